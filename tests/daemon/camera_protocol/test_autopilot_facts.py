@@ -6,6 +6,8 @@ The lines are those of a note on ArduCopter 4.7-dev in software in the loop, flo
 
 from __future__ import annotations
 
+import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -16,6 +18,7 @@ TESTS = Path(__file__).parents[2]
 PROTOCOL, NAVIGATION = "daemon/camera_protocol/test_autopilots.py", "daemon/navigation/test_owned_triggers.py"
 COMPONENT, MOCK = "daemon/camera_protocol/test_component.py", "mocks/autopilot/test_personality.py"
 STEPS, FORWARDED = "daemon/navigation/test_clock_steps.py", "daemon/pipeline/test_forwarded.py"
+BOOKS = "daemon/replay/test_three_books.py"
 ROUTES = "daemon/camera_protocol/test_report_routes.py"
 FACTS: dict[str, tuple[tuple[str, str], ...]] = {
     "CAMERA_FEEDBACK is sent for every camera at every trigger; a time of 0 is no time": (
@@ -47,8 +50,9 @@ FACTS: dict[str, tuple[tuple[str, str], ...]] = {
         (MOCK, "test_a_broadcast_is_executed_and_one_to_a_camera_is_not"),
         ("matrix", "stations broadcast"),
     ),
-    "Indices count ArduPilot's own triggers: a gap is a lost trigger": (
+    "Indices and CAM entries count ArduPilot's own triggers: a gap is a lost trigger": (
         (PROTOCOL, "test_each_trigger_that_was_lost_on_the_link_is_named"),
+        (BOOKS, "test_each_trigger_that_is_not_in_all_three_is_named"),
         ("matrix", "link down"),
         ("matrix", "one packet of ten lost"),
     ),
@@ -82,19 +86,59 @@ FACTS: dict[str, tuple[tuple[str, str], ...]] = {
         (COMPONENT, "test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulted"),
         ("system/test_mavlink_flights.py", "test_a_pilot_is_told_of_a_camera_that_went_and_came_back"),
     ),
-    "Peers of 2026: MAVProxy's camera module": (("system/test_mavlink_peers.py", "test_mavproxys_camera_module"),),
+    "Peers of 2026: MAVProxy's camera module; QGroundControl's two map points a photograph": (
+        ("system/test_mavlink_peers.py", "test_mavproxys_camera_module"),
+        ("daemon/camera_protocol/test_autopilot_facts.py", "test_the_page_says_how_to_have_one_map_point"),
+    ),
 }
+
+
+LINES = 14  # of the note
+
+
+def test_each_line_is_here_once_with_tests_of_its_own() -> None:
+    """A test may hold two lines; but no line has only what another one has."""
+    assert len(FACTS) == LINES
+    assert len({frozenset(tests) for tests in FACTS.values()}) == LINES
+    for fact, tests in FACTS.items():
+        assert len(set(tests)) == len(tests), fact
+        assert {place for place, _ in tests} - {"matrix"}, f"{fact}: the matrix alone does not say what it holds"
 
 
 @pytest.mark.parametrize("fact", FACTS)
 def test_each_fact_has_its_tests(fact: str) -> None:
     world = program("autopilot_cell")
     flown = {name for cell in program("autopilots").cells() for name in (cell.wiring, cell.fault)}
-    assert FACTS[fact]
     for place, name in FACTS[fact]:
         if place == "matrix":
             assert name in flown
             assert name in (*world.WIRINGS, *world.FAULTS)
         else:
-            text = (TESTS / place).read_text("utf-8")
-            assert f"def {name}(" in text
+            assert runs(TESTS / place, name), f"{place} has no test {name} that runs"
+
+
+def runs(path: Path, name: str) -> bool:
+    """Whether a file of tests has this one, neither skipped nor expected to fail."""
+    for node in ast.parse(path.read_text("utf-8")).body:
+        if isinstance(node, ast.FunctionDef) and node.name == name:
+            return not any(word in ast.unparse(mark) for mark in node.decorator_list for word in ("skip", "xfail"))
+    return False
+
+
+def test_a_test_that_is_missing_or_skipped_holds_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "test_one.py"
+    path.write_text("@pytest.mark.skip\ndef test_a(): ...\ndef test_b(): ...\n# def test_c(\n", "utf-8")
+    assert [runs(path, f"test_{name}") for name in "abc"] == [False, True, False]
+
+
+def test_the_page_says_how_to_have_one_map_point() -> None:
+    """The option that keeps the camera's messages from the ground station, as bit and as value."""
+    (paragraph,) = [
+        text
+        for text in (TESTS.parent / "docs" / "mavlink.md").read_text("utf-8").split("\n\n")
+        if text.startswith("**Two map points for one photograph.**")
+    ]
+    found = re.search(r"bit (\d+) of `SERIALn_OPTIONS` \([^)]*, (\d+);", paragraph)
+    assert found is not None
+    assert int(found[2]) == 2 ** int(found[1])
+    assert {"CAMERA_FEEDBACK", "CAMERA_IMAGE_CAPTURED"} <= set(re.findall(r"CAMERA_[A-Z_]+", paragraph))
