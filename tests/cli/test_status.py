@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.cli import main
+from dappled.cli import main, status
 from dappled.cli.status import is_listening, stream_endpoint
 from dappled.daemon.stream.publisher import Publisher
 from dappled.errors import DappledError
@@ -61,6 +61,18 @@ def test_nobody_there_is_said_in_a_sentence(tmp_path: Path, capsys: pytest.Captu
     assert "no daemon was heard on" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("name", "service"), [("dappled", "dappled"), ("left", "dappled@left")])
+def test_who_is_not_there_is_named(
+    name: str, service: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(status, "SERVICE_FOLDER", tmp_path / "run" / "dappled")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+    (tmp_path / "dappled").mkdir()
+    (file := tmp_path / "dappled" / f"{name}.toml").write_text("", encoding="utf-8")
+    assert main(["status", "--config", str(file), "--timeout", "0.2"]) == 1
+    assert f"(systemctl status {service})" in capsys.readouterr().err
+
+
 # --- which daemon is asked when the call names none
 
 
@@ -106,6 +118,8 @@ def test_the_settings_of_one_camera_of_several_lead_to_its_own_service(own: Path
     assert stream_endpoint(settings / "left.toml", service) == f"ipc://{own}/slices"  # it does not run
     (tmp_path / "run" / "dappled-left").mkdir()
     assert stream_endpoint(settings / "left.toml", service) == f"ipc://{service}-left/slices"
+    with listening(own / "slices"):  # of whichever camera
+        assert stream_endpoint(settings / "left.toml", service) == f"ipc://{service}-left/slices"
 
 
 def test_settings_that_name_an_endpoint_are_obeyed(own: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -10,10 +11,12 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from dappled.cli.status import NotRunningError, health
+from dappled.cli import main, status
+from dappled.cli.status import NotRunningError
 from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
@@ -23,21 +26,26 @@ from tests.system.flying import eventually
 BYTES = {"left": 50_000, "right": 60_000}  # so that a frame shows which body it is of
 
 
+def settings_of(folder: Path, name: str) -> Path:
+    """The settings of a camera's daemon, as in /etc/dappled."""
+    return folder / "dappled" / f"{name}.toml"
+
+
 @contextmanager
 def serving(
     name: str, component: int, folder: Path, runtime: Path, autopilot: int
 ) -> Iterator[subprocess.Popen[bytes]]:
     """`dappled run` as the unit of this name runs it, with a body of its own, from the end of the block ended."""
     with SimulatedBody.start(BodyOptions(picture=f"pattern:{BYTES[name]}:CR2", serial=name)) as body:
-        (folder / f"{name}.toml").write_text(
-            f'[camera]\nport = "{body.port}"\n[record]\nmin_free_mb = 0\n[pose]\nwait_ms = 0\n'
-            f'[mavlink]\nurl = "udpin:127.0.0.1:{autopilot}"\ncomponent_id = {component}\n'
-        )
         (home := folder / f"dappled-{name}").mkdir()
+        settings_of(folder, name).write_text(
+            f'[camera]\nport = "{body.port}"\n[record]\nmin_free_mb = 0\ndirectory = "{home}/flights"\n'
+            f'[pose]\nwait_ms = 0\n[mavlink]\nurl = "udpin:127.0.0.1:{autopilot}"\ncomponent_id = {component}\n'
+        )
         runtime.mkdir(mode=0o700)
         of_unit = {"HOME": str(home), "RUNTIME_DIRECTORY": str(runtime)}
         daemon = subprocess.Popen(
-            [sys.executable, "-m", "dappled", "run", "--config", str(folder / f"{name}.toml")],
+            [sys.executable, "-m", "dappled", "run", "--config", str(settings_of(folder, name))],
             env=os.environ | of_unit,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -59,14 +67,24 @@ def frames(folder: Path, name: str) -> list[int]:
 
 
 @pytest.mark.slow
-def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(tmp_path: Path, sockets: Path) -> None:
+def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(
+    tmp_path: Path, sockets: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(status, "SERVICE_FOLDER", sockets / "dappled")
+    (tmp_path / "dappled").mkdir()
+
+    def says(*words: str) -> tuple[int, dict[str, Any]]:
+        capsys.readouterr()
+        code = main([*words, "--json"])
+        return code, json.loads(capsys.readouterr().out)
+
     ports = {name: free_port(socket.SOCK_DGRAM) for name in ("left", "right", "ground")}
     assert len(set(ports.values())) == len(ports)
     urls = [f"--url=udpout:127.0.0.1:{ports[name]}" for name in BYTES] + [f"--url=udpin:127.0.0.1:{ports['ground']}"]
     autopilot = [sys.executable, "-m", "dappled.mocks.autopilot.autopilot", "--with-parent", *urls]
     with ExitStack() as stack:
         daemons = [
-            stack.enter_context(serving(name, 100 + number, tmp_path, sockets / name, ports[name]))
+            stack.enter_context(serving(name, 100 + number, tmp_path, sockets / f"dappled-{name}", ports[name]))
             for number, name in enumerate(BYTES)
         ]
         vehicle = subprocess.Popen([*autopilot, "--camera=mavlink", "--camera=mavlink"], stdin=subprocess.PIPE)
@@ -85,9 +103,19 @@ def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(tmp_path: Path, 
                     60,
                 )
 
-            eventually(lambda: all(is_ready(sockets / name) for name in BYTES), "both cameras are ready", 60)
+            eventually(
+                lambda: all(is_ready(settings_of(tmp_path, name)) for name in BYTES), "both cameras are ready", 60
+            )
             for camera, names in ((1, ["left"]), (2, ["right"]), (2, ["right"]), (0, ["left", "right"]), (1, ["left"])):
                 photograph(camera, *names)
+        for name in BYTES:
+            file = str(settings_of(tmp_path, name))
+            _, record = says("status", "--config", file)
+            assert Path(record["disk"]["folder"]).parent == tmp_path / f"dappled-{name}" / "flights"
+            assert record["shots"]["safe"] == asked[name]
+            _, judged = says("doctor", "--config", file)
+            assert judged["flight"] == record["flight"]
+            assert not [one for one in judged["checks"] if one["name"] == "settings"]
         for daemon in daemons:
             daemon.send_signal(signal.SIGTERM)
         assert [daemon.wait(60) for daemon in daemons] == [0, 0]
@@ -97,12 +125,14 @@ def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(tmp_path: Path, 
         balance = flight_report.balance(flight)
         assert balance.balanced
         assert balance.by_source == {"mavlink:1/1": 3}
+        code, report = says("flight", "report", "--config", str(settings_of(tmp_path, name)))
+        assert (code, report["flight"]) == (0, flight.name)
 
 
-def is_ready(runtime: Path) -> bool:
-    """Whether the daemon with this runtime folder says that its camera is ready and its autopilot is heard."""
+def is_ready(settings: Path) -> bool:
+    """Whether the daemon with these settings says that its camera is ready and its autopilot is heard."""
     try:
-        record = health(f"ipc://{runtime}/slices", 5)
+        record = status.health(status.stream_endpoint(settings), 5)
     except NotRunningError:
         return False
     return record["camera"]["state"] == "ready" and "MAVLink" not in "".join(record["problems"])

@@ -89,10 +89,11 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
     """Judge go or no-go by the health record of the daemon that runs here, as the console does."""
     if arguments.test_shot or arguments.latency:
         raise DaemonRunsError(
-            f"a daemon runs at {endpoint} and holds the camera: stop it first (sudo systemctl stop dappled), or ask it "
-            "for a photograph (dappled trigger, the ground station, the console)"
+            f"a daemon runs at {endpoint} and holds the camera: stop it first "
+            f"(sudo systemctl stop {status.unit(arguments.config)}), or ask it for a photograph "
+            "(dappled trigger, the ground station, the console)"
         )
-    report, user = status.health(endpoint, HEAR_S), status.stranger(endpoint)
+    report, user = status.health(endpoint, HEAR_S, status.unit(arguments.config)), status.stranger(endpoint)
     checks = go_no_go.checks(report)
     looked: list[Check] = []
     if report["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
@@ -103,7 +104,7 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
         ]
     verdict = go_no_go.verdict(checks)
     if arguments.config is not None:
-        compared = _differences(arguments.config, settings, report)
+        compared = _differences(arguments.config, settings, report, endpoint)
         looked += compared
         verdict = go_no_go.verdict([*checks, *compared])
     todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
@@ -119,8 +120,9 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
     return 1 if verdict == "no-go" else 0
 
 
-def _differences(file: Path, wanted: Settings, report: Mapping[str, Any]) -> list[Check]:
-    """What the daemon was not started with, though the file says it. The flight's folder holds its settings."""
+def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoint: str) -> list[Check]:
+    """What the daemon at this endpoint was not started with, though the file says it. The flight's folder holds its
+    settings."""
     flown = Path(report["disk"]["folder"]) / "flight.toml"
     try:
         tables, _ = read_toml(flown)
@@ -129,8 +131,13 @@ def _differences(file: Path, wanted: Settings, report: Mapping[str, Any]) -> lis
     live = tables.get("settings", {})
     live.get("record", {})["min_free_mb"] = report.get("min_free_bytes", 0) // 1_000_000  # it can change in flight
     ours = configuration.to_tables(wanted)
+    if wanted.publish.slices == f"ipc://{configuration.runtime_folder()}/slices":  # not named: a service has another
+        ours["publish"]["slices"] = endpoint
+        if wanted.publish.ask == f"{wanted.publish.slices}.ask":
+            ours["publish"]["ask"] = f"{endpoint}.ask"
     todo = (
-        "restart the daemon with this file (sudo systemctl restart dappled), or name the file that it was started with"
+        f"restart the daemon with this file (sudo systemctl restart {status.unit(file)}), or name the file that it was "
+        "started with"
     )
     simulated: Collection[tuple[str, str]] = ()
     found = []

@@ -42,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     endpoint = arguments.endpoint or stream_endpoint(arguments.config)
-    record = health(endpoint, arguments.timeout)
+    record = health(endpoint, arguments.timeout, unit(arguments.config))
     if arguments.json:
         print(json.dumps(record))
     else:
@@ -50,17 +50,30 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def stream_endpoint(config: Path | None, service: Path = SERVICE_FOLDER) -> str:
+def unit(config: Path | None) -> str:
+    """The service that has these settings: those with another name beside the service's (/etc/dappled/left.toml) are
+    of `dappled@left`."""
+    if config is not None and config.absolute().parent.name == "dappled" and config.stem != "dappled":
+        return f"dappled@{config.stem}"
+    return "dappled"
+
+
+def stream_endpoint(config: Path | None, service: Path | None = None) -> str:
     """Endpoint of the daemon on this machine: the one in the settings, else this user's own, else the service's.
 
-    Settings with another name beside the service's (/etc/dappled/left.toml) are those of `dappled@left`, which has a
-    folder of its own. Raises ConfigError, and WireError if this user may not open the service's folder.
+    `service` is the service's folder (default: `SERVICE_FOLDER`). `dappled@left` (see `unit`) has a folder of its own,
+    which goes before this user's own daemon: that may be of another camera. Raises ConfigError, and WireError if this
+    user may not open the service's folder.
     """
     endpoint = settings.load(config).publish.slices
     ours = settings.runtime_folder() / "slices"
-    if config is not None and config.absolute().parent.name == "dappled" and config.stem != "dappled":
-        service = service.with_name(f"{service.name}-{config.stem}")
-    if endpoint != f"ipc://{ours}" or ours.parent == service or not service.is_dir() or is_listening(endpoint):
+    service = service or SERVICE_FOLDER
+    name = unit(config)
+    one_of_several = name != "dappled"
+    service = service.with_name(name.replace("dappled@", f"{service.name}-")) if one_of_several else service
+    if endpoint != f"ipc://{ours}" or ours.parent == service or not service.is_dir():
+        return endpoint
+    if not one_of_several and is_listening(endpoint):
         return endpoint
     if not os.access(service, os.X_OK):
         raise WireError(
@@ -101,8 +114,8 @@ def stranger(endpoint: str) -> str | None:
         return str(user)
 
 
-def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:
-    """The daemon's next health record. Raises NotRunningError after `timeout_s`."""
+def health(endpoint: str, timeout_s: float, name: str = "dappled") -> Mapping[str, Any]:
+    """The daemon's next health record; `name` is its service's. Raises NotRunningError after `timeout_s`."""
     until = time.monotonic() + timeout_s
     with Subscriber(endpoint, topics=("health",)) as subscriber:
         while (left := until - time.monotonic()) > 0:
@@ -110,7 +123,7 @@ def health(endpoint: str, timeout_s: float) -> Mapping[str, Any]:
             if message is not None and message.topic == "health":
                 return message.header
     raise NotRunningError(
-        f"no daemon was heard on {endpoint} for {timeout_s:g} s: check that it runs (systemctl status dappled) "
+        f"no daemon was heard on {endpoint} for {timeout_s:g} s: check that it runs (systemctl status {name}) "
         "with these settings (--config)"
     )
 
