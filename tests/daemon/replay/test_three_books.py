@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import random
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -12,7 +14,7 @@ from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.daemon.replay import three_books
 from dappled.daemon.replay.three_books import BooksError
-from dappled.drivers.mavlink import mavlink, pack
+from dappled.drivers.mavlink import dataflash, mavlink, pack, ulog
 from dappled.drivers.mavlink.log_packets import AutopilotLogError
 from dappled.flight import Cause, Shot, recording
 from dappled.mocks.autopilot.path import FlightPath
@@ -251,3 +253,21 @@ def test_a_file_that_is_no_sound_log_is_one_sentence(
 def test_a_log_without_a_trigger_says_what_to_set(fly: Callable[..., Path], bin_log: Path) -> None:
     with pytest.raises(AutopilotLogError, match=r"no trigger of CAM1 .*LOG_BITMASK"):
         three_books.reconcile(fly(requested()), [bin_log])
+
+
+@pytest.mark.parametrize("kind", ["bin", "ulg"])
+def test_a_damaged_log_is_read_or_refused(tmp_path: Path, kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Bytes changed anywhere, also in the descriptions of messages, raise nothing else; nothing is printed."""
+    if kind == "ulg":
+        pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+    log = written(tmp_path)[0] if kind == "bin" else ulog_written(tmp_path)
+    (add_triggers if kind == "bin" else add_px4_triggers)(log, TIMES_S)
+    whole, places = log.read_bytes(), random.Random(1)  # noqa: S311
+    for _ in range(150):
+        data = bytearray(whole)
+        for _ in range(places.choice((1, 5, 50))):
+            data[places.randrange(places.choice((1200, len(data))))] = places.randrange(256)
+        log.write_bytes(data)
+        with contextlib.suppress(AutopilotLogError):
+            assert (dataflash.triggers(log, 0) if kind == "bin" else ulog.triggers(log)).triggers
+    assert not capsys.readouterr().out

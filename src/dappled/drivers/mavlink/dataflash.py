@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -45,55 +44,79 @@ class DataFlashError(AutopilotLogError):
 
 def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. Raises DataFlashError."""
-    rows = _rows(path, _USED)
-    clock = _clock(path, rows["GPS"])
-    messages = [*_positions(path, rows), *_attitudes(rows), *_receiver(rows, clock)]
+    with _sound(path):
+        rows = _rows(path, _USED)
+        clock = _clock(path, rows["GPS"])
+        messages = [*_positions(path, rows), *_attitudes(rows), *_receiver(rows, clock)]
     yield from log_packets.packets(messages, clock)
 
 
 def triggers(path: Path, cam_idx: int) -> TriggerLog:
     """The triggers of one camera (0 is CAM1). Raises DataFlashError."""
-    rows = _rows(path, ["GPS", *_OF_CAMERAS])
-    clock = _clock(path, rows["GPS"])
-    # before ArduPilot 4.3 the messages don't say which camera: there is one
-    mine = {name: [row for row in rows[name] if getattr(row, "I", 0) == cam_idx] for name in _OF_CAMERAS}
-    given = mine["TRIG"] or mine["CAM"]
-    if any(not hasattr(row, name) for row in given for name in ("Img", "TimeUS", "Lat", "Lng")):
-        raise DataFlashError(f"{path} holds messages CAM or TRIG in a form that is not ArduPilot's since 4.0")
-    found = sorted(
-        (
-            LoggedTrigger(
-                int(row.Img), int(row.TimeUS), (float(row.Lat), float(row.Lng)) if row.Lat or row.Lng else None
-            )
-            for row in given
-        ),
-        key=lambda one: one.boot_us,
-    )
-    if not found:
-        raise DataFlashError(
-            f"{path} holds no trigger of CAM{cam_idx + 1} (messages CAM and TRIG): choose Camera in LOG_BITMASK"
+    with _sound(path):
+        rows = _rows(path, ["GPS", *_OF_CAMERAS])
+        clock = _clock(path, rows["GPS"])
+        # before ArduPilot 4.3 the messages don't say which camera: there is one
+        mine = {name: [row for row in rows[name] if getattr(row, "I", 0) == cam_idx] for name in _OF_CAMERAS}
+        given = mine["TRIG"] or mine["CAM"]
+        if any(not hasattr(row, name) for row in given for name in ("Img", "TimeUS", "Lat", "Lng")):
+            raise DataFlashError(f"{path} holds messages CAM or TRIG in a form that is not ArduPilot's since 4.0")
+        found = sorted(
+            (
+                LoggedTrigger(
+                    int(row.Img), int(row.TimeUS), (float(row.Lat), float(row.Lng)) if row.Lat or row.Lng else None
+                )
+                for row in given
+            ),
+            key=lambda one: one.boot_us,
         )
-    times_us = [int(row.TimeUS) for name in rows for row in rows[name]]
-    contacts = len(mine["CAM"]) if mine["TRIG"] else None
-    return TriggerLog("ArduPilot", tuple(found), contacts, min(times_us), max(times_us), clock)
+        if not found:
+            raise DataFlashError(
+                f"{path} holds no trigger of CAM{cam_idx + 1} (messages CAM and TRIG): choose Camera in LOG_BITMASK"
+            )
+        times_us = [int(row.TimeUS) for name in rows for row in rows[name]]
+        contacts = len(mine["CAM"]) if mine["TRIG"] else None
+        return TriggerLog("ArduPilot", tuple(found), contacts, min(times_us), max(times_us), clock)
+
+
+@contextlib.contextmanager
+def _sound(path: Path) -> Iterator[None]:
+    """What damage does to the reader, or to a field of a message, is one sentence; what is printed of it is dropped."""
+    try:
+        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+            yield
+    except OSError as error:
+        raise DataFlashError(f"{path} can't be read: {error.strerror}") from None
+    except DataFlashError:
+        raise
+    except Exception as error:  # noqa: BLE001  the reader raises that class itself, beside many others
+        raise DataFlashError(f"{path} is damaged as a log of ArduPilot ({first_line(error)}): copy it again") from None
+
+
+class _Reader(DFReader.DFReader_binary):  # type: ignore[misc]  # it has no types
+    """The reader, which leaves no file open where it finds nothing to read."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            super().__init__(str(path))
+        except BaseException:
+            if hasattr(self, "filehandle"):
+                self.filehandle.close()
+            raise
 
 
 def _rows(path: Path, used: list[str]) -> dict[str, list[Any]]:
     """The messages in use, by name. A log that was cut off is read up to there."""
     rows: dict[str, list[Any]] = {name: [] for name in used}
+    log = _Reader(path)
     try:
-        with contextlib.redirect_stderr(io.StringIO()):  # the reader prints what it skips
-            log = DFReader.DFReader_binary(str(path))
-            while (message := log.recv_match(type=used)) is not None:
-                name = message.get_type()
-                first = getattr(message, "I", 0) == 0 and getattr(message, "C", 0) == 0
-                if first or name in _OF_CAMERAS:  # the first receiver, the first core
-                    rows[name].append(message)
-            log.filehandle.close()
-    except OSError as error:
-        raise DataFlashError(f"{path} can't be read: {error.strerror}") from None
-    except (ValueError, TypeError, KeyError, IndexError, AttributeError, struct.error) as error:
-        raise DataFlashError(f"{path} is damaged as a log of ArduPilot ({first_line(error)}): copy it again") from None
+        while (message := log.recv_match(type=used)) is not None:
+            name = message.get_type()
+            first = getattr(message, "I", 0) == 0 and getattr(message, "C", 0) == 0
+            if first or name in _OF_CAMERAS:  # the first receiver, the first core
+                rows[name].append(message)
+    finally:
+        log.filehandle.close()
     return rows
 
 

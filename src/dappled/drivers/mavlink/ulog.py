@@ -55,39 +55,52 @@ class ULogError(AutopilotLogError):
 
 def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. Raises ULogError."""
-    topics = _topics(path, [_PLACES, _SPEEDS, _TURNS, _HOME])
-    found = next((topics[name] for name in _RECEIVERS if name in topics), None)
-    fixes, clock = _fixes(path, found)
-    messages = [*_positions(path, topics), *_attitudes(path, topics)]
-    for fix in fixes:
-        messages += log_packets.receiver(fix, clock)
+    with _sound(path):
+        topics = _topics(path, [_PLACES, _SPEEDS, _TURNS, _HOME])
+        found = next((topics[name] for name in _RECEIVERS if name in topics), None)
+        fixes, clock = _fixes(path, found)
+        messages = [*_positions(path, topics), *_attitudes(path, topics)]
+        for fix in fixes:
+            messages += log_packets.receiver(fix, clock)
     yield from log_packets.packets(messages, clock)
 
 
 def triggers(path: Path) -> TriggerLog:
     """The camera's triggers: camera_trigger, of which some may be contacts of a feedback pin, or without it
     camera_capture. Raises ULogError."""
-    topics = _topics(path, [_PLACES, _TRIGGERS, _CAPTURES])
-    _, clock = _fixes(path, next((topics[name] for name in _RECEIVERS if name in topics), None))
-    given = topics.get(_TRIGGERS, topics.get(_CAPTURES))
-    if given is None or "seq" not in given:
-        raise ULogError(
-            f"{path} holds no trigger ({_TRIGGERS} or {_CAPTURES}): was TRIG_MODE set, and are they logged?"
-        )
-    at, numbers = _times(given, "timestamp"), given["seq"].astype(np.int64)
-    told = _within(at, 0, _BOOT_MAX_US)
-    back = given["feedback"] != 0 if "feedback" in given else np.zeros(len(at), dtype=bool)
-    found = [
-        LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(topics.get(_PLACES), int(at[n])))
-        for n in np.flatnonzero(told & ~back)
-    ]
-    if not found:
-        raise ULogError(f"{path} holds no trigger ({_TRIGGERS}), only contacts of a feedback pin: nothing to compare")
-    all_us = np.concatenate([_times(topic, "timestamp") for topic in topics.values()])
-    all_us = all_us[_within(all_us, 0, _BOOT_MAX_US)]
-    contacts = int((told & back).sum()) if back.any() else None
-    ordered = tuple(sorted(found, key=lambda one: one.boot_us))
-    return TriggerLog("PX4", ordered, contacts, int(all_us.min()), int(all_us.max()), clock)
+    with _sound(path):
+        topics = _topics(path, [_PLACES, _TRIGGERS, _CAPTURES])
+        _, clock = _fixes(path, next((topics[name] for name in _RECEIVERS if name in topics), None))
+        given = topics.get(_TRIGGERS, topics.get(_CAPTURES))
+        if given is None or "seq" not in given:
+            raise ULogError(
+                f"{path} holds no trigger ({_TRIGGERS} or {_CAPTURES}): was TRIG_MODE set, and are they logged?"
+            )
+        at, numbers = _times(given, "timestamp"), given["seq"].astype(np.int64)
+        told = _within(at, 0, _BOOT_MAX_US)
+        back = given["feedback"] != 0 if "feedback" in given else np.zeros(len(at), dtype=bool)
+        found = [
+            LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(topics.get(_PLACES), int(at[n])))
+            for n in np.flatnonzero(told & ~back)
+        ]
+        if not found:
+            raise ULogError(
+                f"{path} holds no trigger ({_TRIGGERS}), only contacts of a feedback pin: nothing to compare"
+            )
+        all_us = np.concatenate([_times(topic, "timestamp") for topic in topics.values()])
+        all_us = all_us[_within(all_us, 0, _BOOT_MAX_US)]
+        contacts = int((told & back).sum()) if back.any() else None
+        ordered = tuple(sorted(found, key=lambda one: one.boot_us))
+        return TriggerLog("PX4", ordered, contacts, int(all_us.min()), int(all_us.max()), clock)
+
+
+@contextlib.contextmanager
+def _sound(path: Path) -> Iterator[None]:
+    """What damage left of a topic is used, or is one sentence."""
+    try:
+        yield
+    except (ValueError, TypeError, KeyError, IndexError, ArithmeticError) as error:
+        raise ULogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
 
 
 def _place_at(topic: Columns | None, boot_us: int) -> tuple[float, float] | None:
