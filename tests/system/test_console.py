@@ -385,16 +385,22 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
 
 def test_live_view_before_a_shot_and_off_while_shooting(chromium: Browser, tmp_path: Path, sockets: Path) -> None:
     with flown(tmp_path, sockets) as daemon:
-        for viewport in (PHONE, {"width": 844, "height": 390}, {"width": 1024, "height": 600}, LAPTOP):
+        for viewport in (
+            PHONE,
+            {"width": 844, "height": 390},
+            {"width": 1024, "height": 600},
+            {"width": 1280, "height": 800},
+        ):
             watched = opened(chromium, daemon, viewport)
             page, caption = watched.page, "document.querySelector('#caption').textContent"
             page.click("#tab-live")
             page.wait_for_selector("#live:not([hidden])")
             until(page, f"/of the middle/.test({caption})")
             assert re.fullmatch(r"sharpness \d+ % of the best, [\d.]+ % clipped", page.inner_text("#which"))
-            below = page.locator("#which").bounding_box()
-            assert below is not None
-            assert below["y"] + below["height"] <= viewport["height"]  # what the ring is turned by, on the first screen
+            for name in ("#which", "#live"):  # what the ring is turned by and the histogram, on the first screen
+                below = page.locator(name).bounding_box()
+                assert below is not None
+                assert below["y"] + below["height"] <= viewport["height"], name
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
             page.screenshot(path=SCREENSHOTS / f"live-{viewport['width']}x{viewport['height']}.png")
             page.click("#live")

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -116,6 +119,11 @@ def ticks(page: Page) -> int:
     return page.locator('#checks svg:not([aria-label="unknown"])').count()
 
 
+def top_of_page(page: Page) -> float:
+    """Where the page begins below its header, in px."""
+    return float(page.evaluate("document.querySelector('main').getBoundingClientRect().top"))
+
+
 def said(what: str) -> str:
     return f"document.querySelector('#outcome').textContent.includes({what!r})"
 
@@ -125,7 +133,7 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
     chromium: Browser, daemon: Daemon, link: Link, size: str
 ) -> None:
     page = page_of(chromium, link.url, size)
-    before = requested(daemon)
+    before, stood = requested(daemon), top_of_page(page)
     assert ticks(page) >= 7  # of the camera's own checks, some come once there was a shot
     link.cut()
     page.click("#shoot")
@@ -136,6 +144,7 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
     assert page.inner_text("#verdict-word") == "No contact"
     assert ticks(page) == 0
     assert page.is_disabled("#shoot")
+    assert top_of_page(page) == stood, "what is under a thumb must not move as contact is lost"
     picture(page, size, "cut")
     link.mend()
     until_flown(page)
@@ -202,6 +211,50 @@ def test_a_flight_s_end_is_told_and_a_death_is_no_end(
         if word == "Ended":
             assert page.inner_text("#verdict-text") == "1 shot: 1 frame recorded"
         at_all_sizes(page, word.lower().replace(" ", "-"))
+        if word == "Ended":
+            recorded_flight(chromium, one.flights)
+
+
+def recorded_flight(browser: Browser, flights: Path) -> None:
+    """What was recorded, on the same page: its frame at every size, and nothing that looks as if it could be fired."""
+    (flight,) = (path for path in flights.iterdir() if path.is_dir())
+    words = [sys.executable, "-m", "dappled", "open", str(flight), "--no-browser"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as command:
+        try:
+            assert command.stdout is not None
+            found = re.search(r"http://127\.0\.0\.1:\d+/", command.stdout.readline())
+            assert found
+            page = browser.new_context(viewport={"width": 390, "height": 844}).new_page()
+            page.goto(found[0])
+            until(page, "document.querySelector('#which').textContent === 'frame 0'")
+            until(page, "!document.querySelector('#gl').hidden")
+            assert not page.is_visible("#shoot") or page.is_disabled("#shoot")
+            for size, (width, height) in SIZES.items():
+                page.set_viewport_size({"width": width, "height": height})
+                assert page.evaluate("document.documentElement.scrollWidth") <= width
+                box = page.locator("#gl").bounding_box()
+                assert box is not None
+                assert box["y"] + box["height"] <= height, (size, box)
+                picture(page, size, "recorded")
+        finally:
+            command.send_signal(signal.SIGINT)
+
+
+# Nothing is wrong that a flight could not do without: no mask, no autopilot, a body that tells nothing of itself.
+BARE = '[camera]\ndriver = "simulated"\noptions = {picture = "pattern:60000:dng"}\n'
+
+
+def test_what_is_lost_without_mask_and_link_is_a_caution_with_names(
+    chromium: Browser, tmp_path: Path, sockets: Path
+) -> None:
+    with flown(tmp_path, sockets, settings=BARE) as one:
+        page = page_of(chromium, one.url, "phone", "caution")
+        assert page.inner_text("#verdict-word") == "Go"
+        told = page.inner_text("#verdict-text")
+        assert told.startswith("with caution: ")
+        assert {"autopilot", "decoding"} <= set(re.findall(r"\w+", told))
+        assert decoding(page) == ("caution", "no mask is configured: frames are kept, not decoded")
+        at_all_sizes(page, "caution")
 
 
 # What a camera that says who it is only when it is connected may turn out to be: frames of another size than those
@@ -224,8 +277,9 @@ def test_a_calibration_of_another_camera_is_no_go_on_the_page_before_and_after_f
         page = page_of(chromium, one.url, "phone", "no-go")
         state, text = decoding(page)
         assert state == "no-go"
-        assert text.endswith(
-            "is for frames of 2856 × 4290 px, which reference-36mm doesn't make: calibrate with that camera"
+        assert text == (
+            "frames will be kept, not decoded: the calibration is for frames of 2856 × 4290 px, "
+            "which reference-36mm doesn't make: calibrate with that camera"
         )
         at_all_sizes(page, "no-go")
         page.set_viewport_size({"width": 390, "height": 844})

@@ -113,7 +113,9 @@ class ShotEvents(Observer):
         """Whether the calibration is for this camera. Its mask and law were judged before the flight began."""
         if self._recipe is not None:
             try:
-                self.misfit = calibration_files.misfit(self._recipe, model) or ""
+                found = calibration_files.misfit(self._recipe, model)
+                # the flight's own copy is read: a pilot on the field has no use for its long name
+                self.misfit = found.replace(self._recipe.calibration, "the calibration") if found else ""
             except DappledError as error:
                 self.misfit = str(error)
 

@@ -195,7 +195,7 @@ function showLog(lines) {
 
 function tick() {
   const age = performance.now() - heardAt, lost = heardAt > 0 && age > STALE_MS, stale = lost || Boolean(ended);
-  const words = ended ? "the flight has ended" : lost ? `nothing heard for ${Math.round(age / 1000)} s` : connected ? "live" : "connecting";
+  const words = ended ? "ended" : lost ? `silent ${Math.round(age / 1000)} s` : connected ? "live" : "connecting";
   $("contact").textContent = words;
   $("contact").dataset.state = lost && !ended ? "lost" : "live";
   if (utcAt !== null && !stale) $("clock").textContent = utc(utcAt + age * 1e6);
