@@ -97,6 +97,19 @@ def test_without_a_person_the_mask_must_be_given(tmp_path: Path, capsys: pytest.
 
 
 @pytest.mark.usefixtures("alone")
+def test_without_a_name_it_is_the_file_that_the_documents_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["init", "--mask", "mask-2", "--link", "none", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["file"] == "dappled.toml"
+    assert settings.load(tmp_path / "dappled.toml").mask.profile == "mask-2"
+    assert main(["init", "--mask", "mask-1", "--link", "none", "--json"]) != 0
+    assert "--overwrite" in capsys.readouterr().err
+    assert settings.load(tmp_path / "dappled.toml").mask.profile == "mask-2"
+
+
+@pytest.mark.usefixtures("alone")
 def test_a_body_that_usb_can_t_fire_gets_its_driver_and_needs_a_shutter(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

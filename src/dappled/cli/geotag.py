@@ -113,6 +113,8 @@ def run(arguments: argparse.Namespace) -> int:
         )
     else:
         words = f"{counted(written.placed, 'frame')} placed, {counted(len(written.files), 'file')} written"
+        if folders := dict.fromkeys(str(path.parent) for path in written.files):
+            words += f" to {' and '.join(folders)}"
         print(
             words
             + (f", {len(copied)} {'copy' if len(copied) == 1 else 'copies'} with EXIF" if arguments.copies else "")

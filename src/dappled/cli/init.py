@@ -49,7 +49,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n  dappled init dappled.toml\n"
         "  dappled init dappled.toml --body canon-eos-450d --mask mask-2 --link /dev/ttyAMA0,921600 --folder ~/flights"
     )
-    parser.add_argument("file", type=Path, metavar="FILE", help="settings file to write")
+    parser.add_argument(
+        "file", type=Path, nargs="?", default=Path("dappled.toml"), metavar="FILE",
+        help="settings file to write (default: dappled.toml)",
+    )  # fmt: skip
     parser.add_argument("--body", metavar="P", help="camera profile or TOML file, or auto: the one that fits the body")
     parser.add_argument("--shutter", metavar="LINE", help="Fujifilm: what fires it (camera.shutter)")
     parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or none")
