@@ -142,6 +142,8 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
     until(page, said("not confirmed; it may have fired"))
     until(page, "document.querySelector('#verdict').dataset.state === 'lost'")
     assert page.inner_text("#verdict-word") == "No contact"
+    ground = "getComputedStyle(document.querySelector('#verdict')).backgroundColor"
+    assert page.evaluate(ground) == "rgb(179, 19, 14)", "no green, not even as it fades, under these words"
     assert ticks(page) == 0
     assert page.is_disabled("#shoot")
     assert top_of_page(page) == stood, "what is under a thumb must not move as contact is lost"
