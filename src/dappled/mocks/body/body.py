@@ -29,7 +29,7 @@ from dappled.mocks.body.eos_card import CARD_BYTES
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
 
-_START_S = 30.0
+_START_S = 300.0  # a process that emulates another processor takes minutes
 _ANSWER_S = 5.0
 
 
@@ -104,7 +104,7 @@ class SimulatedBody:
 
     @classmethod
     def start(cls, options: BodyOptions | None = None) -> SimulatedBody:
-        """Start a body's process. Raises BodyError where it doesn't listen within 30 s."""
+        """Start a body's process. Raises BodyError where it ends, or doesn't listen within five minutes."""
         command = [sys.executable, "-m", "dappled.mocks.body.body", *(options or BodyOptions()).arguments()]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         assert process.stdout is not None  # asked for above
