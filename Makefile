@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers walk docs notebooks clean-room wheel demo test check test-fast coverage test-slow soak faults bench lock deb arm64 install uninstall clean
+.PHONY: help setup peers walk docs notebooks clean-room wheel demo test check test-fast coverage test-slow soak faults bench lock deb deb-trial arm64 install uninstall clean
 PREFIX ?= /usr/local
 # Three tests on two cores: a third of the time of tests is waiting for sockets and processes.
 BESIDE = -n $(shell echo $$(( ($$(nproc) * 3 + 1) / 2 ))) --dist worksteal
@@ -86,7 +86,12 @@ lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers
 	  --no-annotate pyproject.toml -o requirements-onboard.lock
 
 deb: setup ## build Debian packages for amd64 and arm64 in build/deb (SUITE=trixie for Debian 13)
-	@$(BIN)/python tools/deb.py --suite $(or $(SUITE),bookworm) $(if $(ARCH),--arch $(ARCH))
+	@$(BIN)/python tools/deb.py --suite $(or $(SUITE),bookworm) $(foreach a,$(ARCH),--arch $(a))
+
+deb-trial: ## the packages in bare Debian roots: installed, flown, purged (SUITE=bookworm, ARCH="amd64 arm64"); as root
+	@$(MAKE) -s deb
+	@for arch in $(or $(ARCH),amd64 arm64); do deb=$$(ls build/deb/dappled_*+$(or $(SUITE),bookworm)_$$arch.deb) || exit 1; \
+	  ARCH=$$arch BRING=$$deb tools/clean-room $(or $(SUITE),bookworm) "tools/deb-trial /root/$$(basename $$deb)" || exit 1; done
 
 arm64: setup ## check that the onboard part installs on a Raspberry Pi, and print its size
 	@$(BIN)/python tools/arm64.py
