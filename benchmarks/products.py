@@ -1,4 +1,6 @@
-"""What refocusing and depth cost, and how good depth is on scenes with truth: python benchmarks/products.py [--json].
+"""What refocusing and depth cost, and how good depth is on scenes with truth.
+
+python benchmarks/products.py [--json]
 
 Times are the least of interleaved rounds beside a plain mean over the same views, measured in the same run; `cpu` is
 what all threads together took, which a busy machine changes less.

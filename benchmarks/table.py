@@ -10,6 +10,8 @@ against the baseline is shown, and ends 1 only where `--strict` asks for it. `--
 from __future__ import annotations
 
 import argparse
+import ast
+import itertools
 import json
 import os
 import statistics
@@ -149,7 +151,19 @@ def page(rows: Sequence[Row], on: Mapping[str, str | int | float], repeats: int)
         f"{on['model']}, {on['cores']} cores, Python {on['python']}, {on['date']}; load before the run "
         f"{on['load_before']}; median of {repeats}."
     )
-    return f"{HEAD}{where}\n\n{table(rows)}\n"
+    parts = [
+        f"## {benchmark}\n\n{purpose(benchmark)}\n\n{table(list(group))}\n"
+        for benchmark, group in itertools.groupby(rows, key=lambda row: row.limit.benchmark)
+    ]
+    return f"{HEAD}{where}\n\n" + "\n".join(parts)
+
+
+def purpose(benchmark: str) -> str:
+    """What a benchmark measures: the first paragraph of its text, and its file."""
+    path = FOLDER / f"{benchmark}.py"
+    said = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) if path.exists() else None
+    first = " ".join((said or "").split("\n\n")[0].split())
+    return f"{first} (`benchmarks/{benchmark}.py`)".strip()
 
 
 def baseline(path: Path) -> dict[str, float]:

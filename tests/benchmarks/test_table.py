@@ -72,6 +72,11 @@ def test_every_limit_names_a_benchmark_and_every_ratio_its_anchor() -> None:
         assert one.anchor or "_over_" not in one.figure, one.name
 
 
+def test_every_limit_can_be_missed() -> None:
+    for one in read_limits():
+        assert not one.asked or one.missed(1e12, 0.0) or one.missed(-1e12, 0.0), one.name
+
+
 def test_the_page_marks_what_is_missed() -> None:
     on: dict[str, str | int | float] = {"model": "m", "cores": 2, "python": "3", "date": "d", "load_before": 0}
     text = page(
