@@ -60,4 +60,29 @@ def test_as_json(stream: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_silence_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["watch", f"ipc://{tmp_path}/nobody", "--timeout", "0.1"]) == 1
-    assert "0 frames received" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "0 frames received" in said.out
+    assert f"nothing came from ipc://{tmp_path}/nobody: is a daemon running there?" in said.err
+
+
+def test_a_daemon_that_sends_no_slices_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = f"ipc://{tmp_path}/s"
+    publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", high_water_mark=8)
+    publisher.start("20261121T101503Z-1a2b3c4d", lambda _request, _reply: None)
+    over = threading.Event()
+
+    def send() -> None:
+        for _ in range(40):  # for a second, then silence
+            publisher.publish("health", {"utc_ns": 1})
+            if over.wait(0.025):
+                return
+
+    sender = threading.Thread(target=send)
+    sender.start()
+    try:
+        assert main(["watch", endpoint, "--timeout", "1"]) == 1
+    finally:
+        over.set()
+        sender.join()
+        publisher.stop()
+    assert f"too few slices came from {endpoint}: `dappled status {endpoint}`" in capsys.readouterr().err

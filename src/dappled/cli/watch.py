@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
-from dappled.cli.terminal import waiting_for
+from dappled.cli.terminal import remark, waiting_for
 from dappled.clock import SystemClock
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
@@ -70,6 +70,10 @@ def run(arguments: argparse.Namespace) -> int:
         if not arguments.json:
             asked_again = f"{subscriber.recovered} after a repeated request"
             print(f"{counted(seen.frames, 'frame')} received, {asked_again}, {subscriber.lost} lost")
+        if not seen.messages:
+            remark(f"nothing came from {endpoint}: is a daemon running there? `dappled status {endpoint}` asks it")
+        elif seen.short_of(arguments.count):
+            remark(f"too few slices came from {endpoint}: `dappled status {endpoint}` tells whether it decodes")
         return 1 if seen.short_of(arguments.count) or subscriber.lost else 0
 
 

@@ -13,6 +13,7 @@ from dappled.daemon.health.go_no_go import Check
 VEHICLE = {"latitude_deg": 41.0, "longitude_deg": 1.0, "yaw_deg": 3.0, "position_sigma_m": 1.24, "age_ms": 40.0}
 DECODE = {"mask": "mask-2", "calibration": "c.toml", "running": True, "failed": 0, "failed_in_a_row": 0, "failure": "",
           "misfit": ""}  # fmt: skip
+HALF_HEARD = [{"in": 9}, {"in": 0}]
 LINK = {"urls": 2, "silent": 0, "packets": 500, "positions": 50}
 WELL: dict[str, Any] = {
     "utc_ns": 1_800_000_000 * 10**9,
@@ -59,7 +60,8 @@ def test_all_is_well() -> None:
         ("Disk", "caution", "unknown before the first", {"disk": {"free_bytes": 10**9}, "frame_bytes": None}),
         ("Disk", "go", "unknown before the first", {"frame_bytes": None}),
         ("Autopilot", "caution", "no link is configured", {"link": {"urls": 0, "packets": 0}}),
-        ("Autopilot", "go", "1 of 2 links silent", {"link": LINK | {"silent": 1}}),
+        ("Autopilot", "go", "heard; 1 of 2 links silent", {"link": LINK | {"silent": 1, "each": [{"in": 9}] * 2}}),
+        ("Autopilot", "go", "heard; nobody yet on 1 of 2 links", {"link": LINK | {"silent": 1, "each": HALF_HEARD}}),
         ("Autopilot", "no-go", "silent", {"link": LINK | {"silent": 2}, "vehicle": VEHICLE | {"age_ms": 9e3}}),
         ("Autopilot", "caution", "sends no position", {"vehicle": None}),
         ("Position", "caution", "unknown", {"vehicle": None}),

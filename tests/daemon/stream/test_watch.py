@@ -67,7 +67,7 @@ def watched(script: Script, **options: float) -> tuple[Watched, list[str], list[
 
 def test_a_frame_that_comes_twice_is_one() -> None:
     seen, heard, new = watched(Script([slices(1), slices(1), slices(1, "two"), slices(2), END]))
-    assert seen == Watched(3, ended=True)
+    assert (seen.frames, seen.ended) == (3, True)
     assert heard == ["slices"] * 4 + ["end"]
     assert new == [1, 1, 2]
     assert not seen.short_of(None)
@@ -86,13 +86,13 @@ def test_after_the_end_it_waits_for_what_was_asked() -> None:
     asked = Message("slices", {**answer.header, "asked": {"get": "slices"}}, answer.body)
     seen, _, new = watched(Script([END, None, asked, slices(8)], owed=1))
     assert new == [7]
-    assert seen == Watched(1, ended=True)
+    assert (seen.frames, seen.ended) == (1, True)
 
 
 @pytest.mark.parametrize("first", [[], [slices(1)]])
 def test_silence_ends_it_where_that_is_wished(first: list[Message]) -> None:
     seen, _, _ = watched(Script([*first, *[None] * 5, slices(9)]), silence_s=2.0)
-    assert seen == Watched(len(first), ended=False)
+    assert seen == Watched(len(first), len(first), ended=False)
     assert seen.short_of(None) is not bool(first)
 
 

@@ -125,10 +125,17 @@ def _link(health: Mapping[str, Any]) -> Check:
     silent = link.get("silent", 0)
     age_ms = (health.get("vehicle") or {}).get("age_ms")
     if age_ms is not None and age_ms < _FRESH_MS:
-        return Check("Autopilot", "go", f"heard; {silent} of {link['urls']} links silent" if silent else "heard")
+        return Check("Autopilot", "go", "; ".join(["heard", *_quiet_links(link, silent)]))
     if silent >= link["urls"]:
         return Check("Autopilot", "no-go", "silent for more than 5 s")
     return Check("Autopilot", "caution", "heard, but it sends no position")
+
+
+def _quiet_links(link: Mapping[str, Any], silent: int) -> list[str]:
+    """Words on the links that are silent: those that were heard, and those on which nobody was heard yet."""
+    unheard = min(silent, sum(not each["in"] for each in link.get("each", ())))
+    counts = [(silent - unheard, "{} of {} links silent"), (unheard, "nobody yet on {} of {} links")]
+    return [words.format(count, link["urls"]) for count, words in counts if count]
 
 
 def _position(vehicle: Mapping[str, Any] | None) -> Check:

@@ -31,9 +31,10 @@ class StreamView(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """For how many frames slices came, and whether the flight has ended."""
+    """For how many frames slices came, how many messages came in all, and whether the flight has ended."""
 
     frames: int
+    messages: int
     ended: bool
 
     def short_of(self, count: int | None) -> bool:
@@ -55,7 +56,7 @@ def watch(
     """Receive until the slices of `count` frames have come, the flight has ended and no answer is outstanding, or no
     message came for `silence_s`. `received` gets every message, `new_frame` the first slices of each frame."""
     frames: set[tuple[str, int]] = set()
-    ended = False
+    messages, ended = 0, False
     last_ns = clock.monotonic_ns()
     while not (ended and not stream.waiting_for) and (count is None or len(frames) < count):
         message = stream.receive(_LOOK_S)
@@ -63,7 +64,7 @@ def watch(
             if silence_s and clock.monotonic_ns() - last_ns > silence_s * 1e9:
                 break
             continue
-        last_ns = clock.monotonic_ns()
+        last_ns, messages = clock.monotonic_ns(), messages + 1
         ended = ended or message.topic == "end"
         received(message)
         if message.topic == "slices":
@@ -71,7 +72,7 @@ def watch(
             if frame not in frames:
                 frames.add(frame)
                 new_frame(message)
-    return Watched(len(frames), ended)
+    return Watched(len(frames), messages, ended)
 
 
 def save(message: Message, folder: Path) -> None:
