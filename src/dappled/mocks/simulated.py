@@ -21,7 +21,7 @@ from dappled.config.schema import ConfigError, TomlSource, build, setting
 from dappled.drivers.camera import CameraError, Identity, check_options, seconds_option
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.sources import FolderSource
-from dappled.mocks.body.body import BodyOptions, exposer
+from dappled.mocks.body.body import BodyOptions, pictures
 from dappled.workers import Worker
 
 _HOLD_S = 0.02
@@ -75,7 +75,7 @@ class Exposing:
     def open(self) -> None:
         """See ShutterLine."""
         try:
-            self._expose = self._expose or exposer(self._options)
+            self._expose = self._expose or pictures(self._options).expose
             self._card.mkdir(mode=0o700, exist_ok=True)
         except (ValueError, OSError) as error:
             raise CameraError(f"the simulated camera can't start: {error}") from None

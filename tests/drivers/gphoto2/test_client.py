@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import math
 import os
 import signal
 import subprocess
@@ -13,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,6 +28,7 @@ from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, spawn_process
 from dappled.drivers.gphoto2.messages import Carryover
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
+from dappled.drivers.raw.raw_file import read_exif
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from dappled.testing import (
@@ -88,7 +91,7 @@ def running(camera: GPhoto2Camera) -> Iterator[GPhoto2Camera]:
         camera.stop()
 
 
-@pytest.mark.parametrize(("f_number", "shown"), [(None, "2.8"), (14.8, "16"), (22.0, "22"), (59.2, "32")])
+@pytest.mark.parametrize(("f_number", "shown"), [(None, "2.8"), (14.8, "14"), (22.0, "22"), (59.2, "32")])
 def test_the_simulated_lens_is_set_to_the_stop_of_its_pictures(f_number: float | None, shown: str) -> None:
     with (
         SimulatedBody.start(BodyOptions(picture="pattern:1000:dng", f_number=f_number)) as body,
@@ -96,6 +99,18 @@ def test_the_simulated_lens_is_set_to_the_stop_of_its_pictures(f_number: float |
     ):
         until_state(camera, "ready")
         assert {one.name: one.value for one in camera.settings()}["aperture"] == shown
+
+
+def test_the_simulated_body_is_set_to_the_time_of_its_pictures() -> None:
+    options = BodyOptions(scale=0.125, scene="white", f_number=14.8)
+    with SimulatedBody.start(options) as body, running(open_camera({"port": body.port})) as camera:
+        until_state(camera, "ready")
+        camera.fire(1)
+        file = content(arrived(camera, 1))
+        shown = {one.name: one.value for one in camera.settings()}["shutter_speed"]
+    taken_s = read_exif(io.BytesIO(file)).exposure_s
+    assert taken_s is not None
+    assert abs(math.log2(float(Fraction(shown)) / taken_s)) <= 1 / 6 + 0.05  # marked times are rounded
 
 
 class TestContractToTheCard(CameraContract):

@@ -4,12 +4,13 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from dappled.mocks.body.body import BodyError, BodyOptions, SimulatedBody, exposer, pattern
+from dappled.mocks.body.body import BodyError, BodyOptions, SimulatedBody, pattern, pictures
 
 
 def test_a_body_listens_obeys_and_ends() -> None:
@@ -79,6 +80,10 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     class Camera:
         def __init__(self, *seed: int, **options: object) -> None:
             asked.append((*seed, options))
+            self.optics = SimpleNamespace(f_number=7.4)
+
+        def metered(self, f_number: float) -> tuple[float, float]:
+            return f_number / 740, 0.5
 
         def expose(self, trigger_t_s: float, shot_number: int, *, f_number: float | None) -> SimpleNamespace:
             asked.append((trigger_t_s, shot_number))
@@ -91,7 +96,11 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     renderer.__dict__["reference_camera"] = Camera
     monkeypatch.setitem(sys.modules, "dappled.mocks.scene.masked_camera", renderer)
     options = BodyOptions(seed=9, scale=0.5, start_monotonic_ns=1_000_000_000, truth=tmp_path)
-    assert exposer(options)(3_500_000_000, 4) == (b"raw", "dng")
+    assert pictures(replace(options, f_number=14.8)).exposure_s == 0.02
+    asked.clear()
+    source = pictures(options)
+    assert source.exposure_s == 0.01
+    assert source.expose(3_500_000_000, 4) == (b"raw", "dng")
     assert asked[0][0] == 9
     wanted = asked[0][1]
     assert isinstance(wanted, dict)
@@ -106,5 +115,5 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
 
 def test_a_file_is_shown_every_time(tmp_path: Path) -> None:
     (tmp_path / "a.cr2").write_bytes(b"raw")
-    expose = exposer(BodyOptions(picture=str(tmp_path / "a.cr2")))
+    expose = pictures(BodyOptions(picture=str(tmp_path / "a.cr2"))).expose
     assert expose(0, 1) == expose(0, 2) == (b"raw", "cr2")

@@ -206,18 +206,26 @@ def pattern(shot_number: int, size: int) -> bytes:
     return b"".join(stamp + page[len(stamp) :] for stamp in stamps)[:size]
 
 
-def exposer(options: BodyOptions) -> Expose:
+@dataclass(frozen=True, slots=True)
+class Pictures:
+    """Where a body's pictures come from, and the exposure time that it meters, in s (None: nothing is metered)."""
+
+    expose: Expose
+    exposure_s: float | None = None
+
+
+def pictures(options: BodyOptions) -> Pictures:
     """The source of pictures that the options name. Raises ValueError for one that isn't there."""
     if options.picture == "simulated":
         return _simulated(options)
     if options.picture.startswith("pattern:"):
         _, size, extension = options.picture.split(":")
-        return _delayed(options.delay_s, lambda number: pattern(number, int(size)), extension)
+        return Pictures(_delayed(options.delay_s, lambda number: pattern(number, int(size)), extension))
     path = Path(options.picture)
     if not path.is_file():
         raise ValueError(f"picture {options.picture!r} is neither simulated, nor pattern:SIZE:EXT, nor a file")
     data = path.read_bytes()
-    return _delayed(options.delay_s, lambda _number: data, path.suffix[1:])
+    return Pictures(_delayed(options.delay_s, lambda _number: data, path.suffix[1:]))
 
 
 def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Expose:
@@ -229,7 +237,7 @@ def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Ex
     return expose
 
 
-def _simulated(options: BodyOptions) -> Expose:
+def _simulated(options: BodyOptions) -> Pictures:
     # Imported here: it loads the whole renderer, which a body that shows patterns doesn't need.
     start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
     epoch_utc_s = time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9
@@ -264,7 +272,8 @@ def _simulated(options: BodyOptions) -> Expose:
             (options.truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
         return made.file, made.name_suffix.lstrip(".")
 
-    return expose
+    exposure_s, _ = camera.metered(camera.optics.f_number if options.f_number is None else options.f_number)
+    return Pictures(expose, exposure_s)
 
 
 def _obey(line: str, eos: Eos450d, responder: Responder, faults: BodyFaults) -> str:
@@ -323,14 +332,16 @@ def serve(options: BodyOptions, lines: Iterable[str]) -> None:
     faults = BodyFaults(clock)
     for fault in options.faults:
         faults.command(fault)
+    source = pictures(options)
     eos = Eos450d(
-        exposer(options),
+        source.expose,
         faults,
         clock,
         serial=options.serial,
         card_bytes=options.card_bytes,
         pairs=options.pairs,
         f_number=options.f_number,
+        exposure_s=source.exposure_s,
     )
     responder = Responder(eos, faults, addresses=options.addresses)
     _say(f"port {' '.join(map(str, responder.ports))}")

@@ -55,8 +55,10 @@ class Eos450d:
         card_bytes: int = CARD_BYTES,
         pairs: bool = False,
         f_number: float | None = None,
+        exposure_s: float | None = None,
     ) -> None:
-        """`f_number` is what the body says its lens is set to, to the next full stop (None: f/2.8)."""
+        """What the body says it is set to, to the next third of a stop: f-number (None: f/2.8), exposure time in
+        seconds (None: 1/250 s)."""
         self._expose = expose
         self._faults = faults
         self._serial = serial
@@ -65,7 +67,7 @@ class Eos450d:
         self._session = self._working = False
         self._releases = self._looks = 0
         self._card = Card(card_bytes, faults, clock.utc_ns() // 10**9)
-        self._properties = Properties(serial, pairs=pairs, f_number=f_number)
+        self._properties = Properties(serial, pairs=pairs, f_number=f_number, exposure_s=exposure_s)
         self._handlers: dict[int, Handler] = {
             Op.GET_DEVICE_INFO: self._device_info,
             Op.OPEN_SESSION: self._open,
@@ -314,11 +316,13 @@ _FORMATS = (_RAW, _RAW_AND_JPEG)
 class Properties:
     """The values of the properties, and the events not fetched yet. The caller holds the body's lock."""
 
-    def __init__(self, serial: str, *, pairs: bool, f_number: float | None = None) -> None:
+    def __init__(
+        self, serial: str, *, pairs: bool, f_number: float | None = None, exposure_s: float | None = None
+    ) -> None:
         self._events: deque[bytes] = deque()
         self._values: dict[int, bytes] = {
             Prop.APERTURE: _u32(0x20 if f_number is None else _aperture(f_number)),
-            Prop.SHUTTER_SPEED: _u32(0x78),
+            Prop.SHUTTER_SPEED: _u32(0x78 if exposure_s is None else _shutter_speed(exposure_s)),
             Prop.ISO: _u32(0x48),
             Prop.AUTO_EXPOSURE_MODE: _u32(3),
             Prop.DRIVE_MODE: _u32(0),
@@ -449,8 +453,19 @@ def _custom_functions(*, mirror_lockup: int) -> bytes:
 
 
 def _aperture(f_number: float) -> int:
-    """The code of the full stop next to an f-number, f/2.8 (0x20) to f/32 (0x58): eight to a stop."""
-    return min(max(8 + 8 * round(2 * math.log2(f_number)), 0x20), 0x58)
+    """The code of the third of a stop next to an f-number, f/2.8 (0x20) to f/32 (0x58)."""
+    return min(max(_thirds(8 + 16 * math.log2(f_number)), 0x20), 0x58)
+
+
+def _shutter_speed(exposure_s: float) -> int:
+    """The code of the third of a stop next to an exposure time, 30 s (0x10) to 1/4000 s (0x98)."""
+    return min(max(_thirds(0x38 - 8 * math.log2(exposure_s)), 0x10), 0x98)
+
+
+def _thirds(eighths: float) -> int:
+    """Eighths of a stop to the next third of a stop: the codes of a stop end on 0, 3 and 5."""
+    stop, part = divmod(round(3 * eighths / 8), 3)
+    return 8 * stop + (0, 3, 5)[part]
 
 
 def _words(values: Iterable[int]) -> bytes:
