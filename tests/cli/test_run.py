@@ -5,7 +5,10 @@ from __future__ import annotations
 import gc
 import json
 import os
+import re
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -20,23 +23,25 @@ from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.simulation import free_port
 from tests.daemon.fakes import eventually
+from tests.system.conftest import dappled
 
 HELD_UP = 0.2  # of the objects of the process may be looked at while it flies
 LONG_S = "120"  # a bound, never waited for
 
 
 class Ground(threading.Thread):
-    """A ground station that asks for one frame as soon as it hears the camera; then `after`."""
+    """A ground station that asks for frames as soon as it hears the camera; then `after`."""
 
-    def __init__(self, port: int, after: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, port: int, after: Callable[[], None] = lambda: None, frames: int = 1) -> None:
         super().__init__(daemon=True)
+        self._frames = frames
         self._url, self._after = f"udpout:127.0.0.1:{port}", after
         self.outcomes: list[Outcome] = []
 
     def run(self) -> None:
         with GroundClient(self._url) as client:
             client.find_camera(60.0)
-            self.outcomes = client.capture(1, 0.0, timeout_s=60.0, on_outcome=lambda _: None)
+            self.outcomes = client.capture(self._frames, 0.0, timeout_s=60.0, on_outcome=lambda _: None)
         self._after()
 
 
@@ -88,6 +93,42 @@ def test_it_ends_when_it_has_its_frames(
     assert flight.balance is not None
     assert flight.balance.balanced
     assert flight.balance.closed
+
+
+def test_frames_that_could_not_be_decoded_are_a_failure_though_all_are_safe(
+    config: Path, port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masked = '[camera]\nprofile = "reference-36mm"\n'
+    text = config.read_text().replace("[decode]\nenabled = false\n", '[mask]\nprofile = "reference-5x5"\n')
+    config.write_text(text.replace("[camera]\n", masked))
+    ground = Ground(port, frames=3)
+    ground.start()
+    assert main(["run", "--config", str(config), "--frames", "3", "--for", LONG_S]) == 1
+    ground.join(60)
+    assert capsys.readouterr().err.splitlines()[-1] == "3 shots: 3 frames safe, 0 decoded, 3 with a problem"
+    (flight,) = flight_report.list_flights(tmp_path / "flights")
+    assert flight.balance is not None
+    assert flight.balance.balanced
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("burning", [0, 2], ids=["calm", "both cores loaded"])
+def test_a_run_that_goes_well_tells_of_no_problem(tmp_path: Path, burning: int) -> None:
+    """Every line on a person's screen is one of these: no warning of a library, no death of a process, no "problem"."""
+    load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(burning)]
+    try:
+        done = dappled("run", "--simulate", "--frames", "4", "--for", "300", cwd=tmp_path, timeout_s=360)
+    finally:
+        for one in load:
+            one.kill()
+            one.wait()
+    assert done.returncode == 0, done.stderr
+    assert re.fullmatch(r"(00000[0-3]  IMAGE_START_CAPTURE [^\n]* carriers [^\n]*\n){4}", done.stdout)
+    head = ("simulating ", "flight ", "stream ", "console ", "camera ready", "waiting for ")
+    *told, last = done.stderr.splitlines()
+    assert [line for line in told if not line.startswith(head)] == []
+    assert last == "4 shots: 4 frames safe, 4 decoded, 0 with a problem"
+    assert not re.search("problem|PROBLEM|died|Warning|Traceback", done.stdout + "\n".join(told))
 
 
 def test_time_that_runs_out_before_the_frames_is_a_failure(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
