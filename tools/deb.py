@@ -101,6 +101,7 @@ def build(arch: str, suite: str, out: Path) -> Path:
     )
     texts[settings] = (ROOT / "systemd" / "dappled.toml").read_text(encoding="utf-8")
     texts[Path("/usr/share/doc/dappled/copyright")] = (ROOT / "LICENSE").read_text(encoding="utf-8")
+    texts[HOME / "packaged"] = "This copy of dappled belongs to a Debian package.\n"  # see dappled.errors.PACKAGED
     for path, text in texts.items():
         put(stage / path.relative_to("/"), text, 0o755 if path == command else 0o644)
     size_kib = sum(path.stat().st_size for path in stage.rglob("*") if path.is_file()) // 1024

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import ClassVar
 
 SERVICE_MANIFEST = "installed.json"  # which `make install` leaves in its environment
+PACKAGED = "packaged"  # which the Debian package has beside dappled's own folder
 _NUMBER = re.compile(r"\d+(?:[.,]\d+)*(?:( [a-z]+?)s?\b)?")
 
 
@@ -72,6 +73,6 @@ def report(log: logging.Logger, what: str, error: BaseException) -> None:
 def install_extra(extra: str) -> str:
     """How a person gets what an extra brings. The service's own environment can't be added to."""
     wanted = f"pip install 'dappled[{extra}]'"
-    if (Path(sys.prefix) / SERVICE_MANIFEST).exists():
+    if (Path(sys.prefix) / SERVICE_MANIFEST).exists() or (Path(__file__).parents[1] / PACKAGED).exists():
         return f"the onboard installation leaves it out; on the ground, in an environment of its own: {wanted}"
     return f"install it with: {wanted}"

@@ -63,3 +63,7 @@ def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path:
     run = (getattr(sys, "_base_executable", sys.executable), "-I", "-c")
     code = f"import sys; sys.path[:0] = [{str(home)!r}]; import dappled, gphoto2, rawpy, zmq; print(dappled.__file__)"
     assert ask(*run, code).strip() == str(home / "dappled" / "__init__.py")
+    code = (
+        f"import sys; sys.path[:0] = [{str(home)!r}]; from dappled import errors; print(errors.install_extra('ground'))"
+    )
+    assert "on the ground, in an environment of its own" in ask(*run, code)
