@@ -132,6 +132,7 @@ class ConsoleApp:
         return {
             "is": "about",
             "start": self._feed.start,
+            "recording": self._feed.recording,
             "map": None if self._background is None else self._background.bounds(),
             "path": list(self._feed.path),
         }

@@ -127,6 +127,8 @@ class Feed:
     All calls on one event loop.
     """
 
+    recording = False  # the page leaves out what only a daemon can do or say
+
     def __init__(
         self,
         endpoint: str,

@@ -61,6 +61,8 @@ class RecordedFeed(Feed):
     """Keeps all frames of a recording from the start. Slices are decoded when a page asks for them, and one after the
     other in between, the last frame first, so that every frame has its small picture."""
 
+    recording = True
+
     def __init__(self, source: FrameSource, hub: Hub, studio: Studio) -> None:
         super().__init__("", "", hub, studio)
         self._source = source

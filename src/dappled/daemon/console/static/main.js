@@ -12,11 +12,12 @@ const settings = new Settings($("settings"), (name, value) => fire("/api/setting
 const frames = new Map();   // index → frame event
 let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
 let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
+let isRecording = false;   // of `dappled open`: there is no daemon
 let interval = null, lastChecks = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
 const handlers = {
-  about(event) { map.setBackground(event.map); map.setPath(event.path); if (event.start) began(event.start); },
+  about(event) { recording(event.recording); map.setBackground(event.map); map.setPath(event.path); if (event.start) began(event.start); },
   start(event) { began(event.start); },
   state(event) { token = event.token; tokenAt = performance.now(); if (event.health) showState(event); tick(); },
   frame: showFrame,
@@ -29,6 +30,13 @@ function began(start) {
   if (flight && flight !== start.flight) location.reload();   // another flight: start again
   flight = start.flight;
   $("flight").textContent = [start.flight, start.camera, start.mask || "no mask"].join("  ·  ");
+}
+
+// Over a recording nothing can be fired, set or awaited: the page leaves out all that would.
+function recording(given) {
+  isRecording = Boolean(given);
+  document.body.toggleAttribute("data-recording", isRecording);
+  for (const id of ["tab-live", "clock-box"]) $(id).hidden = isRecording;
 }
 
 function showState({ health, checks, verdict, frames_left: framesLeft = null }) {
@@ -161,8 +169,15 @@ function choose(index) {
   for (const one of $("strip").children) one.setAttribute("aria-selected", String(Number(one.dataset.frame) === index));
   map.select(index);
   showFacts(frame);
-  document.querySelector("#instruments .histogram")?.replaceWith(histogramCell());
+  if (isRecording) showRecorded(frame);
+  else document.querySelector("#instruments .histogram")?.replaceWith(histogramCell());
   stage.set(frame);
+}
+
+// Of a recording: the histogram above the picture, and the frame's own place below the map.
+function showRecorded({ tag: { frame, pose } }) {
+  $("instruments").replaceChildren(histogramCell());
+  $("map-text").textContent = pose.latitude_deg === null ? `frame ${frame}: no position` : `frame ${frame}: ${fixed(pose.latitude_deg, 6)}°, ${fixed(pose.longitude_deg, 6)}°  ·  ${fixed(pose.height_above_home_m, 1, "m")} up`;
 }
 
 function showFacts({ tag, slices, verdict }) {
@@ -195,11 +210,11 @@ function showLog(lines) {
 
 function tick() {
   const age = performance.now() - heardAt, lost = heardAt > 0 && age > STALE_MS, stale = lost || Boolean(ended);
-  const words = ended ? "ended" : lost ? `silent ${Math.round(age / 1000)} s` : connected ? "live" : "connecting";
+  const words = isRecording ? recordingWords() : ended ? "ended" : lost ? `silent ${Math.round(age / 1000)} s` : connected ? "live" : "connecting";
   $("contact").textContent = words;
-  $("contact").dataset.state = lost && !ended ? "lost" : "live";
+  $("contact").dataset.state = (isRecording ? !connected : lost && !ended) ? "lost" : "live";
   if (utcAt !== null && !stale) $("clock").textContent = utc(utcAt + age * 1e6);
-  if (stale !== wasStale) {
+  if (stale !== wasStale && !isRecording) {
     wasStale = stale;
     document.body.toggleAttribute("data-stale", stale);
     if (lastChecks) showChecks(lastChecks, stale);
@@ -220,6 +235,8 @@ function tick() {
   settings.enable(able);
   $("interval-stop").disabled = Boolean(ended) || stopping || !(interval || lost);
 }
+
+const recordingWords = () => (!connected ? "no answer: has dappled open ended?" : ended ? `recording  ·  ${recorded(ended)}` : "recording");
 
 // What a flight brought, in words.
 function recorded({ wished = 0, safe = 0, failed = 0 }) {
