@@ -68,6 +68,12 @@ def test_all_is_well() -> None:
         ("Position", "caution", "±22 m", {"vehicle": VEHICLE | {"position_sigma_m": 22.4}}),
         ("Position", "caution", "accuracy unknown", {"vehicle": VEHICLE | {"position_sigma_m": None}}),
         ("Position", "caution", "attitude unknown", {"vehicle": VEHICLE | {"yaw_deg": None}}),
+        (
+            "Position",
+            "caution",
+            "the satellite receiver has a 2D fix",
+            {"vehicle": VEHICLE, "gnss": {"fix_type": 2, "satellites": 4}},
+        ),
         ("Clock", "no-go", "does not know the date", {"utc_ns": 1000}),
         ("Clock", "caution", "autopilot's clock is unknown", {"clock": None}),
         ("Clock", "caution", "by packet arrival, ±80 ms", {"clock": {"source": "arrival", "sigma_ms": 80.0}}),

@@ -61,3 +61,13 @@ def test_what_is_unknown_has_no_line() -> None:
     assert not any(name == "dappled_disk_free_bytes" for name, _ in read(HEALTH))
     known = {**HEALTH, "disk": {"free_bytes": 5e9, "folder": "/x"}}
     assert read(known)["dappled_disk_free_bytes", ""] == 5e9
+
+
+def test_what_is_left_and_the_fix_are_gauges() -> None:
+    names = ("frames_left", "card_frames_left", "gnss_fix_type", "gnss_satellites")
+    unknown = read({**HEALTH, "gnss": None, "body": None, "frame_bytes": None})
+    assert not any(name == f"dappled_{one}" for name, _ in unknown for one in names)
+    found = {"free_bytes": 5e9, "folder": "/x"}, {"fix_type": 6, "satellites": 17}, {"card_frames": 0}
+    known = {**HEALTH, **dict(zip(("disk", "gnss", "body"), found, strict=True)), "frame_bytes": 20e6}
+    told = read({**known, "min_free_bytes": 1e9})
+    assert [told[f"dappled_{one}", ""] for one in names] == [200, 0, 6, 17]  # (5 - 1) GB in frames of 20 MB

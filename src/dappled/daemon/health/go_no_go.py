@@ -10,6 +10,7 @@ from dappled.errors import counted
 from dappled.flight.layout import disk_shortage
 
 State = Literal["go", "caution", "no-go"]
+_WEAK_FIXES = {1: "no fix", 2: "a 2D fix"}  # by GPS_FIX_TYPE; 0, no receiver, may fly by other means
 _SURE_M, _SLOW_CLOCK_MS, _FRESH_MS = 5.0, 50.0, 3000.0
 FAILING = 3  # so many frames in a row that can't be decoded are no accident
 _FRAME_BYTES = 20e6  # of a large one: whether little room is left before a flight has shown its own
@@ -51,7 +52,7 @@ def checks(health: Mapping[str, Any]) -> list[Check]:
         *_body(health),
         _disk(health),
         _link(health),
-        _position(health.get("vehicle")),
+        _position(health.get("vehicle"), health.get("gnss")),
         _clock(health),
         _decoding(health),
         _service(health.get("dead", [])),
@@ -138,13 +139,17 @@ def _quiet_links(link: Mapping[str, Any], silent: int) -> list[str]:
     return [words.format(count, link["urls"]) for count, words in counts if count]
 
 
-def _position(vehicle: Mapping[str, Any] | None) -> Check:
+def _position(vehicle: Mapping[str, Any] | None, gnss: Mapping[str, Any] | None) -> Check:
     if vehicle is None or vehicle["latitude_deg"] is None:
         return Check("Position", "caution", "unknown: frames have no position")
     sigma, yaw = vehicle["position_sigma_m"], vehicle["yaw_deg"]
     text = "accuracy unknown" if sigma is None else _about(sigma, "m")
+    if fix := None if gnss is None else _WEAK_FIXES.get(gnss["fix_type"]):
+        text += f", but the satellite receiver has {fix}"
     if yaw is None:
-        return Check("Position", "caution", f"{text}, attitude unknown")
+        text += ", attitude unknown"
+    if fix or yaw is None:
+        return Check("Position", "caution", text)
     return Check("Position", "go" if sigma is not None and sigma <= _SURE_M else "caution", text)
 
 

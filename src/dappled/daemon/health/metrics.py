@@ -9,6 +9,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from dappled.daemon.health import go_no_go
+
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _STATES = ("absent", "starting", "ready", "busy", "faulted")
 
@@ -39,6 +41,14 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
     yield _counter("wishes", "Capture requests that became shots", {"": shots["wished"]})
     yield _gauge("shots_pending", "Shots under way", {"": shots["pending"]})
     yield _gauge("disk_free_bytes", "Free space where flights are recorded", {"": disk["free_bytes"]})
+    yield _gauge(
+        "frames_left", "Frames that fit on the disk, by their sizes so far", {"": go_no_go.frames_left(health)}
+    )
+    room = (health.get("body") or {}).get("card_frames")
+    yield _gauge("card_frames_left", "Frames that fit on the camera's card, as the camera says", {"": room})
+    fix = health.get("gnss") or {}
+    yield _gauge("gnss_fix_type", "GPS_FIX_TYPE of the satellite receiver's last report", {"": fix.get("fix_type")})
+    yield _gauge("gnss_satellites", "Satellites in the receiver's last report", {"": fix.get("satellites")})
     yield _counter("mavlink_packets", "Packets heard and sent", {"": link["packets"]})
     yield _counter("positions", "Positions heard", {"": link["positions"]})
     stages = {stage["name"]: stage for stage in health["stages"] if "waiting" in stage}
