@@ -9,6 +9,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -289,7 +290,7 @@ def test_a_corrupted_ledger_of_a_crashed_flight_is_made_anew(flights: Path) -> N
             frames.append(deliver(flight, index, b"raw %d" % index))
     flight.close()
     name = flight.folder.name
-    with sqlite3.connect(flights / "index.sqlite") as index_file:
+    with closing(sqlite3.connect(flights / "index.sqlite")) as index_file, index_file:
         index_file.execute("UPDATE flights SET sealed = 0")  # as if it had crashed before that
     index_file.close()
     for page in range(pages(flight.folder.ledger)):

@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -145,13 +146,13 @@ def test_a_file_that_is_no_ledger_is_told(tmp_path: Path, content: bytes) -> Non
 
 def test_foreign_newer_and_missing_ledgers_are_told(tmp_path: Path) -> None:
     foreign, newer = tmp_path / "foreign.sqlite", tmp_path / "newer.sqlite"
-    with sqlite3.connect(foreign) as db:
+    with closing(sqlite3.connect(foreign)) as db, db:
         db.execute("CREATE TABLE notes (a)")
     db.close()
     with pytest.raises(FlightError, match="not a dappled ledger"):
         ledger_at(foreign)
     ledger_at(newer).close()
-    with sqlite3.connect(newer) as db:
+    with closing(sqlite3.connect(newer)) as db, db:
         db.execute("PRAGMA user_version=99")
     db.close()
     with pytest.raises(FlightError, match=r"version 99, this dappled reads version 1"):

@@ -7,6 +7,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -61,7 +62,7 @@ def test_the_second_reader_follows_the_chain(flight: Path) -> None:
     assert head is not None
     (line,) = read(flight, 1)
     assert line.endswith(f"rows, the last link is {head.link}")
-    with sqlite3.connect(flight / "flight.sqlite") as db:
+    with closing(sqlite3.connect(flight / "flight.sqlite")) as db, db:
         db.execute("UPDATE shots SET wished_utc_ns = 9 WHERE idx = 1")
         db.execute("DELETE FROM events WHERE number = 1")
         db.execute("UPDATE chain SET key = '[9]' WHERE number = 30")
@@ -96,7 +97,7 @@ def test_the_shell_lines_in_the_document_check_a_tag(flight: Path) -> None:
         ).stdout.split()[0]
         for line in lines
     ]
-    with sqlite3.connect(flight / "flight.sqlite") as ledger:
+    with closing(sqlite3.connect(flight / "flight.sqlite")) as ledger, ledger:
         (sha256,) = ledger.execute("SELECT sha256 FROM tags WHERE idx = 0").fetchone()
     ledger.close()
     assert said == [sha256, sha256]

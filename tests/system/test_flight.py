@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import jsonschema
@@ -124,7 +125,7 @@ def test_one_flipped_byte_of_the_telemetry_is_found(copied: Path, share: float) 
 
 
 def test_each_missing_hash_is_found(copied: Path) -> None:
-    with sqlite3.connect(copied / "flight.sqlite") as ledger:
+    with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger, ledger:
         for index, table in enumerate(("poses", "tags", "results")):
             ledger.execute(f"DELETE FROM {table} WHERE idx = {index}")  # noqa: S608  # a table's name from this test
     ledger.close()
@@ -135,7 +136,7 @@ def test_each_missing_hash_is_found(copied: Path) -> None:
 
 
 def test_a_changed_slices_hash_is_found(copied: Path) -> None:
-    with sqlite3.connect(copied / "flight.sqlite") as ledger:
+    with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger, ledger:
         (record,) = ledger.execute("SELECT record FROM results WHERE idx = 0").fetchone()
         changed = {**json.loads(record), "slices_sha256": "0" * 64}
         ledger.execute(
@@ -166,7 +167,7 @@ def test_a_new_recipe_writes_beside_the_old_results(copied: Path) -> None:
         verified = dappled("replay", str(copied), "--verify", *words)
         assert verified.returncode == 0, verified.stdout + verified.stderr
     assert "again: 3 frames decoded again" in dappled("flight", "show", str(copied)).stdout
-    with sqlite3.connect(copied / "flight.sqlite") as ledger_file:
+    with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger_file, ledger_file:
         ledger_file.execute("DELETE FROM results WHERE idx = 1 AND run = 'again'")
     ledger_file.close()
     spoilt = dappled("replay", str(copied), "--verify", "--run", "again")

@@ -13,7 +13,7 @@ from dappled.products.exports import light_files
 from tests.products.fields import light_field
 
 WITHOUT = """
-import os, select, signal, sys
+import os, select, shutil, signal, sys
 
 LINUX = {"fcntl", "termios", "pty", "pwd", "grp", "resource", "syslog", "gpiod", "gphoto2"}
 
@@ -28,6 +28,7 @@ for name in LINUX:
 for name in ("memfd_create", "fork", "geteuid", "getuid", "posix_fadvise", "sched_setaffinity", "register_at_fork",
              "O_DIRECT", "O_CLOEXEC", "O_NOFOLLOW", "O_DIRECTORY", "O_NONBLOCK", "O_PATH"):
     delattr(os, name)
+shutil._use_fd_functions = False  # as Python itself decides where files have no such descriptors
 for name in ("epoll", "poll"):
     delattr(select, name)
 for name in ("SIGPIPE", "SIGHUP", "SIGUSR1", "SIGUSR2", "SIGKILL", "pthread_sigmask"):

@@ -140,7 +140,11 @@ def _within(earlier: bytes, later: bytes) -> bool:
 def _opened(image: bytes) -> sqlite3.Connection:
     connection = sqlite3.connect(":memory:")
     # SQLite reads no WAL database from memory; bytes 18 and 19 of the header say how it is journalled
-    connection.deserialize(image[:18] + b"\1\1" + image[20:])
+    try:
+        connection.deserialize(image[:18] + b"\1\1" + image[20:])
+    except sqlite3.Error:
+        connection.close()
+        raise
     return connection
 
 
