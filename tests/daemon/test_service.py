@@ -168,8 +168,10 @@ def test_a_flight_that_closes_badly_is_kept(
 ) -> None:
     """Without a shot in the journal there is telemetry still, and perhaps a photograph that somebody took by hand."""
     service = started(settings, [])
+    really = Recording.close
 
-    def refuse(_: object) -> None:
+    def refuse(recording: Recording) -> None:
+        really(recording)  # nothing is left open for the tests after this one
         raise FlightError("the disk went away")
 
     with monkeypatch.context() as broken:
