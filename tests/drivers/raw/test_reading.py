@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 import mmap
+import tracemalloc
 import zlib
 from collections.abc import Callable
 from contextlib import suppress
@@ -314,3 +315,19 @@ def test_pixels_that_are_not_stored_are_not_unpacked(name: str) -> None:
         tifffile.imwrite(file, values, compression="zlib")
     with pytest.raises(RawFileError, match=r"its 9000 × 9000 pixels would take 81 MB of memory, and the .* stored"):
         read(file.getvalue(), name)
+
+
+def test_an_error_does_not_hold_the_file(tmp_path: Path) -> None:
+    """Errors are kept for a while, in cycles until the collector comes by: ten frames of 11 MB were."""
+    path = tmp_path / "a.cr2"
+    path.write_bytes(bytes(range(256)) * 40_000)
+    tracemalloc.start()
+    try:
+        with pytest.raises(RawFileError) as kept:
+            read_metadata(path)
+        held, most = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert "is not a frame that can be read" in str(kept.value)
+    assert most > 10_000_000
+    assert held < 1_000_000

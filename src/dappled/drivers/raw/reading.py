@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import os
+import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -114,20 +115,26 @@ def _open(source: RawSource, label: str) -> Iterator[BinaryIO]:
 
 @contextmanager
 def _sentences(label: str) -> Iterator[None]:
+    """Word whatever a reader raises. What its frames hold goes at once: the whole file, which the error would keep."""
     try:
         yield
-    except (rawpy.LibRawFileUnsupportedError, UnidentifiedImageError) as error:
-        raise RawFileError(
-            f"{label} is not a frame that can be read (camera raw, DNG, Lytro, TIFF, PNG, JPEG or NPY), or is cut short"
-        ) from error
-    except ClaimError as error:
-        raise RawFileError(f"{label} can't be read as a frame: {error}") from error
-    except MemoryError as error:
-        raise RawFileError(f"{label} needs more memory than is free: close other programs") from error
     except Exception as error:  # the readers raise anything on damaged bytes
-        raise RawFileError(
-            f"{label} can't be read as a frame, it may be damaged or cut short: {_words(error)}"
-        ) from error
+        traceback.clear_frames(error.__traceback__)
+        raise RawFileError(_sentence(label, error)) from error
+
+
+def _sentence(label: str, error: Exception) -> str:
+    """Why a file can't be read as a frame."""
+    match error:
+        case rawpy.LibRawFileUnsupportedError() | UnidentifiedImageError():
+            kinds = "camera raw, DNG, Lytro, TIFF, PNG, JPEG or NPY"
+            return f"{label} is not a frame that can be read ({kinds}), or is cut short"
+        case ClaimError():
+            return f"{label} can't be read as a frame: {error}"
+        case MemoryError():
+            return f"{label} needs more memory than is free: close other programs"
+        case _:
+            return f"{label} can't be read as a frame, it may be damaged or cut short: {_words(error)}"
 
 
 def _length(file: BinaryIO) -> int:
