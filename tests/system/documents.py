@@ -74,6 +74,12 @@ ELSEWHERE = {
 }
 """Commands that need more than this stage has, and the tests that give it to them."""
 
+FINDINGS = {
+    "dappled doctor": "go",  # no-go: not every place on the stage has a camera
+    "dappled depth --flight": "fly lower, or use pairs of frames",  # the demo's frames are at the limit of Eq 5
+}
+"""Commands that may end with 1 here because of what they find, and what they say then; the documents say so too."""
+
 
 @dataclass(frozen=True)
 class Stage:
@@ -120,12 +126,12 @@ class Stage:
             )
         except subprocess.TimeoutExpired:
             return f"{command}\n  has not ended after 120 s"
-        no_go = words.startswith("dappled doctor") and done.returncode == 1 and done.stdout  # a finding, no failure
-        return (
-            None
-            if done.returncode == 0 or no_go
-            else f"{command}\n  exit {done.returncode}: {done.stderr.strip()[-600:]}"
+        found = any(
+            words.startswith(start) and done.returncode == 1 and sentence in done.stdout + done.stderr
+            for start, sentence in FINDINGS.items()
         )
+        well = done.returncode == 0 or found
+        return None if well else f"{command}\n  exit {done.returncode}: {done.stderr.strip()[-600:]}"
 
     def _make(self, command: str) -> str | None:
         """The target is there; running it is what other tests and CI do."""
