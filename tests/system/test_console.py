@@ -380,6 +380,18 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
             .map(([name, box]) => `${name} ${box.width} ${box.height}`)"""
     )
     assert small == [], "a thumb misses these"
+    before, after = page.evaluate(
+        """(long) => {
+            const names = innerWidth < 700 ? ['shoot'] : ['shoot', 'interval-stop'];
+            const at = () => names.map((name) => document.getElementById(name).getBoundingClientRect().y);
+            const before = at();
+            for (const name of ['verdict-text', 'outcome']) document.getElementById(name).textContent = long;
+            return [before, at()];
+        }""",
+        "decoding: 3 frames in a row can't be decoded: the carriers are nowhere near those of the calibration; " * 3,
+    )
+    page.screenshot(path=SCREENSHOTS / f"long-reason-{width}x{height}.png")
+    assert after == before, "a reason of many words moves a button from under a finger"
     assert watched.wrong == []
 
 
