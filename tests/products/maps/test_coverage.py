@@ -103,7 +103,7 @@ def test_a_tilted_frame_sees_where_its_axis_points() -> None:
 
 def test_frames_and_directions_are_counted_apart() -> None:
     twice = coverage.cover(seen([frame(1, 0, 0), frame(2, 0, 0)]), grid())
-    assert (twice.frames.max(), twice.directions.max()) == (2, 1)
+    assert [twice.frames.max(), twice.directions.max()] == [2, 1]
     places = [frame(n, 30 * math.sin(a), 30 * math.cos(a)) for n, a in enumerate(np.arange(4) * math.pi / 2)]
     around = coverage.cover(seen(places), grid())
     row, column = (side // 2 for side in around.frames.shape)

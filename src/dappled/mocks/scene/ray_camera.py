@@ -155,7 +155,8 @@ class RayCamera:
             strengths = strengths * left_by_diffraction(made.per_mm, self.mask_distance_mm)
         own = made.per_mm @ _turn(-(self.turn_rad + self.turned_rad))  # back in the mask's own axes
         place = own @ (np.array(self.shift_mm) + self.moved_mm)
-        return made.orders, strengths * np.exp(2j * np.pi * place), made.per_mm
+        turned: NDArray[np.complex128] = np.exp(2j * np.pi * place)
+        return made.orders, turned * strengths, made.per_mm
 
     def lattice(self) -> Lattice:
         """Where the carriers are, in cycles/pixel (in the middle of the field, where the film is bowed)."""

@@ -53,9 +53,9 @@ def coloured(values: NDArray[np.floating], low: float, high: float) -> Bytes:
     at = np.arange(len(_VIRIDIS))
     made = np.stack([np.interp(share, at, _VIRIDIS[:, c]) for c in range(3)], axis=-1)
     unknown = ~np.isfinite(values)
-    rows, columns = np.indices(unknown.shape, sparse=True)
+    rows, columns = (np.arange(side) for side in unknown.shape)
     made[unknown] = UNKNOWN
-    made[unknown & ((rows + columns) % _HATCH_STEP == 0)] = HATCH
+    made[unknown & ((rows[:, None] + columns) % _HATCH_STEP == 0)] = HATCH
     colours: Bytes = np.rint(made).astype(np.uint8)
     return colours
 

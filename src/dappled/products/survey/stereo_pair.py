@@ -60,7 +60,8 @@ def pair(made: Survey, cell_m: float | None = None) -> FlightPair:
     along = step / float(np.linalg.norm(step))
     axes = np.array([along, [-along[1], along[0]]])  # to the right, and up
     rims = [map_grid.footprint(one.eye, made.ground)[:, :2] @ axes.T for one in (left, right)]
-    low, high = (np.array(f([g(rim, axis=0) for rim in rims], axis=0)) for f, g in ((np.max, np.min), (np.min, np.max)))
+    low = np.max([rim.min(axis=0) for rim in rims], axis=0)
+    high = np.min([rim.max(axis=0) for rim in rims], axis=0)
     size = (cell_m or made.gsd_m) * left.eye.scale
     size = max(size, float((high - low).max()) / _LARGEST)
     x, y = np.arange(low[0], high[0], size), np.arange(high[1], low[1], -size)
