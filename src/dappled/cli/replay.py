@@ -118,6 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
             recipe=recipe,
             publish=settings.publish if arguments.publish else None,
             pace=_pace(arguments),
+            report=lambda text: print(f"doubt: {text}", file=sys.stderr),
         )
     if not arguments.verify:
         return 1 if progress.bad else 0

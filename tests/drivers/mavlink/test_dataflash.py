@@ -8,11 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dappled.daemon.navigation import ExposureTime
+from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, log_packets
 from dappled.drivers.mavlink.dataflash import DataFlashError
 from dappled.mocks.autopilot.path import FlightPath
-from tests.drivers.mavlink.true_logs import BOOT_US, TIMES_S, UTC_US, formats, poses, same_fix, written
+from tests.drivers.mavlink.true_logs import (
+    BOOT_US,
+    SPAN_S,
+    TIMES_S,
+    UTC_US,
+    formats,
+    poses,
+    same_fix,
+    ulog_written,
+    written,
+)
 
 
 def test_both_logs_give_the_same_poses(tmp_path: Path) -> None:
@@ -43,6 +55,23 @@ def test_a_log_that_was_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
     own, _ = written(tmp_path)
     own.write_bytes(own.read_bytes()[:-1000])
     assert poses(own)[2].source == "interpolated"
+
+
+@pytest.mark.parametrize("form", ["bin", "ulg", "tlog"])
+@pytest.mark.parametrize("cut", [0, 1, 2, 5])
+def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path) -> None:
+    if form == "ulg":
+        pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+        log = ulog_written(tmp_path)
+    else:
+        log = written(tmp_path)[form == "tlog"]
+    data = log.read_bytes()
+    log.write_bytes(data[: len(data) - cut])
+    told: list[str] = []
+    after = ExposureTime((UTC_US + round(SPAN_S * 1e6)) * 1000, 1_000_000, "test")  # so all of the log is read
+    RecordedTelemetry(log, {}, wait_s=9.0, report=told.append).pose(0, after)
+    assert len(told) == (cut > 0)
+    assert all(str(log) in text and ("cut short" in text or "at the end" in text) for text in told)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 
@@ -44,11 +45,12 @@ def run(
     recipe: Recipe | None = None,
     publish: PublishSettings | None = None,
     pace: Pace | None = None,
+    report: Callable[[str], object] = lambda _: None,
 ) -> None:
     """Play the recording to its end (see `replay.play`), and close what was opened for it.
 
-    `writer` takes the results. Without a recipe nothing is decoded, without `publish` nothing is published. Raises
-    ReplayError, DecodeError, WireError, KeyFileError.
+    `writer` takes the results, `report` a sentence for each gap in the telemetry. Without a recipe nothing is decoded,
+    without `publish` nothing is published. Raises ReplayError, DecodeError, WireError, KeyFileError.
     """
     time = replay.clock(recording)
     with ExitStack() as stack:
@@ -58,7 +60,12 @@ def run(
             stack.callback(decoder.close)
             decoder.warm_up()
         telemetry = RecordedTelemetry.flown(
-            flown.settings, recording.telemetry, recording.horizons, recording.vehicles, rules=recording.rules
+            flown.settings,
+            recording.telemetry,
+            recording.horizons,
+            recording.vehicles,
+            rules=recording.rules,
+            report=report,
         )
         publisher = None
         if publish is not None:

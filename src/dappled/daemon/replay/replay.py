@@ -181,9 +181,10 @@ class RecordedTelemetry:
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
         rules: int = TAGGING_RULES,
+        report: Callable[[str], object] = lambda _: None,
     ) -> None:
         """`vehicles`, `component_id`, `cam_idx`, `attitude_sigma_rad` and `rules` are those that the recording daemon
-        had."""
+        had. `report` gets a sentence for each gap that is read over, and for a log that was cut short."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
         self._telemetry = Telemetry(
             vehicles=vehicles,
@@ -192,7 +193,7 @@ class RecordedTelemetry:
             attitude_sigma_rad=attitude_sigma_rad,
             rules=rules,
         )
-        self._packets = _packets(path) if path else iter(())
+        self._packets = _packets(path, report) if path else iter(())
         self._fed = 0
 
     @classmethod
@@ -204,6 +205,7 @@ class RecordedTelemetry:
         vehicles: Sequence[tuple[int, int]],
         *,
         rules: int,
+        report: Callable[[str], object] = lambda _: None,
     ) -> Self:
         """As the daemon of these settings had it."""
         return cls(
@@ -215,6 +217,7 @@ class RecordedTelemetry:
             cam_idx=settings.mavlink.cam_idx,
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
             rules=rules,
+            report=report,
         )
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
@@ -316,26 +319,26 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
     return None if found is None else found[0]
 
 
-def _packets(path: Path) -> Iterator[tuple[int, int, MavlinkMessage]]:
+def _packets(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, MavlinkMessage]]:
     """The messages of a .tlog or of an autopilot's own log. Raises FlightError and AutopilotLogError."""
     decoder = PacketParser()
-    for number, stamp_us, raw in _logged(path):
+    for number, stamp_us, raw in _logged(path, report):
         message = decoder(raw)
         if message is not None:  # a packet with a wrong checksum was never acted on either
             yield number, stamp_us, message
 
 
-def _logged(path: Path) -> Iterator[tuple[int, int, bytes]]:
+def _logged(path: Path, report: Callable[[str], object]) -> Iterator[tuple[int, int, bytes]]:
     kind = own_log(path)
     if kind is None:
-        return log_reading.read_telemetry(path)
+        return log_reading.read_telemetry(path, report)
     if kind == "ulog":
         from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
 
-        return ulog.packets(path)
+        return ulog.packets(path, report)
     from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
 
-    return dataflash.packets(path)
+    return dataflash.packets(path, report)
 
 
 def _first_position_utc_ns(path: Path) -> int:

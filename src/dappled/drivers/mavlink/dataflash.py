@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +42,22 @@ class DataFlashError(AutopilotLogError):
     """A log of ArduPilot can't be used; one sentence."""
 
 
-def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """(running number, stamp in µs UTC, packet), in the order of time. Raises DataFlashError."""
+def packets(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
+    """(running number, stamp in µs UTC, packet), in the order of time. `report` gets a sentence where the log was cut
+    short. Raises DataFlashError."""
     with _sound(path):
-        rows = _rows(path, _USED)
+        rows, cut = _rows(path, _USED)
         clock = _clock(path, rows["GPS"])
         messages = [*_positions(path, rows), *_attitudes(rows), *_receiver(rows, clock)]
+    if cut:
+        report(f"{path}: {log_packets.CUT_SHORT}")
     yield from log_packets.packets(messages, clock)
 
 
 def triggers(path: Path, cam_idx: int) -> TriggerLog:
     """The triggers of one camera (0 is CAM1). Raises DataFlashError."""
     with _sound(path):
-        rows = _rows(path, ["GPS", *_OF_CAMERAS])
+        rows, _ = _rows(path, ["GPS", *_OF_CAMERAS])
         clock = _clock(path, rows["GPS"])
         # before ArduPilot 4.3 the messages don't say which camera: there is one
         mine = {name: [row for row in rows[name] if getattr(row, "I", 0) == cam_idx] for name in _OF_CAMERAS}
@@ -104,9 +107,18 @@ class _Reader(DFReader.DFReader_binary):  # type: ignore[misc]  # it has no type
                 self.filehandle.close()
             raise
 
+    def cut_short(self) -> bool:
+        """Whether the last message ends after the file, or bytes follow it that are none."""
+        ends = (
+            at[-1] + self.formats[number].len
+            for number, at in enumerate(self.offsets)
+            if number in self.formats and len(at)
+        )
+        return max(ends, default=0) != int(self.data_len)
 
-def _rows(path: Path, used: list[str]) -> dict[str, list[Any]]:
-    """The messages in use, by name. A log that was cut off is read up to there."""
+
+def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
+    """The messages in use, by name, and whether the log was cut short: then it is read up to there."""
     rows: dict[str, list[Any]] = {name: [] for name in used}
     log = _Reader(path)
     try:
@@ -115,9 +127,9 @@ def _rows(path: Path, used: list[str]) -> dict[str, list[Any]]:
             first = getattr(message, "I", 0) == 0 and getattr(message, "C", 0) == 0
             if first or name in _OF_CAMERAS:  # the first receiver, the first core
                 rows[name].append(message)
+        return rows, log.cut_short()
     finally:
         log.filehandle.close()
-    return rows
 
 
 def _clock(path: Path, receiver: list[Any]) -> LogClock:

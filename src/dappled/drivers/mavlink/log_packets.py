@@ -20,6 +20,9 @@ _AGREEING = 0.75  # share of a receiver's messages that must give one time
 _DRIFT = 1e-4  # of an autopilot's clock, at most
 
 Timed = tuple[int, MavlinkMessage]  # µs since boot
+CUT_SHORT = (
+    "it ends within a message: the copy is cut short, or the autopilot lost power, and what came after is missing"
+)
 
 
 class AutopilotLogError(DappledError):

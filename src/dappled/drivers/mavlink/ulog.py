@@ -10,7 +10,7 @@ import contextlib
 import errno
 import io
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ _PLACES, _SPEEDS, _TURNS, _HOME = (
 _TRIGGERS, _CAPTURES = "camera_trigger", "camera_capture"
 _RECEIVERS = ("vehicle_gps_position", "sensor_gps")
 _EXTRAPOLATED = 8  # of PX4; MAVLink's 8 is another
+_HEADER_BYTES = 16
+_MESSAGE = struct.Struct("<HB")  # before each message: its length and its kind
 _GAP_US = 1_000_000  # a velocity further away is not that of a position
 _BOOT_MAX_US = 2**32 * 1000  # MAVLink's milliseconds since boot
 _EPOCH_US = 1_483_228_800 * 10**6  # 2017: a receiver that says an earlier time doesn't know it yet
@@ -53,8 +55,9 @@ class ULogError(AutopilotLogError):
     """A log of PX4 can't be used; one sentence."""
 
 
-def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
-    """(running number, stamp in µs UTC, packet), in the order of time. Raises ULogError."""
+def packets(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
+    """(running number, stamp in µs UTC, packet), in the order of time. `report` gets a sentence where the log was cut
+    short. Raises ULogError."""
     with _sound(path):
         topics = _topics(path, [_PLACES, _SPEEDS, _TURNS, _HOME])
         found = next((topics[name] for name in _RECEIVERS if name in topics), None)
@@ -62,6 +65,8 @@ def packets(path: Path) -> Iterator[tuple[int, int, bytes]]:
         messages = [*_positions(path, topics), *_attitudes(path, topics)]
         for fix in fixes:
             messages += log_packets.receiver(fix, clock)
+        if _cut_short(path.read_bytes()):
+            report(f"{path}: {log_packets.CUT_SHORT}")
     yield from log_packets.packets(messages, clock)
 
 
@@ -101,6 +106,14 @@ def _sound(path: Path) -> Iterator[None]:
         yield
     except (ValueError, TypeError, KeyError, IndexError, ArithmeticError) as error:
         raise ULogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
+
+
+def _cut_short(data: bytes) -> bool:
+    """Whether the last message (its length, its kind, its bytes) ends after the file does."""
+    at = _HEADER_BYTES
+    while at + _MESSAGE.size <= len(data):
+        at += _MESSAGE.size + int(_MESSAGE.unpack_from(data, at)[0])
+    return at != len(data)
 
 
 def _place_at(topic: Columns | None, boot_us: int) -> tuple[float, float] | None:
