@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from dappled.cli import main
+from dappled.cli import depth, main
 from dappled.clock import RecordedClock
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.geometry import camera_pose
@@ -58,6 +58,19 @@ def test_views_as_one_picture(field: str, of: str, tmp_path: Path, capsys: pytes
     assert main(["views", field, "--of", of, "-o", str(tmp_path / "a.png")]) == 0
     assert size(tmp_path / "a.png")[0] > 200
     assert "5 × 5 views of 80 × 60 px" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("sigma", "told"), [([0.01, 0.02, 0.03], False), ([0.66, 1.63, 2.95], True), (None, False)])
+def test_a_depth_map_without_relief_says_so(sigma: list[float] | None, told: bool) -> None:
+    quartiles = None if sigma is None else [-0.03, -0.001, 0.02]
+    report = {
+        "method": "combined",
+        "known": 0.9,
+        "disparity_px": quartiles,
+        "sigma_px": sigma,
+        "no_distances": "no focus",
+    }
+    assert ("no relief is told" in depth.words(report)) == told
 
 
 def test_four_alphas_become_one_picture(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -46,3 +46,22 @@ def test_the_report_prints_a_line_for_each_source(recorded: FlightFolder, capsys
     said = capsys.readouterr().out.splitlines()
     assert said[1].split() == ["source", "requests", "refused", "shots", "safe", "failed", "open", "tagged", "decoded"]
     assert said[2].split() == ["mavlink:255/190", "3", "0", "3", "2", "1", "0", "2", "1"]
+
+
+def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+    states = ("good", "bad", "unknown")
+    for index in range(len(states) + 1):
+        request(flight, index)
+        deliver(flight, index, bytes(1000))
+    for index, state in enumerate(states):
+        details = {"verdict": {"state": state, "reasons": [f"why {index}", "and more"]}}
+        flight.ledger.add_result(Result(index, "ab", 12, 13, "geometric", "predicted", details=details))
+    flight.close()
+    assert main(["flight", "report", str(flight.folder.path)]) == 0
+    said = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    judged = said.index("judged: 1 good, 0 usable, 1 bad, 2 unknown")
+    assert said[judged + 1 : judged + 4] == [
+        "bad: frame 1: why 1; and more",
+        "unknown: frame 2: why 2; and more",
+        "unknown: frame 3: not judged in flight",
+    ]

@@ -188,6 +188,11 @@ def words(report: dict[str, Any]) -> str:
         f"{report['method']}: {report['known']:.0%} of the pixels known",
         f"disparity (quartiles): {three(report['disparity_px'], 'px/view')}, σ {three(report['sigma_px'], 'px/view')}",
     ]
+    spread, sigma = report["disparity_px"], report["sigma_px"]
+    if spread is not None and sigma is not None and sigma[1] > spread[2] - spread[0]:
+        lines.append(
+            "no relief is told: σ is larger than the spread of the disparities (a flat scene, noise, few carriers)"
+        )
     if "distance_m" in report:
         lines.append(
             f"distance (quartiles): {three(report['distance_m'], 'm')}, σ {three(report['distance_sigma_m'], 'm')}, "

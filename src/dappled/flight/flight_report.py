@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ class Balance:
 
     `by_source` counts shots, `following` the failed ones whose files are still on the camera, `companions` files beside
     frames. `began_utc_ns` is None where UTC was never known. `judged` counts frames by their verdict in flight (a frame
-    without one is unknown; empty where none was judged), `bad` says of each bad one why.
+    without one is unknown; empty where none was judged), `bad` says of each bad one why, `unknown` of each unknown one.
     """
 
     flight: str
@@ -48,6 +48,7 @@ class Balance:
     lost_triggers: tuple[str, ...] = ()
     judged: Mapping[str, int] = field(default_factory=dict)
     bad: tuple[str, ...] = ()
+    unknown: tuple[str, ...] = ()
 
     @property
     def balanced(self) -> bool:
@@ -125,10 +126,18 @@ def balance(path: Path) -> Balance:
             if correction_ns is None or "began_utc_ns" not in facts
             else facts["began_utc_ns"] + correction_ns,
             judged=_by_verdict(judged, len(frames)),
-            bad=tuple(
-                f"frame {index}: {'; '.join(reasons)}" for index, (state, reasons) in judged.items() if state == "bad"
-            ),
+            bad=_reasons("bad", judged, frames),
+            unknown=_reasons("unknown", judged, frames),
         )
+
+
+def _reasons(wanted: str, judged: Mapping[int, tuple[str, list[str]]], frames: Sequence[Frame]) -> tuple[str, ...]:
+    """Why each frame has this verdict; none where the flight's frames were not judged."""
+    if not judged:
+        return ()
+    none: tuple[str, list[str]] = ("unknown", ["not judged in flight"])
+    each = ((frame.index, *judged.get(frame.index, none)) for frame in frames)
+    return tuple(f"frame {index}: {'; '.join(reasons)}" for index, state, reasons in each if state == wanted)
 
 
 def _by_verdict(judged: Mapping[int, tuple[str, list[str]]], frames: int) -> dict[str, int]:

@@ -96,7 +96,7 @@ def _said(
     for name, why in seen.left:
         print(printable(f"not counted: {name}: {why}"))
     if seen.unjudged:
-        print(f"{counted(seen.unjudged, 'frame')} of these were not judged in flight, or their verdict is unknown")
+        print(f"frames that were not judged in flight, or judged unknown, and count as seen: {seen.unjudged}")
     if area is not None and area.left:
         print(printable(f"not in the area: {', '.join(area.left)}"))
     if area is None:

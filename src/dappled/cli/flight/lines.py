@@ -12,7 +12,7 @@ from dappled.flight.checks.flight_check import CheckReport
 from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport
 from dappled.flight.offload import Offloaded
 
-_BAD_SHOWN = 20
+_SHOWN = 20  # frames of a verdict
 
 
 def of_list(one: ListedFlight) -> str:
@@ -90,9 +90,10 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     yield f"  {frames}, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
     if found.judged:
         yield f"  {'judged':>13}: {', '.join(f'{count} {state}' for state, count in found.judged.items())}"
-        yield from (f"  {'bad':>13}: {text}" for text in found.bad[:_BAD_SHOWN])
-        if len(found.bad) > _BAD_SHOWN:
-            yield f"  {'':13}  and {len(found.bad) - _BAD_SHOWN} more bad ones (--json names all)"
+        for state, texts in (("bad", found.bad), ("unknown", found.unknown)):
+            yield from (f"  {state:>13}: {text}" for text in texts[:_SHOWN])
+            if len(texts) > _SHOWN:
+                yield f"  {'':13}  and {len(texts) - _SHOWN} more {state} ones (--json names all)"
     if found.following:
         yield f"  {found.following:6d} of the failed still have their files in the camera: dappled flight pickup"
     if found.companions:
