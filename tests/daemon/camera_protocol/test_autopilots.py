@@ -7,6 +7,7 @@ import struct
 import pytest
 
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink, pack
+from dappled.mocks.autopilot.autopilot import heartbeat
 from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 from dappled.refusals import LostTriggers
 from tests.daemon.camera_protocol.test_component import GCS, Rig
@@ -88,6 +89,42 @@ def test_a_pins_time_counts_as_now_after_it_has_wrapped() -> None:
     rig.hear(mavlink.MAVLink_attitude_message(late_us // 1000, 0, 0, 0, 0, 0, 0), AUTOPILOT)
     hear(rig, autopilot.trigger(late_us) + autopilot.contact(late_us))
     assert len(rig.fired) == 1
+
+
+@pytest.mark.parametrize(("late_s", "shots"), [(0.2, 2), (4.5, 2), (5.5, 1), (60.0, 1)])
+def test_a_contact_that_is_reported_more_than_five_seconds_late_is_no_shot_and_is_named(
+    late_s: float, shots: int
+) -> None:
+    """A slow radio is seconds behind; a frame that came long ago can't be told from the next one's."""
+    rig = rig_of(fires=False)
+    autopilot = CameraTriggers(cameras=(CameraPort("wire", pin=True),))
+    booted_s = BOOT_US / 1e6
+    fly(rig, booted_s, 1.0)
+    hear(rig, autopilot.trigger(BOOT_US + 10**6) + autopilot.contact(BOOT_US + 10**6))
+    assert len(rig.fired) == 1
+    held = autopilot.trigger(BOOT_US + 2 * 10**6) + autopilot.contact(BOOT_US + 2 * 10**6)
+    fly(rig, booted_s + 1.0, 1.0 + late_s)
+    hear(rig, held)
+    fly(rig, booted_s + 2.0 + late_s, 8.0)
+    assert len(rig.fired) == shots
+    assert named(rig) == [(2, 2)] * (shots == 1)
+    assert all("late" in one.text() for one in rig.lost_triggers)
+
+
+@pytest.mark.parametrize("personality", ["ardupilot", "px4"])
+def test_a_camera_shoots_whether_the_vehicle_is_armed_or_not(personality: str) -> None:
+    """On the bench it is not; and neither arming nor disarming is a restart, which would end what is known of it."""
+    rig = Rig()
+    autopilot = CameraTriggers(personality, (CameraPort("mavlink"),))
+    hear(rig, [heartbeat(armed=False, personality=personality)])
+    rig.tick(4)
+    for number, armed in enumerate((False, True, True, False, False)):
+        fly(rig, BOOT_US / 1e6 + number, 1.0)
+        hear(rig, [heartbeat(armed=armed, personality=personality)])
+        hear(rig, autopilot.trigger(BOOT_US + (number + 1) * 10**6, UNIX_US))
+        assert len(rig.fired) == number + 1
+    fly(rig, BOOT_US / 1e6 + 6, 8.0)
+    assert named(rig) == []
 
 
 @pytest.mark.parametrize("personality", ["ardupilot", "px4"])

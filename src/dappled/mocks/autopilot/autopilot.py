@@ -87,10 +87,16 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     if message_id == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
         return mavlink.MAVLink_system_time_message(unix_us, boot_ms)
     if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-        return mavlink.MAVLink_heartbeat_message(
-            mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, 81, 3, mavlink.MAV_STATE_ACTIVE, 3
-        )
+        return heartbeat(armed=True)
     raise ValueError(f"the simulated autopilot has no message {message_id}")
+
+
+def heartbeat(*, armed: bool, personality: str = "ardupilot") -> MavlinkMessage:
+    """The autopilot's heartbeat, in flight (armed) or on the ground."""
+    make = mavlink.MAV_AUTOPILOT_PX4 if personality == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+    mode = 81 | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
+    state = mavlink.MAV_STATE_ACTIVE if armed else mavlink.MAV_STATE_STANDBY
+    return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, make, mode, 3, state, 3)
 
 
 def _gimbal_ahead(boot_ns: int) -> MavlinkMessage:
@@ -154,7 +160,7 @@ class Flyer:
 
     `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras. `relay` sends
     what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `gimbal`: it has one, and
-    sends its attitude on request alone.
+    sends its attitude on request alone. It is armed from `arms_s` after the flight's beginning on.
     """
 
     path: FlightPath
@@ -166,6 +172,7 @@ class Flyer:
     cameras: CameraTriggers | None = None
     relay: Callable[[Forwarded, int], object] | None = None
     gimbal: bool = False
+    arms_s: float = 0.0
     due_ns: dict[int, int] = field(default_factory=dict)
     interval_ns: dict[int, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -196,6 +203,11 @@ class Flyer:
             boot_ns = self.boot_ns(now_ns)
             if number == _GIMBAL:
                 message = _gimbal_ahead(boot_ns)
+            elif number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+                armed = now_ns - self.start_monotonic_ns >= self.arms_s * 1e9
+                message = heartbeat(
+                    armed=armed, personality="ardupilot" if self.cameras is None else self.cameras.personality
+                )
             else:
                 message = telemetry_message(number, pose, boot_ns, time.time_ns() // 1000)
             self._later(message, now_ns)
@@ -350,6 +362,7 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--drift", type=float, default=BootTime().drift, help="share by which its clock runs fast")
     parser.add_argument("--jump", action="append", type=_jump, default=[], help="AT:BY, seconds its clock gains at AT")
+    parser.add_argument("--arms", type=float, default=0.0, help="seconds from the flight's beginning until it is armed")
     parser.add_argument("--gimbal", action="store_true", help="it has a gimbal, and sends its attitude on request")
     parser.add_argument("--forward", action="store_true", help="forward between its ports, as ArduPilot does")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
@@ -359,7 +372,7 @@ def main(arguments: list[str] | None = None) -> int:
     boot = BootTime(wanted.booted, wanted.drift, tuple(wanted.jump))
     cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
     flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
-    flyer.gimbal = wanted.gimbal
+    flyer.gimbal, flyer.arms_s = wanted.gimbal, wanted.arms
     if wanted.forward:
         flyer.relay = PortRelay(len(wanted.url), links.sender.send)
     try:
