@@ -2,6 +2,8 @@
 
 python benchmarks/sustained.py [--json] [--directory DIR] [--seconds 300] [--rate 4] [--megabytes 11] [--decode-s 2]
 
+A flight of two hours at a frame a second, 24 times as fast: --seconds 300 --rate 24 --megabytes 0.1 --decode-s 0.02
+
 The pipeline of a live flight (shutter, journal, recorder, ledger, tagger, decode queue) in front of a camera that
 brings a new file for every shot. Decoding is too slow on purpose. Afterwards the whole flight is read back and
 compared.
@@ -41,6 +43,7 @@ from dappled.flight import flight_report, recording
 from dappled.flight.checks import flight_check
 
 QUEUE = 4
+_SEEN = {"resident_mb": "resident_growth_mb", "memfd_mb": "memfd_growth_mb", "handles": "handles_growth"}
 
 
 class SteadyCamera(PlainCamera):
@@ -122,7 +125,8 @@ def main() -> None:
 
 def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: float) -> dict[str, float]:
     """Counts, milliseconds and megabytes, as the names say. `lost` counts shots without an intact frame, and frames
-    neither decoded nor noted as not decoded. Memory: the growth from the second quarter to the last."""
+    neither decoded nor noted as not decoded. Memory and file handles: the growth from the second quarter to the last;
+    `ledger_growth`: the ledger's bytes a frame in the last quarter over those in the second."""
     clock, notes_ms = SystemClock(), []
     flight = recording.begin(root, clock, {})
     camera = SteadyCamera(size)
@@ -143,7 +147,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
         judge=Judge(PoseSettings().mount, on_gimbal=False),
     )
 
-    memory = Memory()
+    memory = Memory(flight.folder.ledger)
     pipeline.start()
     count = round(seconds * rate)
     start = time.monotonic()
@@ -167,23 +171,28 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
 
 
 class Memory:
-    """Resident memory of this process, and what all memfds hold."""
+    """Memory of this process, resident and in memfds (MB), its file handles, and the bytes of the ledger on disk."""
 
-    def __init__(self) -> None:
-        self._seen: list[tuple[float, float]] = []
+    def __init__(self, ledger: Path) -> None:
+        self._ledger = ledger
+        self._seen: list[tuple[float, float, int, int]] = []
 
     def look(self) -> None:
         resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-        held = sum(path.stat().st_size for path in Path("/proc/self/fd").iterdir() if _is_memfd(path)) / 1e6
-        self._seen.append((resident, held))
+        handles = list(Path("/proc/self/fd").iterdir())
+        held = sum(path.stat().st_size for path in handles if _is_memfd(path)) / 1e6
+        self._seen.append((resident, held, len(handles), self._ledger.stat().st_size))
 
     def growth(self) -> dict[str, float]:
         quarter = max(1, len(self._seen) // 4)
         early, late = self._seen[quarter : 2 * quarter], self._seen[-quarter:]
         rows = {}
-        for place, name in enumerate(("resident", "memfd")):
-            rows[f"{name}_mb"] = statistics.median(one[place] for one in late)
-            rows[f"{name}_growth_mb"] = rows[f"{name}_mb"] - statistics.median(one[place] for one in early)
+        for place, (name, growth) in enumerate(_SEEN.items()):
+            rows[name] = statistics.median(one[place] for one in late)
+            rows[growth] = rows[name] - statistics.median(one[place] for one in early)
+        grown = [part[-1][3] - part[0][3] for part in (early, late)]
+        rows["ledger_bytes_a_frame"] = grown[1] / quarter
+        rows["ledger_growth"] = grown[1] / max(1, grown[0])
         return rows
 
 
