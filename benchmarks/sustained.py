@@ -180,7 +180,7 @@ class Memory:
     def look(self) -> None:
         resident = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
         handles = list(Path("/proc/self/fd").iterdir())
-        held = sum(path.stat().st_size for path in handles if _is_memfd(path)) / 1e6
+        held = sum(_memfd_bytes(path) for path in handles) / 1e6
         self._seen.append((resident, held, len(handles), self._ledger.stat().st_size))
 
     def growth(self) -> dict[str, float]:
@@ -196,11 +196,12 @@ class Memory:
         return rows
 
 
-def _is_memfd(path: Path) -> bool:
+def _memfd_bytes(path: Path) -> int:
+    """What a file handle holds where it is that of a memfd, else 0."""
     try:
-        return os.readlink(path).startswith("/memfd:")
+        return path.stat().st_size if os.readlink(path).startswith("/memfd:") else 0
     except OSError:  # closed in the meantime
-        return False
+        return 0
 
 
 def _account(flight: Path, count: int) -> dict[str, float]:
