@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dappled.daemon.camera_protocol.camera_status import Captured
@@ -167,6 +167,7 @@ outages = st.tuples(st.integers(0, 1), times, st.floats(0.5, 9.0)).map(lambda on
     st.lists(times, min_size=1, max_size=6),
     st.sampled_from([None, DIRECT, RADIO]),
 )
+@example((True, True), [(1, 4.0, 11.0)], [12.0], RADIO)  # two stations of one id, each heard once since the outage
 def test_no_report_is_lost_and_none_comes_twice_without_need(
     forwards: tuple[bool, bool],
     down: list[tuple[int, float, float]],

@@ -35,6 +35,7 @@ PROOF_NS = 500_000_000
 _STEADY_NS = 300_000_000  # telemetry is requested at 50 Hz
 _ON_ITS_WAY_NS = 100_000_000  # what came so soon after a report may have been sent before it
 _HEARTBEATS, _HEARTBEATS_NS = 256, 5 * 10**9
+_KNOWN_NS = 2 * 10**9  # so long, and every station behind a port has been heard there
 _REPORTS = 256
 HEARTBEAT_NS = 10**9
 STATUS_NS = 100_000_000
@@ -50,7 +51,7 @@ class ReportRoutes:
     is the heartbeats of others. If every one that came over a port came over the other port too, as the same packet,
     whoever can be reached over the first port can be over the other: the first port gets no report. A heartbeat that
     came over one port alone is a station that may only be there, and both ports get it. So does a port where nobody but
-    the autopilot was heard. If the other port falls silent around a report for `_STEADY_NS` (the cable is out, or the
+    the autopilot was heard, and one that has just come back: a station there may not have been heard yet. If the other port falls silent around a report for `_STEADY_NS` (the cable is out, or the
     autopilot's telemetry is slower than requested), it is sent on the first port after all: a station that has it twice
     is better than one that never has it. With three ports or more all get every report. Times are monotonic; all
     methods may be called from any thread.
@@ -94,6 +95,8 @@ class ReportRoutes:
 
     def _reaches_all_of(self, port: int, other: int, now_ns: int) -> bool:
         """Whether every heartbeat that came over `other` came over `port` too. The last one may still come."""
+        if now_ns - self._ports[other][0] < _KNOWN_NS:
+            return False
         there = self._heartbeats.get(port, {})
         proven: set[tuple[int, int]] = set()
         for packet, heard_ns in self._heartbeats.get(other, {}).items():
