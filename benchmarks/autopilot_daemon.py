@@ -12,6 +12,7 @@ from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import BodyLatency, ExposureTime, Telemetry, clocks
 from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.spacing import Spacing
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
@@ -33,6 +34,18 @@ class _Body:
 
     def change(self, name: SettingName, value: str) -> None:
         raise AssertionError(name)
+
+
+class _NoSeries:
+    """Photographs by distance are asked of nobody here."""
+
+    def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None: ...
+
+    def begin_configured(self, source: str) -> bool:
+        return False
+
+    def end(self) -> bool:
+        return False
 
 
 class _NothingEarlier:
@@ -70,6 +83,7 @@ class Daemon:
             Parameters(_Body()),
             model=self,
             earlier=_NothingEarlier(),
+            series=_NoSeries(),
             cam_idx=camera,
         )
 

@@ -52,3 +52,11 @@ def test_a_file_without_a_link_that_listens_is_told(
     assert main(["trigger", "--config", str(tmp_path / "d.toml")]) == 1
     assert "names no link that listens" in capsys.readouterr().err
     assert called == []
+
+
+@pytest.mark.parametrize("wrong", ["0", "-3", "nan", "inf", "10001", "far"])
+def test_a_distance_that_can_not_be_flown_is_told(wrong: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["trigger", f"--distance={wrong}"])
+    assert ended.value.code == 2
+    assert "neither a distance" in capsys.readouterr().err

@@ -43,7 +43,7 @@ from dappled.refusals import Refusals
 
 
 def no_pose(utc_ns: int = 0) -> Pose:
-    return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, 0)
+    return Pose.unknown(utc_ns, 0)
 
 
 Script = Callable[[int], list[CameraEvent | Exception]]
@@ -224,6 +224,22 @@ class FakeSink:
 
     def refused(self, refusals: Refusals) -> None:
         self.refusals.append(refusals)
+
+
+class Nowhere:
+    """SurveyFacts of which nothing is known."""
+
+    def pose(self) -> None:
+        """Not known."""
+
+    def height(self) -> None:
+        """Not known."""
+
+    def field(self) -> None:
+        """Not known."""
+
+    def busy(self) -> bool:
+        return False
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,47 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.cli.arguments import seconds, whole
 from dappled.cli.terminal import waiting_for
 from dappled.config import settings
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
+from dappled.daemon.pipeline.spacing import MOST_M
 from dappled.drivers.mavlink import LinkError, parse
 
 DEFAULT_URL = "udpout:127.0.0.1:14550"
 _CALLED_AT = {"udpin": "udpout", "tcpin": "tcp"}
+
+
+@dataclass(frozen=True, slots=True)
+class Distance:
+    """What --distance asks for: metres, 0 for an end; None: as the camera's settings say."""
+
+    metres: float | None
+
+    def __str__(self) -> str:
+        return "settings" if self.metres is None else f"{self.metres:g}"
+
+    @property
+    def told(self) -> str:
+        if self.metres is None:
+            return "photographs by the camera's own settings: they go on until --distance off"
+        return f"a photograph every {self.metres:g} m, until --distance off" if self.metres else "no more photographs"
+
+
+def _distance(text: str) -> Distance:
+    if text in ("settings", "off"):
+        return Distance(None if text == "settings" else 0.0)
+    try:
+        metres = float(text)
+    except ValueError:
+        metres = math.nan
+    if not 0 < metres <= MOST_M:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a distance of up to {MOST_M:g} m, nor settings, nor off")
+    return Distance(metres)
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -25,6 +56,13 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="the daemon's settings file, which names its link",
+    )
+    parser.add_argument(
+        "--distance",
+        type=_distance,
+        metavar="M",
+        help="have the camera take a photograph every M metres over ground; settings: as its settings say, by distance "
+        "or overlap; off: no more",
     )
     parser.add_argument("--count", type=whole, default=1, metavar="N", help="number of photographs (default: 1)")
     parser.add_argument(
@@ -46,6 +84,10 @@ def run(arguments: argparse.Namespace) -> int:
     with GroundClient(url, key_file=key) as client:
         with waiting_for(f"a camera on {url}"):
             client.find_camera(arguments.timeout)
+        if arguments.distance is not None:
+            client.by_distance(arguments.distance.metres)
+            print(json.dumps({"distance": str(arguments.distance)}) if arguments.json else arguments.distance.told)
+            return 0
         outcomes = client.capture(
             arguments.count,
             arguments.interval,

@@ -146,6 +146,27 @@ class RecordSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class TriggerSettings:
+    distance_m: float = setting(
+        0.0, "Way over ground from one photograph to the next; 0: by overlap", unit="m", low=0, high=10_000
+    )
+    overlap: float = setting(
+        0.0,
+        "Share of a photograph's ground, along the way, that the next one sees too; 0: by distance_m",
+        low=0,
+        high=0.95,
+    )
+    from_height_m: float = setting(
+        0.0,
+        "Height above the take-off place from which on these photographs are taken, until the vehicle is a fifth "
+        "lower; 0: only when a ground station asks for them",
+        unit="m",
+        low=0,
+        high=10_000,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class PoseSettings:
     wait_ms: float = setting(
         700.0, "How long a tag waits for telemetry after the exposure", unit="ms", low=0, high=10_000
@@ -232,6 +253,7 @@ class Settings:
     mask: MaskSettings = field(default_factory=MaskSettings)
     mavlink: MavlinkSettings = field(default_factory=MavlinkSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
+    trigger: TriggerSettings = field(default_factory=TriggerSettings)
     pose: PoseSettings = field(default_factory=PoseSettings)
     decode: DecodeSettings = field(default_factory=DecodeSettings)
     publish: PublishSettings = field(default_factory=PublishSettings)

@@ -49,11 +49,13 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.survey_facts import LiveSurvey, spacing_of
 from dappled.drivers.camera import Camera
 from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
 from dappled.drivers.raw.darkroom import Recipe
@@ -191,6 +193,14 @@ class Service:
         autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
+        self._distance = DistanceTrigger(
+            self._shutter,
+            LiveSurvey(self._navigation, reported, shots),
+            clock,
+            mount=settings.pose.mount,
+            configured=spacing_of(settings.trigger),
+            from_height_m=settings.trigger.from_height_m,
+        )
         self._body = BodyPlan(settings.body, settings.camera.capture_target, camera, clock)
         self._parameters = self._settable(self._body, names, decodes=recipe is not None)
         self._component = Component(
@@ -201,6 +211,7 @@ class Service:
             self._parameters,
             model=self._control,
             earlier=IndexedOutcomes(recording.index),
+            series=self._distance,
             cam_idx=settings.mavlink.cam_idx,
         )
         self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
@@ -243,7 +254,7 @@ class Service:
         )
         self._answers = Answers(writer, self._decoder, shots)
         driver = (camera,) if isinstance(camera, HasThreads) else ()
-        self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, *driver)
+        self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, self._distance, *driver)
         self._tasks = self._periodic_tasks()
 
     def _settable(self, body: BodyPlan, names: Names, *, decodes: bool) -> Parameters:
@@ -271,6 +282,8 @@ class Service:
         self._pipeline.start()
         stack.callback(self._shutter.stop)
         self._shutter.start()
+        stack.callback(self._distance.stop)
+        self._distance.start()
         self._links.start(self._navigation, self._component)
 
     def _remove_unused_flight(self) -> None:
@@ -370,6 +383,7 @@ class Service:
             navigation.telemetry.impossible(self._clock.utc_ns()),
             self._events.doubt,
             self._control.shortage,
+            None if (distance := self._distance.statistics()) is None else distance.problem,
         )
         return health.record(
             self._settings.now,

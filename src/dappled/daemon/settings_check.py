@@ -120,6 +120,16 @@ def _feedback(settings: Settings) -> None:
         )
 
 
+def _trigger(settings: Settings) -> None:
+    trigger = settings.trigger
+    if trigger.distance_m and trigger.overlap:
+        raise ConfigError("trigger.distance_m and trigger.overlap both say how far photographs are apart: keep one")
+    if trigger.from_height_m and not (trigger.distance_m or trigger.overlap):
+        raise ConfigError("trigger.from_height_m begins photographs by distance or overlap: set one of those")
+    if trigger.from_height_m and settings.camera.fired_outside:
+        raise ConfigError("trigger.from_height_m is for a camera that dappled fires, and something else fires this one")
+
+
 def _link_keys(settings: Settings) -> None:
     keys, links = settings.mavlink.keys, len(settings.mavlink.url)
     if len(keys) not in (0, 1, links):
@@ -211,6 +221,7 @@ RULES: tuple[SettingsRule, ...] = (
     SettingsRule("mask.profile", _mask_profile),
     SettingsRule("mavlink.url", _links),
     SettingsRule("mavlink.feedback_is_shot", _feedback, ("camera.shutter", "camera.driver")),
+    SettingsRule("trigger.from_height_m", _trigger, ("trigger.distance_m", "trigger.overlap", "camera.shutter")),
     SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",), secrets=lambda settings: settings.mavlink.keys),
     SettingsRule("record.directory", _directory),
     SettingsRule("record.seal_key", _seal, secrets=lambda settings: (settings.record.seal_key,)),

@@ -17,12 +17,13 @@ from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Signing, mavlink, pack
 from dappled.flight import Cause, Shot
 from dappled.flight.layout import DiskSpace
 from dappled.refusals import LostTriggers, Refusals
-from tests.daemon.fakes import eventually
+from tests.daemon.fakes import Nowhere, eventually
 
 
 class NothingEarlier:
@@ -84,6 +85,7 @@ class Camera:
             Parameters(self),
             model=self,
             earlier=NothingEarlier(),
+            series=DistanceTrigger(self.shutter, Nowhere(), self.clock, mount=self.mount),
         )
         self._worker = threading.Thread(target=self._work)
 

@@ -17,12 +17,13 @@ from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameter, Parameters, code
 from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger, Spacing
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
 from dappled.flight.layout import DiskSpace
 from dappled.refusals import LostTriggers
 from tests.daemon.camera_protocol.rig import NothingEarlier
-from tests.daemon.fakes import FakeSink
+from tests.daemon.fakes import FakeSink, Nowhere
 
 NAN = math.nan
 GCS = (255, 190)
@@ -58,6 +59,7 @@ class Rig:
         cam_idx: int = 0,
         fires: bool = True,
         on_gimbal: bool = False,
+        configured: Spacing | None = None,
     ) -> None:
         self.body = Body()
         self.decode = "on"
@@ -73,6 +75,7 @@ class Rig:
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity, fires=fires)
+        self.series = DistanceTrigger(self.shutter, Nowhere(), self.clock, mount=self.mount, configured=configured)
         parameters = Parameters(self.body, (self,))
         self.autopilot = OwnAutopilot(self, self.clock, on_gimbal=on_gimbal)
         self.component = Component(
@@ -83,6 +86,7 @@ class Rig:
             parameters,
             model=self,
             earlier=earlier or NothingEarlier(),
+            series=self.series,
             cam_idx=cam_idx,
         )
 
@@ -255,7 +259,7 @@ def test_a_past_image_whose_flight_was_moved_away_is_missed_in_words() -> None:
 
 def test_refused_by_name_and_silent_on_broadcasts() -> None:
     rig = Rig()
-    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 206, 214, 2003, 2505):
+    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 214, 2505):
         assert rig.command(command, NAN) == mavlink.MAV_RESULT_UNSUPPORTED
         assert rig.command(command, NAN, target=(0, 0)) is None
     assert rig.command(mavlink.MAV_CMD_SET_CAMERA_MODE, 0, 1) == mavlink.MAV_RESULT_DENIED
@@ -627,3 +631,35 @@ def test_a_command_with_a_known_number_long_after_is_a_new_photograph() -> None:
         rig.clock.advance(13)
         assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1) == mavlink.MAV_RESULT_ACCEPTED
         assert rig.fired == [5, 6][: turn + 1]
+
+
+def test_a_distance_between_photographs_begins_ends_and_is_refused_with_a_sentence() -> None:
+    """MAV_CMD_DO_SET_CAM_TRIGG_DIST to the camera itself; one to all components is the autopilot's."""
+    rig = Rig()
+    assert rig.command(206, 12.5, 0, 0) == mavlink.MAV_RESULT_ACCEPTED
+    found = rig.series.statistics()
+    assert found is not None
+    assert found.wanted == Spacing(12.5)
+    assert rig.command(206, 0) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.series.statistics() is None
+    said = ""
+    for wrong in (-5.0, math.nan, math.inf, 1e9):
+        assert rig.command(206, wrong) == mavlink.MAV_RESULT_DENIED
+        said += "".join(message.text for message in rig.of("STATUSTEXT"))
+    assert "must be 0 to 10000 m" in said
+    assert rig.command(206, 10.0, target=(1, 0)) is None
+    assert rig.series.statistics() is None
+    assert Rig(fires=False).command(206, 10.0) == mavlink.MAV_RESULT_DENIED
+
+
+def test_the_series_of_the_settings_begins_and_ends_by_command() -> None:
+    rig = Rig(configured=Spacing(overlap=0.8))
+    assert rig.command(2003, 1, -1, -1) == mavlink.MAV_RESULT_ACCEPTED
+    found = rig.series.statistics()
+    assert found is not None
+    assert found.wanted == Spacing(overlap=0.8)
+    assert rig.command(2003, -1, -1, -1) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.series.statistics() is not None
+    assert rig.command(2003, 0, -1, -1) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.series.statistics() is None
+    assert Rig().command(2003, 1, -1, -1) == mavlink.MAV_RESULT_DENIED  # there is none in the settings

@@ -13,7 +13,6 @@ from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSetting
 from dappled.daemon.health import record as health
 from dappled.daemon.health.record import DecodingState
 from dappled.daemon.navigation import Telemetry
-from dappled.daemon.navigation.navigation import unknown_pose
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
@@ -136,7 +135,7 @@ def test_a_gimbal_that_is_not_heard_is_a_problem_where_the_camera_is_on_it(
 ) -> None:
     settings = replace(WELL, pose=replace(WELL.pose, on_gimbal=on_gimbal))
     level = (1.0, 0.0, 0.0, 0.0)
-    vehicle = replace(unknown_pose(1, 5), age_ms=100.0, gimbal_attitude=level if heard else None)
+    vehicle = replace(Pose.unknown(1, 5), age_ms=100.0, gimbal_attitude=level if heard else None)
     found = record(tmp_path, settings, vehicle=vehicle)["problems"]
     assert any("pose.on_gimbal" in text for text in found) == problem
     silent = replace(vehicle, age_ms=None)  # nothing is heard of the vehicle at all, which is told already

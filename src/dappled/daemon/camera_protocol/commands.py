@@ -7,12 +7,14 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import ZOOM, CameraStatus
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.daemon.pipeline.shutter import CANNOT_FIRE, ShotDecision, Shutter
+from dappled.daemon.pipeline.spacing import Spacing
 from dappled.drivers.camera import CameraError
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -90,6 +92,19 @@ class CommandAnswer:
 _NOT_OURS = CommandAnswer(DENIED)  # a broadcast to a camera that something else fires: it is left alone, unanswered
 
 
+class DistanceSeries(Protocol):
+    """Photographs by distance (see `DistanceTrigger`)."""
+
+    def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None:
+        """See DistanceTrigger."""
+
+    def begin_configured(self, source: str) -> bool:
+        """See DistanceTrigger."""
+
+    def end(self) -> bool:
+        """See DistanceTrigger."""
+
+
 class MessageIntervals:
     """The messages that were asked for at an interval (MAV_CMD_SET_MESSAGE_INTERVAL).
 
@@ -132,8 +147,11 @@ class CameraCommands:
         clock: Clock,
         status: CameraStatus,
         parameters: Parameters,
+        *,
         intervals: MessageIntervals,
+        series: DistanceSeries,
     ) -> None:
+        self._series = series
         self._shutter, self._clock, self._status, self._parameters = shutter, clock, status, parameters
         self._intervals = intervals
         self._steps = RecentRequests()
@@ -192,6 +210,41 @@ class CameraCommands:
             autopilot=command.of_autopilot,
         )
         return _decided(self._shutter.request(request))
+
+    # series by distance
+
+    def _trigger_distance(self, command: Command) -> CommandAnswer:
+        """206 to this camera: a photograph every parameter 1 metres, the first at once where parameter 3 is 1; 0 ends
+        it. One to all components is the autopilot's own, which triggers this camera itself."""
+        if command.broadcast:
+            return CommandAnswer(UNSUPPORTED)
+        metres = command.parameters[0]
+        if metres == 0:
+            self._series.end()
+            return CommandAnswer(ACCEPTED)
+        if not self._shutter.fires:
+            return CommandAnswer(DENIED, words=f"no photos: {CANNOT_FIRE}")
+        try:
+            self._series.begin(Spacing(metres), command.source, at_once=command.integer(3) == 1)
+        except ValueError as error:
+            return CommandAnswer(DENIED, words=f"no photos: {error}")
+        return CommandAnswer(ACCEPTED)
+
+    def _trigger_control(self, command: Command) -> CommandAnswer:
+        """2003 to this camera: 1 begins the series of the settings ([trigger]), 0 ends what runs; -1 leaves it."""
+        if command.broadcast:
+            return CommandAnswer(UNSUPPORTED)
+        wanted = command.integer(1, -1)
+        if wanted == 0 or command.integer(3, -1) == 1:
+            self._series.end()
+            return CommandAnswer(ACCEPTED)
+        if wanted != 1:
+            return CommandAnswer(ACCEPTED)
+        if not self._shutter.fires:
+            return CommandAnswer(DENIED, words=f"no photos: {CANNOT_FIRE}")
+        if not self._series.begin_configured(command.source):
+            return CommandAnswer(DENIED, words="no photos: set trigger.distance_m or overlap")
+        return CommandAnswer(ACCEPTED)
 
     # questions
 
@@ -327,6 +380,8 @@ _COMMANDS: dict[int, Callable[[CameraCommands, Command], CommandAnswer]] = {
     mavlink.MAV_CMD_IMAGE_START_CAPTURE: CameraCommands._start_capture,
     mavlink.MAV_CMD_IMAGE_STOP_CAPTURE: CameraCommands._stop_capture,
     mavlink.MAV_CMD_DO_DIGICAM_CONTROL: CameraCommands._digicam_control,
+    mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST: CameraCommands._trigger_distance,
+    mavlink.MAV_CMD_DO_TRIGGER_CONTROL: CameraCommands._trigger_control,
     mavlink.MAV_CMD_REQUEST_MESSAGE: CameraCommands._request_message,
     mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: CameraCommands._get_interval,
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: CameraCommands._set_interval,

@@ -20,6 +20,7 @@ from dappled.daemon.camera_protocol.commands import (
     CameraCommands,
     Command,
     CommandAnswer,
+    DistanceSeries,
     MessageIntervals,
 )
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
@@ -48,13 +49,14 @@ class ReportRoutes:
 
     An autopilot forwards what it gets on one port to its radio and to its other ports; or not, which can't be asked. No
     packet of our own shows it: ArduPilot returns no heartbeat to a port on which it has heard the sender. The proof
-    is the heartbeats of others. If every one that came over a port came over the other port too, as the same packet,
-    whoever can be reached over the first port can be over the other: the first port gets no report. A heartbeat that
-    came over one port alone is a station that may only be there, and both ports get it. So does a port where nobody but
-    the autopilot was heard, and one that has just come back: a station there may not have been heard yet. If the other port falls silent around a report for `_STEADY_NS` (the cable is out, or the
-    autopilot's telemetry is slower than requested), it is sent on the first port after all: a station that has it twice
-    is better than one that never has it. With three ports or more all get every report. Times are monotonic; all
-    methods may be called from any thread.
+    is the heartbeats of others. If every one that came over a port came over the other port too, as the same
+    packet, whoever can be reached over the first port can be over the other: the first port gets no report. A
+    heartbeat that came over one port alone is a station that may only be there, and both ports get it. So does a
+    port where nobody but the autopilot was heard, and one that has just come back: a station there may not have
+    been heard yet. If the other port falls silent around a report for `_STEADY_NS` (the cable is out, or the
+    autopilot's telemetry is slower than requested), it is sent on the first port after all: a station that has it
+    twice is better than one that never has it. With three ports or more all get every report. Times are monotonic;
+    all methods may be called from any thread.
     """
 
     def __init__(self) -> None:
@@ -145,6 +147,7 @@ class Component:
         *,
         model: CameraModel,
         earlier: EarlierOutcomes,
+        series: DistanceSeries,
         cam_idx: int = 0,
     ) -> None:
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity
@@ -156,7 +159,9 @@ class Component:
         self._stamps: deque[int] = deque(maxlen=64)
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
-        self._commands = CameraCommands(shutter, clock, self._status, parameters, self._intervals)
+        self._commands = CameraCommands(
+            shutter, clock, self._status, parameters, intervals=self._intervals, series=series
+        )
         self._parameters = ParameterServer(parameters)
         self._files = FtpServer(self._status)
         self._dedup, self._routes = PacketDedup(), ReportRoutes()

@@ -141,17 +141,25 @@ class GroundClient:
                 self._clock.wait(self._heart.stopping, left_s)
         return outcomes
 
+    def by_distance(self, metres: float | None) -> None:
+        """Have the camera take a photograph every so many metres, the first at once; None: as its settings say; 0 ends
+        them. Raises GroundStationError with the camera's reason."""
+        self.find_camera()
+        with self._listening() as heard:
+            if metres is None:
+                result, _ = self.command(mavlink.MAV_CMD_DO_TRIGGER_CONTROL, 1)
+            else:
+                result, _ = self.command(mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST, metres, 0, 1)
+            if result != mavlink.MAV_RESULT_ACCEPTED:
+                raise GroundStationError(_refusal(result, heard))
+
     def _capture_one(self, expected: int, timeout_s: float) -> Outcome:
         self._sequence += 1
         sequence = self._sequence
         with self._listening() as heard:
             result, ack_ms = self.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, sequence)
-            if result is None:
-                return Outcome(sequence, None, False, f"no answer to {ACK_TRIES} requests", None, None)
             if result != mavlink.MAV_RESULT_ACCEPTED:
-                said = heard(lambda m: m.get_type() == "STATUSTEXT", 0.2)
-                words = f"refused with MAV_RESULT {result}" + (f": {said.text}" if said is not None else "")
-                return Outcome(sequence, None, False, words, ack_ms, None)
+                return Outcome(sequence, None, False, _refusal(result, heard), ack_ms, None)
             until_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
             while (left_ns := until_ns - self._clock.monotonic_ns()) > 0:
                 wait_s = min(_ASK_AGAIN_S, left_ns / 1e9)
@@ -198,6 +206,16 @@ class GroundClient:
                 )
             )
             self._heart.stopping.wait(1.0)
+
+
+def _refusal(
+    result: int | None, heard: Callable[[Callable[[MavlinkMessage], bool], float], MavlinkMessage | None]
+) -> str:
+    """Why a command was not accepted, with what the camera says beside it."""
+    if result is None:
+        return f"no answer to {ACK_TRIES} requests"
+    said = heard(lambda m: m.get_type() == "STATUSTEXT", 0.2)
+    return f"refused with MAV_RESULT {result}" + (f": {said.text}" if said is not None else "")
 
 
 class _Listening:

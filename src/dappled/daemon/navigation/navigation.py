@@ -29,6 +29,7 @@ from dappled.daemon.navigation.clocks import (
     refine,
     unseen,
 )
+from dappled.daemon.navigation.rangefinder import Rangefinder
 from dappled.daemon.navigation.samples import (
     HALF_MS_NS,
     Around,
@@ -207,7 +208,7 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = clock or self._history.clock(limit, utc_ns)
             if clock is None:
-                return unknown_pose(utc_ns, limit)
+                return Pose.unknown(utc_ns, limit)
             if boot_ns is None:
                 boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
             else:  # where the clock stepped, the samples around that time may not be those of the exposure
@@ -280,6 +281,7 @@ class Navigation:
         now = settings.now
         self._settings, self._clock, self._recording = settings, clock, recording
         self._never = threading.Event()
+        self.rangefinder = Rangefinder(clock)
         self.telemetry = Telemetry(
             component_id=now.mavlink.component_id,
             cam_idx=now.mavlink.cam_idx,
@@ -297,6 +299,8 @@ class Navigation:
         """Take a packet, received or sent. One outside the telemetry log is ignored: a replay wouldn't have it."""
         if packet.number is not None:
             self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
+            if packet.message.get_type() == "DISTANCE_SENSOR":
+                self.rangefinder.heard(packet, self._vehicles[-1][1] if self._vehicles else None)
 
     def belongs_to(self, system_id: int | None) -> None:
         """Follow the system that the camera belongs to now; None while that is undecided.
@@ -349,7 +353,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
     attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad, rules)
     gimbal, gimbal_source = _gimbal(at, attitude)
     made = replace(
-        unknown_pose(at.utc_ns, packets),
+        Pose.unknown(at.utc_ns, packets),
         boot_us=at.boot_ns // 1000,
         attitude=attitude,
         attitude_sigma_rad=attitude_sigma,
@@ -386,11 +390,6 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
     )
-
-
-def unknown_pose(utc_ns: int, packets: int) -> Pose:
-    """A pose without any telemetry."""
-    return Pose("none", utc_ns, None, None, None, None, None, None, None, None, None, None, packets)
 
 
 def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:

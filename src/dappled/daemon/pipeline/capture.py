@@ -136,6 +136,12 @@ class PendingShots:
         with self._changed:
             return [index for index, pending in self._in_hand.items() if pending.open]
 
+    @property
+    def waits(self) -> bool:
+        """Whether a shot was handed to the camera that it has not fired yet."""
+        with self._changed:
+            return any(pending.fired is None and pending.open for pending in self._in_hand.values())
+
     def untagged(self, index: int) -> bool:
         """Whether a shot is under way and not tagged yet."""
         pending = self._in_hand.get(index)

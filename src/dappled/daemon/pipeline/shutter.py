@@ -22,6 +22,7 @@ CANNOT_FIRE = 'this camera can\'t be fired from here: something else fires it (c
 _IDLE_S = 60.0
 _SHORTEST_S = 0.05
 _AGAIN_S = 1.0
+OWN_KINDS = ("interval", "distance")  # of requests that are made here: none of them is another one's repeat
 IntervalEnd = Literal["stopped", "none ran", "began later"]
 
 
@@ -252,14 +253,14 @@ class Shutter:
 
     def _judge(self, request: CaptureRequest) -> ShotDecision:
         now_ns = self._clock.monotonic_ns()
-        if request.kind != "interval":
+        if request.kind not in OWN_KINDS:
             known = self._recent.same(request, now_ns)
             if known is not None:
                 if not request.autopilot:
                     self._forwarded.add(request, now_ns, known)  # the autopilot executes a broadcast's retry as well
                 return ShotDecision("duplicate", index=known)
         if (partner := self._forwarded.partner(request, now_ns)) is not None:
-            if request.kind != "interval":
+            if request.kind not in OWN_KINDS:
                 self._recent.add(request, now_ns, partner)
             self._follow_autopilot(request, now_ns, new=False)
             return ShotDecision("duplicate", index=partner)
@@ -281,7 +282,7 @@ class Shutter:
         self._next_index += 1
         self._shots += 1
         self._pending.add(shot.index)
-        if request.kind != "interval":
+        if request.kind not in OWN_KINDS:
             self._recent.add(request, now_ns, shot.index)
         self._forwarded.add(request, now_ns, shot.index)
         self._follow_autopilot(request, now_ns, new=True)

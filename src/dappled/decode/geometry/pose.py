@@ -67,6 +67,11 @@ class Pose:
     position_covariance_m2: Symmetric | None = None
     attitude_covariance_rad2: Symmetric | None = None
 
+    @classmethod
+    def unknown(cls, utc_ns: int, packets: int) -> Pose:
+        """A pose without any telemetry in so many packets."""
+        return cls("none", utc_ns, None, None, None, None, None, None, None, None, None, None, packets)
+
 
 def hermite(ends: tuple[float, float], slopes: tuple[float, float], span_s: float, share: float) -> float:
     """The cubic with these values and slopes (per second) at the ends of `span_s`, at `share` in 0..1 of it."""
