@@ -53,6 +53,7 @@ CALLS: dict[str, list[str]] = {
     "flight seal": ["none"],
     "flight offload": ["none", "there"],
     "flight coverage": ["none"],
+    "flight gnss": ["none"],
     "flight pickup": ["none", "--from", "card"],
     "geotag": ["none"],
     "georeference": ["none"],

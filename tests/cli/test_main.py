@@ -25,7 +25,10 @@ def test_every_verb_has_help_with_an_example(verb: str, capsys: pytest.CaptureFi
 
 ACTIONS = [
     *(("config", name) for name in ("check", "show")),
-    *(("flight", name) for name in ("list", "show", "check", "report", "coverage", "offload", "pickup", "seal")),
+    *(
+        ("flight", name)
+        for name in ("list", "show", "check", "report", "coverage", "gnss", "offload", "pickup", "seal")
+    ),
     *(("keys", name) for name in ("make", "seal", "show", "token")),
     *(("mask", name) for name in ("make", "table", "diffraction", "design", "plan", "kit")),
     ("mavlink", "key"),

@@ -43,6 +43,13 @@ def calibration(path: Path, camera: str = CAMERA, mask: str = MASK, law: str = "
         ('[camera]\nprofile = "canon"', "line 2: [camera] profile", "did you mean"),
         ('[mask]\nprofile = "mask-22"', "line 2: [mask] profile", "did you mean mask-2?"),
         ("[mavlink]\nfeedback_is_shot = true", "line 2: [mavlink] feedback_is_shot", "would fire it once more"),
+        ('[gnss]\nport = "ttyACM0"', "line 2: [gnss] port", "needs a device"),
+        ('[gnss]\nport = "/dev/ttyACM0,9601"', "line 2: [gnss] port", "can't run at 9601 baud"),
+        (
+            '[gnss]\nport = "/dev/ttyACM0"\n[mavlink]\nurl = "/dev/ttyACM0,57600"',
+            "line 2: [gnss] port",
+            "also a link of mavlink.url",
+        ),
         ("[trigger]\ndistance_m = 5\noverlap = 0.5", "line 2: [trigger] distance_m", "keep one"),
         ("[trigger]\nfrom_height_m = 10", "line 2: [trigger] from_height_m", "set one of those"),
         ('[mavlink]\nurl = "udpin:nonsense"', "line 2: [mavlink] url", "needs a host and a port"),

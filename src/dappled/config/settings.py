@@ -167,6 +167,16 @@ class TriggerSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class GnssSettings:
+    port: str = setting(
+        "",
+        "Serial port of a u-blox receiver, DEVICE[,BAUD]: its raw stream is recorded for PPK, and its time marks time "
+        "exposures; empty: none",
+    )
+    edge: str = setting("falling", "Edge at its EXTINT where the exposure begins", choices=("falling", "rising"))
+
+
+@dataclass(frozen=True, slots=True)
 class PoseSettings:
     wait_ms: float = setting(
         700.0, "How long a tag waits for telemetry after the exposure", unit="ms", low=0, high=10_000
@@ -254,6 +264,7 @@ class Settings:
     mavlink: MavlinkSettings = field(default_factory=MavlinkSettings)
     record: RecordSettings = field(default_factory=RecordSettings)
     trigger: TriggerSettings = field(default_factory=TriggerSettings)
+    gnss: GnssSettings = field(default_factory=GnssSettings)
     pose: PoseSettings = field(default_factory=PoseSettings)
     decode: DecodeSettings = field(default_factory=DecodeSettings)
     publish: PublishSettings = field(default_factory=PublishSettings)

@@ -49,14 +49,15 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
-from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
-from dappled.daemon.survey_facts import LiveSurvey, spacing_of
+from dappled.daemon.survey_facts import LiveSurvey, distance_trigger
 from dappled.drivers.camera import Camera
+from dappled.drivers.gnss.port import gnss_port
+from dappled.drivers.gnss.recorded import TelemetryNotebook
 from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
@@ -193,14 +194,9 @@ class Service:
         autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
-        self._distance = DistanceTrigger(
-            self._shutter,
-            LiveSurvey(self._navigation, reported, shots),
-            clock,
-            mount=settings.pose.mount,
-            configured=spacing_of(settings.trigger),
-            from_height_m=settings.trigger.from_height_m,
-        )
+        survey = LiveSurvey(self._navigation, reported, shots)
+        self._distance = distance_trigger(self._shutter, survey, clock, settings)
+        self._gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, self._navigation, clock), clock)
         self._body = BodyPlan(settings.body, settings.camera.capture_target, camera, clock)
         self._parameters = self._settable(self._body, names, decodes=recipe is not None)
         self._component = Component(
@@ -253,7 +249,7 @@ class Service:
             preview_interval_s=settings.publish.preview_interval_s,
         )
         self._answers = Answers(writer, self._decoder, shots)
-        driver = (camera,) if isinstance(camera, HasThreads) else ()
+        driver = tuple(part for part in (camera, self._gnss) if isinstance(part, HasThreads))
         self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, self._distance, *driver)
         self._tasks = self._periodic_tasks()
 
@@ -285,6 +281,9 @@ class Service:
         stack.callback(self._distance.stop)
         self._distance.start()
         self._links.start(self._navigation, self._component)
+        if self._gnss is not None:
+            stack.callback(self._gnss.stop)
+            self._gnss.start()
 
     def _remove_unused_flight(self) -> None:
         """Remove the folder of a flight whose start failed. A flight that has begun is kept, however it ends."""
@@ -384,6 +383,7 @@ class Service:
             self._events.doubt,
             self._control.shortage,
             None if (distance := self._distance.statistics()) is None else distance.problem,
+            None if self._gnss is None else self._gnss.problem(),
         )
         return health.record(
             self._settings.now,

@@ -18,6 +18,7 @@ from dappled.config.settings import TABLES, Settings, SettingsFile
 from dappled.daemon.console import placement
 from dappled.daemon.console import process as console_process
 from dappled.daemon.stream import curve, sockets
+from dappled.drivers.gnss.port import address as gnss_address
 from dappled.drivers.mavlink import LinkError, parse, read_key
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.darkroom import Recipe
@@ -117,6 +118,16 @@ def _feedback(settings: Settings) -> None:
         raise ConfigError(
             "mavlink.feedback_is_shot is for a camera that the autopilot fires, and dappled would fire it once more: "
             'set camera.shutter = "outside"'
+        )
+
+
+def _gnss(settings: Settings) -> None:
+    if not settings.gnss.port:
+        return
+    at = gnss_address(settings.gnss.port)
+    if any(link.kind == "serial" and link.host == at.host for link in map(parse, settings.mavlink.url)):
+        raise ConfigError(
+            f"gnss.port {settings.gnss.port!r} is also a link of mavlink.url: each needs a port of its own"
         )
 
 
@@ -222,6 +233,7 @@ RULES: tuple[SettingsRule, ...] = (
     SettingsRule("mavlink.url", _links),
     SettingsRule("mavlink.feedback_is_shot", _feedback, ("camera.shutter", "camera.driver")),
     SettingsRule("trigger.from_height_m", _trigger, ("trigger.distance_m", "trigger.overlap", "camera.shutter")),
+    SettingsRule("gnss.port", _gnss, ("mavlink.url",)),
     SettingsRule("mavlink.keys", _link_keys, ("mavlink.url",), secrets=lambda settings: settings.mavlink.keys),
     SettingsRule("record.directory", _directory),
     SettingsRule("record.seal_key", _seal, secrets=lambda settings: (settings.record.seal_key,)),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dappled.config.settings import TriggerSettings
+from dappled.clock import Clock
+from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera
 from dappled.daemon.navigation import Navigation
 from dappled.daemon.pipeline.capture import PendingShots
-from dappled.daemon.pipeline.spacing import Height, Spacing
+from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger, Height, Spacing
 from dappled.decode.geometry import Pose
 
 
@@ -40,8 +42,14 @@ class LiveSurvey:
         return self._shots.state == "busy" or self._shots.waits
 
 
-def spacing_of(settings: TriggerSettings) -> Spacing | None:
-    """The series of the settings; None where they have none."""
-    if not settings.distance_m and not settings.overlap:
-        return None
-    return Spacing(settings.distance_m, settings.overlap)
+def distance_trigger(shutter: Shutter, survey: LiveSurvey, clock: Clock, settings: Settings) -> DistanceTrigger:
+    """The trigger by distance, with the series of the settings, if they have one."""
+    wanted = settings.trigger
+    return DistanceTrigger(
+        shutter,
+        survey,
+        clock,
+        mount=settings.pose.mount,
+        configured=Spacing(wanted.distance_m, wanted.overlap) if wanted.distance_m or wanted.overlap else None,
+        from_height_m=wanted.from_height_m,
+    )

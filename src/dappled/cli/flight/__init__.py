@@ -1,4 +1,4 @@
-"""`dappled flight list|show|check|report|coverage|seal|offload|pickup`: work with recorded flights."""
+"""`dappled flight list|show|check|report|coverage|gnss|seal|offload|pickup`: work with recorded flights."""
 
 from __future__ import annotations
 
@@ -58,6 +58,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         f"dappled flight offload /media/disk {_FLIGHT} --prune",
     )
     seen = actions.add("coverage", words.COVERAGE_HELP, *words.COVERAGE_EXAMPLES)
+    receiver = actions.add("gnss", words.GNSS_HELP, *words.GNSS_EXAMPLES)
     bring = actions.add("pickup", words.PICKUP_HELP, *words.PICKUP_EXAMPLES)
     listing.add_argument(
         "folder", nargs="?", type=Path, metavar="FOLDER", help="flights folder (default: record.directory)"
@@ -68,6 +69,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     words.configure_report(report)
     words.configure_pickup(bring)
     words.configure_coverage(seen)
+    words.configure_gnss(receiver)
     intact.add_argument(
         "--key",
         type=Path,
@@ -77,7 +79,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signing.add_argument(
         "--key", type=Path, metavar="FILE", help="the key that signs (default: record.seal_key); see dappled keys seal"
     )
-    for one in (show, intact, report, signing, away, bring, seen):
+    for one in (show, intact, report, signing, away, bring, seen, receiver):
         one.add_argument(
             "flight", nargs="?", type=Path, metavar="FLIGHT", help="flight folder (default: the last with shots)"
         )
@@ -90,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.action == "list":
         return _list(arguments.folder or _flights(arguments.config), arguments.json)
     flight = arguments.flight or _last_flight(_flights(arguments.config))
-    alone = {"pickup": _pickup, "coverage": _coverage, "offload": _offload}
+    alone = {"pickup": _pickup, "coverage": _coverage, "gnss": _gnss, "offload": _offload}
     if arguments.action in alone:
         return alone[arguments.action](flight, arguments)
     if arguments.action == "seal":
@@ -114,6 +116,12 @@ def _coverage(flight: Path, arguments: argparse.Namespace) -> int:
     from dappled.cli.flight import coverage  # noqa: PLC0415  as above, for SciPy and PROJ
 
     return coverage.run(flight, arguments)
+
+
+def _gnss(flight: Path, arguments: argparse.Namespace) -> int:
+    from dappled.cli.flight import gnss  # noqa: PLC0415  as above, for MAVLink
+
+    return gnss.run(flight, arguments)
 
 
 def _last_flight(flights: Path) -> Path:

@@ -1,4 +1,4 @@
-"""Words of `dappled flight coverage`, `pickup` and `report --log`: apart from what they do, which loads slowly."""
+"""Words of `dappled flight coverage`, `gnss`, `pickup`, `report --log`: apart from what they do, which loads slowly."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ COVERAGE_EXAMPLES = (
     "dappled flight coverage ~/flights/20261121T101503Z-0a1b2c3d --area field.kml",
     "dappled flight coverage --area field.plan --least 2 --refly again.plan",
 )
+GNSS_HELP = "write the GNSS receiver's stream that a flight recorded (.ubx), for PPK"
+GNSS_EXAMPLES = ("dappled flight gnss ~/flights/20261121T101503Z-0a1b2c3d -o rover.ubx",)
 PICKUP_HELP = "fetch the files that stayed in the camera; exits 1 if shots still lack files"
 PICKUP_EXAMPLES = (
     "dappled flight pickup --from /media/card/DCIM --dry-run",
@@ -30,6 +32,11 @@ def configure_report(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="compare with the autopilot's own log (.bin, .ulg); again for each of its starts in the flight",
     )
+
+
+def configure_gnss(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="the file (default: the flight's name.ubx)")
+    add_overwrite(parser)
 
 
 def configure_coverage(parser: argparse.ArgumentParser) -> None:

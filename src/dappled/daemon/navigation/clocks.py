@@ -37,7 +37,6 @@ _UTC_BETTER = 2
 _UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
 _REACH_1_NS = 50_000_000
 CAMERA_SOURCE = "camera clock (EXIF)"
-CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 _REACH_SIGMAS = 4
@@ -310,7 +309,7 @@ def choose_feedback(
     if not near:
         return None
     doubtful_ns = near[0][0] * 1.5 + 5_000_000
-    if any(distance <= doubtful_ns and event.boot_ns != near[0][2].boot_ns for distance, _, event in near[1:]):
+    if any(distance <= doubtful_ns and not event.is_contact_of(near[0][2]) for distance, _, event in near[1:]):
         return None
     return near[0][2] if near[0][2].boot_ns >= earliest_ns else None
 
@@ -322,7 +321,7 @@ def _contacts(events: Sequence[Feedback], earliest_ns: float, latest_ns: float, 
     return [
         one
         for one in near
-        if not any(other.image == one.image and 0 < one.boot_ns - other.boot_ns <= bounce_ns for other in near)
+        if not any(one.repeats(other) and 0 < one.boot_ns - other.boot_ns <= bounce_ns for other in near)
     ]
 
 
@@ -355,7 +354,7 @@ def by_trigger(
     """The exposure by the message that created its shot: the exposure, mid-exposure in time since boot, and 1 σ of the
     latter alone. The body's latency is added where the message is no contact."""
     if event.contact:
-        return *refine(exposure, event, clock), CONTACT_SIGMA_NS
+        return *refine(exposure, event, clock), event.sigma_ns
     start_boot_ns = event.boot_ns + round(trigger.latency.mean_ms * 1e6)
     own_ns = round(trigger.latency.sigma_ms * 1e6)
     middle_boot_ns = start_boot_ns + exposure.half_ns
@@ -371,7 +370,7 @@ def by_trigger(
 def refine(exposure: ExposureTime, event: Feedback, clock: BootClock) -> tuple[ExposureTime, int]:
     """The exposure as the hot shoe timed it, and mid-exposure in time since boot."""
     middle_boot_ns = event.boot_ns + exposure.half_ns
-    sigma_ns = round(math.hypot(CONTACT_SIGMA_NS, clock.sigma_ns))
+    sigma_ns = round(math.hypot(event.sigma_ns, clock.sigma_ns))
     source = f"hot shoe ({event.kind})"
     return replace(exposure, utc_ns=clock.utc_ns(middle_boot_ns), sigma_ns=sigma_ns, source=source), middle_boot_ns
 

@@ -16,7 +16,6 @@ from dataclasses import replace
 from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import (
-    CONTACT_SIGMA_NS,
     TAGGING_RULES,
     BootClock,
     ExposureTime,
@@ -67,6 +66,7 @@ _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by le
 _PRUNE_EVERY = 256
 _SHOWN_NS = 60 * 10**9
 _LOOK_S = 0.005
+_MARK_COMES_NS = 1_100_000_000  # a receiver sends its marks with the next solution, at 1 Hz up to 1 s later
 # A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
 METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
 
@@ -148,11 +148,13 @@ class Telemetry:
     def settled(self, exposure: ExposureTime) -> bool:
         """Whether waiting longer would not improve this exposure's pose.
 
-        Samples from after it have arrived, and, from an autopilot that reports the hot shoe, everything that it could
-        report about this exposure.
+        Samples from after it have arrived, and everything that an autopilot which reports the hot shoe, or a receiver
+        that sends marks, could report about this exposure.
         """
         later_ns = reach_ns(exposure, self._rules) if self._counts.feedbacks else 0
-        return self.bracketed(exposure.utc_ns + later_ns)
+        if not self._counts.marks or self.locate(exposure)[0].source != exposure.source:
+            return self.bracketed(exposure.utc_ns + later_ns)
+        return self.bracketed(exposure.utc_ns + max(later_ns, _MARK_COMES_NS))
 
     def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
         """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
@@ -174,7 +176,7 @@ class Telemetry:
             exposure = unseen(exposure) if trigger else exposure
             pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
             return in_doubt(exposure, clock), pose
-        sigma_ns = CONTACT_SIGMA_NS
+        sigma_ns = event.sigma_ns
         if trigger:
             better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock)
         else:
@@ -280,8 +282,7 @@ class Navigation:
     def __init__(self, settings: LiveSettings, clock: Clock, recording: Recording, *, utc_known: bool) -> None:
         now = settings.now
         self._settings, self._clock, self._recording = settings, clock, recording
-        self._never = threading.Event()
-        self.rangefinder = Rangefinder(clock)
+        self._never, self.rangefinder = threading.Event(), Rangefinder(clock)
         self.telemetry = Telemetry(
             component_id=now.mavlink.component_id,
             cam_idx=now.mavlink.cam_idx,
@@ -371,7 +372,9 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
     receiver = at.gnss.reported if at.gnss else None
     across_m = _receiver_sigma_m(receiver, receiver.horizontal_accuracy_m, receiver.hdop) if receiver else None
     upright_m = _receiver_sigma_m(receiver, receiver.vertical_accuracy_m, receiver.vdop) if receiver else None
-    covariance = None
+    across_sigma_m = covariance = None
+    if across_m is not None:
+        across_sigma_m = math.hypot(across_m, math.hypot(north, east) * blur_s, across_doubt_m)
     if across_m is not None and upright_m is not None:
         across = (across_m**2 + across_doubt_m**2) / 2  # of each axis
         covariance = _symmetric(found.velocity_ned_m_s, blur_s, (across, across, upright_m**2 + upright_doubt_m**2))
@@ -383,9 +386,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         altitude_msl_m=found.altitude_msl_m,
         height_above_home_m=found.height_above_home_m,
         velocity_ned_m_s=found.velocity_ned_m_s,
-        position_sigma_m=None
-        if across_m is None
-        else math.hypot(across_m, math.hypot(north, east) * blur_s, across_doubt_m),
+        position_sigma_m=across_sigma_m,
         vertical_sigma_m=None if upright_m is None else math.hypot(upright_m, down * blur_s, upright_doubt_m),
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,

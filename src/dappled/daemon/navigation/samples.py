@@ -104,10 +104,15 @@ class GimbalSample:
     kind: str
 
 
+MARK = "TIM-TM2"  # a time mark of a GNSS receiver of our own (see `drivers.gnss`)
+CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
+MARK_SIGMA_NS = 5_000_000  # SYSTEM_TIME relates the receiver's UTC to boot; how late an autopilot has it isn't measured
+
+
 @dataclass(frozen=True, slots=True)
 class Feedback:
     """One CAMERA_FEEDBACK or CAMERA_TRIGGER: its time since boot. `number` is its packet's in the log,
-    `image` the autopilot's number of it.
+    `image` the autopilot's number of it. `kind` is the message's type, or MARK.
 
     `contact`: it is the time of a contact in the hot shoe. False: it may be that of the command to fire.
     """
@@ -120,6 +125,26 @@ class Feedback:
     contact: bool = True
     time_us: int = 0  # as it was sent
 
+    @property
+    def sigma_ns(self) -> int:
+        """1 σ of a contact on the autopilot's clock."""
+        return MARK_SIGMA_NS if self.kind == MARK else CONTACT_SIGMA_NS
+
+    def repeats(self, other: Feedback) -> bool:
+        """Whether a contact that bounces may have made both: it keeps the autopilot's number, and is one mark more."""
+        return self.kind == other.kind and (self.kind == MARK or self.image == other.image)
+
+    def is_contact_of(self, other: Feedback) -> bool:
+        """Whether it is the same contact: at one time, or timed by the autopilot and by a receiver of our own."""
+        both = (self.kind == MARK) != (other.kind == MARK)
+        return abs(self.boot_ns - other.boot_ns) <= (3 * MARK_SIGMA_NS if both else 0)
+
+
+def is_mark(message: MavlinkMessage, system_id: int | None) -> bool:
+    """Whether it is a time mark that our own receiver has set, of this system."""
+    sender = message.get_srcSystem(), message.get_srcComponent()
+    return sender == (system_id, mavlink.MAV_COMP_ID_GPS) and message.get_type() == "CAMERA_TRIGGER"
+
 
 @dataclass(slots=True)
 class Counts:
@@ -128,6 +153,7 @@ class Counts:
     positions: int = 0
     attitudes: int = 0
     feedbacks: int = 0
+    marks: int = 0  # among the feedbacks
     out_of_order: int = 0
     impossible: int = 0
     impossible_ns: int = 0  # the last one's stamp
@@ -339,6 +365,14 @@ def feedback_boot_ns(
     if unwrap and message.get_type() == "CAMERA_FEEDBACK" and time_us < WRAP_US:
         time_us += max(0, round((now_boot_ns // 1000 - time_us) / WRAP_US)) * WRAP_US
     return time_us * 1000
+
+
+def feedback(number: int, stamp_ns: int, boot_ns: int, message: MavlinkMessage, *, mark: bool, older: bool) -> Feedback:
+    """The message as a Feedback at `boot_ns`. `mark`: see `is_mark`; `older`: by the first tagging rules."""
+    by_pin, time_us = message.get_type() == "CAMERA_FEEDBACK", int(message.time_usec)
+    contact = older or mark or (by_pin and time_us < EPOCH_US)
+    image = message.img_idx if by_pin else message.seq
+    return Feedback(number, stamp_ns, boot_ns, MARK if mark else message.get_type(), image, contact, time_us)
 
 
 def keep(history: list[N], sample: N) -> None:

@@ -433,7 +433,8 @@ class VehicleHistory:
     def _feedback(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """ArduPilot reports every camera at each trigger of one: only our camera's message counts."""
         by_pin, older = message.get_type() == "CAMERA_FEEDBACK", self._rules < 2
-        if not self._ours(message) or (by_pin and message.cam_idx != self._cam_idx and not older):
+        mark = telemetry_samples.is_mark(message, self.system_id)
+        if not (mark or self._ours(message)) or (by_pin and message.cam_idx != self._cam_idx and not older):
             return
         now_ns = self.time.now_boot_ns
         boot_ns = (
@@ -443,13 +444,13 @@ class VehicleHistory:
         )
         if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
             return
-        time_us = int(message.time_usec)
-        image = message.img_idx if by_pin else message.seq
-        if not older and any(one.time_us == time_us and one.image != image for one in self._feedbacks[-_REPEATS:]):
+        found = telemetry_samples.feedback(number, stamp_ns, boot_ns, message, mark=mark, older=older)
+        told = self._feedbacks[-_REPEATS:]
+        if not older and any(one.time_us == found.time_us and one.image != found.image for one in told):
             return  # the report of another camera repeats this one's last time, with the number of a trigger to come
         self.counts.feedbacks += 1
-        contact = older or (by_pin and time_us < EPOCH_US)
-        keep(self._feedbacks, Feedback(number, stamp_ns, boot_ns, message.get_type(), image, contact, time_us))
+        self.counts.marks += mark
+        keep(self._feedbacks, found)
 
     def _refuses(self, stamp_ns: int, message: MavlinkMessage) -> bool:
         """Whether it can't be true. Our own vehicle's are counted."""

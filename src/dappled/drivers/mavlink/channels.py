@@ -63,7 +63,7 @@ def parse(url: str) -> Address:
     """Parse `url`. `udp:HOST:PORT` and `HOST:PORT` listen, as in pymavlink. Raises LinkError."""
     scheme, colon, rest = url.partition(":")
     if url.startswith("/") or scheme == "serial":
-        return _serial_address(url, url if url.startswith("/") else rest)
+        return serial_address(url, url if url.startswith("/") else rest)
     kind = _SCHEMES.get(scheme)
     if colon and kind is not None:
         return _socket_address(url, kind, rest)
@@ -85,15 +85,16 @@ def _socket_address(url: str, kind: LinkKind, rest: str) -> Address:
     return Address(url, kind, host, int(port))
 
 
-def _serial_address(url: str, rest: str) -> Address:
+def serial_address(url: str, rest: str, setting: str = "mavlink.url") -> Address:
+    """Parse DEVICE[,BAUD] of `url`; `setting` names it in sentences. Raises LinkError."""
     device, separator, baud = rest.replace(":", ",").partition(",")
     if not device.startswith("/"):
-        raise LinkError(f"mavlink.url {url!r} needs a device, as in /dev/ttyAMA0,921600")
+        raise LinkError(f"{setting} {url!r} needs a device, as in /dev/ttyAMA0,921600")
     if separator and not (baud.isascii() and baud.isdigit()):
-        raise LinkError(f"mavlink.url {url!r}: {baud!r} is not a baud rate; write a number such as {DEFAULT_BAUD}")
+        raise LinkError(f"{setting} {url!r}: {baud!r} is not a baud rate; write a number such as {DEFAULT_BAUD}")
     speed = int(baud) if separator else DEFAULT_BAUD
     if not hasattr(termios, f"B{speed}"):
-        raise LinkError(f"mavlink.url {url!r}: a serial port can't run at {speed} baud; write 57600, 115200 or 921600")
+        raise LinkError(f"{setting} {url!r}: a serial port can't run at {speed} baud; write 57600, 115200 or 921600")
     return Address(url, "serial", device, speed)
 
 

@@ -6,7 +6,6 @@ The form is that of RTKLIB's manual, B.1: lines of comments that begin with %, t
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -17,16 +16,11 @@ import numpy as np
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_bytes
 from dappled.decode.geometry import Symmetric, camera_pose
+from dappled.drivers.gnss.gps_time import GPS_EPOCH, gps_to_utc
 from dappled.errors import DappledError
 from dappled.flight import disk_error
 
 _MOST_BYTES = 64 << 20
-_GPS_EPOCH = datetime(1980, 1, 6, tzinfo=UTC)
-# From each of these days on GPS time is one second more ahead of UTC.
-_LEAPS = ("1981-07-01", "1982-07-01", "1983-07-01", "1985-07-01", "1988-01-01", "1990-01-01", "1991-01-01",
-          "1992-07-01", "1993-07-01", "1994-07-01", "1996-01-01", "1997-07-01", "1999-01-01", "2006-01-01",
-          "2009-01-01", "2012-07-01", "2015-07-01", "2017-01-01")  # fmt: skip
-_LEAP_STARTS = tuple(datetime.fromisoformat(day).replace(tzinfo=UTC) for day in _LEAPS)
 _EAST_9_H = timedelta(hours=9)
 _QUALITIES = {1: "fix", 2: "float", 3: "SBAS", 4: "DGPS", 5: "single", 6: "PPP"}
 _GEODETIC = ("latitude", "longitude", "height")
@@ -102,19 +96,6 @@ def read(path: Path) -> PosFile:
     marks.sort(key=lambda mark: mark.utc_ns)
     above_geoid = any("/geodetic" in line for line in comments) and columns[0] == _GEODETIC[0]
     return PosFile(tuple(marks), above_geoid, tuple(doubts))
-
-
-def gps_to_utc(gps: datetime) -> datetime:
-    """GPS time, written as a date, in UTC.
-
-    >>> gps_to_utc(datetime(2026, 11, 21, 10, 15, 21, tzinfo=UTC)).isoformat()
-    '2026-11-21T10:15:03+00:00'
-    """
-    seconds = bisect_right(_LEAP_STARTS, gps)
-    utc = gps - timedelta(seconds=seconds)
-    if seconds and utc < _LEAP_STARTS[seconds - 1]:  # within the seconds after a leap, that GPS time reaches first
-        utc += timedelta(seconds=1)
-    return utc
 
 
 def _columns(path: Path, comments: Sequence[str]) -> tuple[list[str], str]:
@@ -224,7 +205,7 @@ def _utc_ns(first: str, second: str, system: str) -> int:
     else:
         whole, _, fraction = second.partition(".")
         ticks = int(fraction[:9].ljust(9, "0"))
-        at = _GPS_EPOCH + timedelta(weeks=int(first), seconds=int(whole))
+        at = GPS_EPOCH + timedelta(weeks=int(first), seconds=int(whole))
     if system == "GPST":
         at = gps_to_utc(at)
     elif system == "JST":

@@ -1,0 +1,149 @@
+"""Record a u-blox receiver's serial port: every byte into the telemetry log, and its time marks beside them."""
+
+from __future__ import annotations
+
+import errno
+import logging
+import select
+from typing import Protocol
+
+from dappled.clock import Clock
+from dappled.config.settings import GnssSettings
+from dappled.drivers.gnss import recorded
+from dappled.drivers.gnss.ubx import Edge, UbxStream, time_mark
+from dappled.drivers.mavlink import LinkError, MavlinkMessage
+from dappled.drivers.mavlink.channels import Address, ByteChannel, over_serial, serial_address
+from dappled.errors import DappledError, report
+from dappled.workers import Loop
+
+log = logging.getLogger(__name__)
+SETTING = "gnss.port"
+_QUIET_S = 0.1
+_AGAIN_S = 1.0
+_SILENT_NS = 5 * 10**9
+
+
+class Notebook(Protocol):
+    """Where messages are logged; see `recorded.TelemetryNotebook`."""
+
+    def note(self, message: MavlinkMessage) -> None: ...
+
+
+def address(text: str) -> Address:
+    """Parse DEVICE[,BAUD]. Raises LinkError."""
+    return serial_address(text, text, SETTING)
+
+
+def gnss_port(settings: GnssSettings, notebook: Notebook, clock: Clock) -> GnssPort | None:
+    """The receiver of the settings; None where they name none. Raises LinkError."""
+    if not settings.port:
+        return None
+    return GnssPort(address(settings.port), "rising" if settings.edge == "rising" else "falling", notebook, clock)
+
+
+class GnssPort:
+    """One receiver. A device that is not there, or goes, is waited for."""
+
+    def __init__(self, at: Address, edge: Edge, notebook: Notebook, clock: Clock) -> None:
+        self._at, self._edge, self._notebook, self._clock = at, edge, notebook, clock
+        self._loop = Loop("gnss", self._run)
+        self._unlogged: str | None = None
+        self._error: str | None = None
+        self._began_ns = clock.monotonic_ns()
+        self._heard_ns: int | None = None
+        self._message_ns: int | None = None
+        self.marks = 0
+
+    def start(self) -> None:
+        """Begin to read."""
+        self._loop.start()
+
+    def stop(self) -> None:
+        """End the thread and close the device."""
+        self._loop.stop(2.0)
+
+    def dead_threads(self) -> list[str]:
+        """See HasThreads."""
+        return self._loop.dead_threads()
+
+    def problem(self) -> str | None:
+        """Why nothing, or nothing of use, is recorded; None while the stream comes."""
+        name = f"GNSS receiver {self._at.host}"
+        if self._error or self._unlogged:
+            return f"{name}: {self._error or self._unlogged}"
+        now_ns = self._clock.monotonic_ns()
+        if now_ns - (self._heard_ns or self._began_ns) > _SILENT_NS:
+            return f"{name}: nothing was heard for 5 s: check cable and baud rate ({self._at.port})"
+        if now_ns - (self._message_ns or self._began_ns) > _SILENT_NS:
+            return f"{name}: no UBX message for 5 s: switch on UBX output (RXM-RAWX, TIM-TM2), check the baud rate"
+        return None
+
+    def _run(self) -> None:
+        while not self._loop.stopping.is_set():
+            try:
+                channel = over_serial(self._at)
+            except LinkError:
+                self._wait(f"it is not a serial device; correct {SETTING}")
+            except OSError as error:
+                self._wait(_sentence(error))
+            else:
+                self._error = None
+                try:
+                    self._read(channel)
+                except OSError as error:
+                    self._wait(_sentence(error))
+                finally:
+                    channel.close()
+
+    def _wait(self, error: str) -> None:
+        self._error = error
+        self._clock.wait(self._loop.stopping, _AGAIN_S)
+
+    def _read(self, channel: ByteChannel) -> None:
+        """Until the device goes, or the thread is to end."""
+        poll = select.poll()
+        for descriptor in channel.descriptors():
+            poll.register(descriptor, select.POLLIN)
+        stream, pending = UbxStream(), b""
+        while not self._loop.stopping.is_set():
+            data: bytes | None = b""
+            if poll.poll(_QUIET_S * 1e3):
+                data = channel.read()
+            if data:
+                pending += data
+                self._heard(stream, data)
+            whole = len(pending) // recorded.CHUNK * recorded.CHUNK if data else len(pending)
+            for at in range(0, whole, recorded.CHUNK):
+                self._note(recorded.bytes_message(pending[at : min(at + recorded.CHUNK, whole)]))
+            pending = pending[whole:]
+            if data is None:
+                self._wait("it was unplugged")
+                return
+        if pending:
+            self._note(recorded.bytes_message(pending))
+
+    def _heard(self, stream: UbxStream, data: bytes) -> None:
+        self._heard_ns = self._clock.monotonic_ns()
+        for message in stream.feed(data):
+            self._message_ns = self._heard_ns
+            mark = time_mark(message, self._edge)
+            if mark is not None:
+                self.marks += 1
+                self._note(recorded.mark_message(mark))
+
+    def _note(self, message: MavlinkMessage) -> None:
+        try:
+            self._notebook.note(message)
+            self._unlogged = None
+        except DappledError as error:  # a full disk: what comes next may have room again
+            if self._unlogged is None:
+                report(log, "GNSS receiver", error)
+            self._unlogged = str(error)
+
+
+def _sentence(error: OSError) -> str:
+    if error.errno == errno.ENOENT:
+        return f"there is no such device; plug it in or correct {SETTING}"
+    if error.errno == errno.EACCES:
+        return "no permission to open it; add the user to the group of the device"
+    return f"{error.strerror or error}; plug it in again"
