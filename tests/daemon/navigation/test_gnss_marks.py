@@ -15,6 +15,14 @@ from tests.daemon.navigation.test_owned_triggers import MS, START_NS, Vehicle
 EXPOSED_S, HALF_MS = 10.2, 1.0
 
 
+def mark(vehicle: Vehicle, count: int, at_s: float, sender: tuple[int, int] = (1, 220)) -> None:
+    """The receiver has marked a contact, and says so 0.1 s later."""
+    message = recorded.mark_message(TimeMark(count, START_NS + round(at_s * 1e9), 30))
+    message.pack(mavlink.MAVLink(None, *sender))
+    vehicle.telemetry.feed(vehicle._number, START_NS // 1000 + round((at_s + 0.1) * 1e6), message)
+    vehicle._number += 1
+
+
 def flown(*marks_s: float, sender: tuple[int, int] = (1, 220), pin: bool = False) -> Vehicle:
     """A vehicle whose camera exposes at 10.2 s; these marks are heard 0.1 s after they were."""
     vehicle = Vehicle(BootTime(drift=0.0), (CameraPort("wire", pin=pin),), "ardupilot", rules=4)
@@ -22,10 +30,7 @@ def flown(*marks_s: float, sender: tuple[int, int] = (1, 220), pin: bool = False
     if pin:
         vehicle.expose(EXPOSED_S - 0.06)
     for count, at_s in enumerate(marks_s):
-        message = recorded.mark_message(TimeMark(count, START_NS + round(at_s * 1e9), 30))
-        message.pack(mavlink.MAVLink(None, *sender))
-        vehicle.telemetry.feed(vehicle._number, START_NS // 1000 + round((at_s + 0.1) * 1e6), message)
-        vehicle._number += 1
+        mark(vehicle, count, at_s, sender)
     vehicle.fly(EXPOSED_S, EXPOSED_S + 3)
     return vehicle
 
@@ -55,6 +60,27 @@ def test_a_contact_that_bounces_is_its_first_mark() -> None:
     exposure, _ = flown(EXPOSED_S, EXPOSED_S + 0.003, EXPOSED_S + 0.02).telemetry.locate(expected())
     assert exposure.source == "hot shoe (TIM-TM2)"
     assert exposure.utc_ns == pytest.approx(START_NS + round((EXPOSED_S + HALF_MS / 1e3) * 1e9), abs=2 * MS)
+
+
+@pytest.mark.parametrize("personality", ["ardupilot", "px4"])
+@pytest.mark.parametrize("marked", [True, False])
+def test_a_body_that_the_autopilot_fires_by_wire_has_the_time_of_its_mark(personality: str, marked: bool) -> None:
+    """Its hot shoe leads to the receiver: the autopilot has the time of its command only, ± the body's latency."""
+    vehicle = Vehicle(BootTime(drift=0.0), (CameraPort("wire"),), personality, rules=4)
+    vehicle.fly(0, EXPOSED_S)
+    vehicle.expose(EXPOSED_S - 0.06)
+    if marked:
+        mark(vehicle, 0, EXPOSED_S + 0.02)  # 20 ms later than the body is said to be
+    vehicle.fly(EXPOSED_S, EXPOSED_S + 3)
+    (_, own), *_ = vehicle.shots()
+    exposure, pose = vehicle.telemetry.locate(own)
+    assert exposure.source == ("hot shoe (TIM-TM2)" if marked else exposure.source)
+    late_ns = 20 * MS if marked else 0
+    assert exposure.utc_ns == pytest.approx(START_NS + round((EXPOSED_S + 0.001) * 1e9) + late_ns, abs=3 * MS)
+    assert exposure.sigma_ns < (8 if marked else 13) * MS
+    assert pose.source == "interpolated"
+    if not marked:
+        assert exposure.source.startswith("autopilot's trigger")
 
 
 @pytest.mark.parametrize("sender", [(2, 220), (1, 100), (1, 154)], ids=["another vehicle", "a camera", "a gimbal"])

@@ -24,12 +24,13 @@ from typing import Literal, Self
 import numpy as np
 
 from dappled.config.settings import CameraSettings
-from dappled.daemon.navigation.samples import Feedback, UtcCorrection, UtcNotes
+from dappled.daemon.navigation.samples import MARK, Feedback, UtcCorrection, UtcNotes
 from dappled.decode.array_types import Floats
 from dappled.flight import Shot
 
 log = logging.getLogger(__name__)
 
+CONTACT_SOURCE = "hot shoe"
 LATENCY_SOURCE = "trigger call + body latency"
 REQUEST_SOURCE = "wish + body latency"
 TAGGING_RULES = 4  # recorded with each flight. 1: those of flights that were recorded without a number
@@ -349,10 +350,11 @@ def unseen(exposure: ExposureTime) -> ExposureTime:
 
 
 def by_trigger(
-    exposure: ExposureTime, trigger: TriggerMessage, event: Feedback, clock: BootClock
+    exposure: ExposureTime, trigger: TriggerMessage, event: Feedback, clock: BootClock, events: Sequence[Feedback] = ()
 ) -> tuple[ExposureTime, int, int]:
     """The exposure by the message that created its shot: the exposure, mid-exposure in time since boot, and 1 σ of the
-    latter alone. The body's latency is added where the message is no contact."""
+    latter alone. Where the message is no contact, a receiver's mark among `events` is; without one the body's latency
+    is added."""
     if event.contact:
         return *refine(exposure, event, clock), event.sigma_ns
     start_boot_ns = event.boot_ns + round(trigger.latency.mean_ms * 1e6)
@@ -363,15 +365,17 @@ def by_trigger(
         utc_ns=clock.utc_ns(middle_boot_ns),
         sigma_ns=round(math.hypot(own_ns, clock.sigma_ns)),
         source=f"autopilot's trigger ({event.kind}) + body latency",
+        called_utc_ns=clock.utc_ns(event.boot_ns),
     )
-    return better, middle_boot_ns, own_ns
+    mark = choose_feedback([one for one in events if one.kind == MARK], better, clock)
+    return (better, middle_boot_ns, own_ns) if mark is None else (*refine(better, mark, clock), mark.sigma_ns)
 
 
 def refine(exposure: ExposureTime, event: Feedback, clock: BootClock) -> tuple[ExposureTime, int]:
     """The exposure as the hot shoe timed it, and mid-exposure in time since boot."""
     middle_boot_ns = event.boot_ns + exposure.half_ns
     sigma_ns = round(math.hypot(event.sigma_ns, clock.sigma_ns))
-    source = f"hot shoe ({event.kind})"
+    source = f"{CONTACT_SOURCE} ({event.kind})"
     return replace(exposure, utc_ns=clock.utc_ns(middle_boot_ns), sigma_ns=sigma_ns, source=source), middle_boot_ns
 
 

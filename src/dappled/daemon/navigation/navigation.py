@@ -16,6 +16,7 @@ from dataclasses import replace
 from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import (
+    CONTACT_SOURCE,
     TAGGING_RULES,
     BootClock,
     ExposureTime,
@@ -152,9 +153,8 @@ class Telemetry:
         that sends marks, could report about this exposure.
         """
         later_ns = reach_ns(exposure, self._rules) if self._counts.feedbacks else 0
-        if not self._counts.marks or self.locate(exposure)[0].source != exposure.source:
-            return self.bracketed(exposure.utc_ns + later_ns)
-        return self.bracketed(exposure.utc_ns + max(later_ns, _MARK_COMES_NS))
+        here = not self._counts.marks or self.locate(exposure)[0].source.startswith(CONTACT_SOURCE)
+        return self.bracketed(exposure.utc_ns + (later_ns if here else max(later_ns, _MARK_COMES_NS)))
 
     def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
         """When and where a frame was exposed, from the packets below `upto_packet` (all so far).
@@ -178,7 +178,7 @@ class Telemetry:
             return in_doubt(exposure, clock), pose
         sigma_ns = event.sigma_ns
         if trigger:
-            better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock)
+            better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock, events)
         else:
             better, boot_ns = refine(exposure, event, clock)
         if rules > 2 and not clock.doubt:  # the better time may be next to a step, where the expected one was not
