@@ -53,16 +53,19 @@ class Daemon:
 
 
 @contextmanager
-def flown(folder: Path, sockets: Path, *, settings: str = "", code: int = 0) -> Iterator[Daemon]:
+def flown(
+    folder: Path, sockets: Path, *, settings: str = "", simulate: bool | None = None, code: int = 0
+) -> Iterator[Daemon]:
     """`dappled run` with a console that asks for a token, on a port that the system chose; `--simulate`, unless more
-    `settings` are given. A process that the test has not killed must end in order, with this code and no traceback."""
+    `settings` are given, or as `simulate` says. A process that the test has not killed must end in order, with this
+    code and no traceback."""
     (folder / "token").write_text(TOKEN)
     (folder / "token").chmod(0o600)
     (folder / "dappled.toml").write_text(
         f'[record]\ndirectory = "flights"\n[publish]\nslices = "ipc://{sockets}/{folder.name}"\n'
         f'[console]\nbind = "127.0.0.1:0"\ntoken = "token"\n{settings}'
     )
-    simulated = () if settings else ("--simulate", "--seed", "3")
+    simulated = ("--simulate", "--seed", "3") if (not settings if simulate is None else simulate) else ()
     process = subprocess.Popen(
         [sys.executable, "-m", "dappled", "run", *simulated, "--config", "dappled.toml"],
         cwd=folder, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True,
@@ -317,6 +320,22 @@ def test_an_interval_runs_and_stops(chromium: Browser, daemon: Daemon) -> None:
     until(page, "document.querySelector('#interval-stop').disabled")
     until(page, "!document.querySelector('#interval-go').disabled")
     assert watched.wrong == []
+
+
+@pytest.mark.slow
+def test_photographs_by_distance_are_shown_and_stopped(chromium: Browser, tmp_path: Path, sockets: Path) -> None:
+    """They begin by themselves: the page must tell that they do, and end them."""
+    by_itself = "[trigger]\ndistance_m = 9\nfrom_height_m = 2\n"
+    with flown(tmp_path, sockets, settings=by_itself, simulate=True) as daemon:
+        watched = opened(chromium, daemon, PHONE)
+        page = watched.page
+        until(page, "/^[1-9]\\d* taken, one each 9.0 m$/.test(document.querySelector('#progress').textContent)")
+        assert page.is_disabled("#interval-go")
+        page.click("#interval-stop")
+        until(page, "document.querySelector('#outcome').textContent === 'the interval is stopped'")
+        until(page, "document.querySelector('#progress').textContent === ''")
+        until(page, "!document.querySelector('#interval-go').disabled")
+        assert watched.wrong == []
 
 
 def test_a_phone_shows_go_or_no_go_first_and_fits(chromium: Browser, daemon: Daemon) -> None:

@@ -119,9 +119,8 @@ class Service:
             names, recipe = recipes.recipe(settings)
             camera = open_camera(settings.camera)
             listener = console_process.open_listener(settings, stack)
-            self._publisher = Publisher.of(
-                settings.publish, private=listener.private if listener else "", clock=self._clock
-            )
+            private = listener.private if listener else ""
+            self._publisher = Publisher.of(settings.publish, private=private, clock=self._clock)
             stack.callback(self._publisher.stop)
             self._links = _configured_links(settings, self._clock)
             self._links.open()
@@ -130,8 +129,8 @@ class Service:
             self._build(camera, names, recipe)
             if listener:  # before the publisher, so that it ends after it: the pages are told how the flight ended
                 self.console_url = listener.url
-                look = CameraLook(camera, self._shutter, self._clock)
-                requests = ConsoleRequests(self._shutter, self._parameters, look, self._logbook, self._clock)
+                look, parts = CameraLook(camera, self._shutter, self._clock), (self._shutter, self._parameters)
+                requests = ConsoleRequests(*parts, look, self._logbook, series=self._distance, clock=self._clock)
                 self._console = console_process.start(
                     listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
                 )
@@ -382,7 +381,6 @@ class Service:
             navigation.telemetry.impossible(self._clock.utc_ns()),
             self._events.doubt,
             self._control.shortage,
-            None if (distance := self._distance.statistics()) is None else distance.problem,
             None if self._gnss is None else self._gnss.problem(),
         )
         return health.record(
@@ -393,6 +391,7 @@ class Service:
             shots=self._shots,
             stages=self._pipeline.statistics(),
             shutter=self._shutter.statistics(),
+            series=self._distance.statistics(),
             links=self._links.statistics(),
             telemetry=navigation.telemetry.statistics(),
             publisher=self._publisher.statistics(),

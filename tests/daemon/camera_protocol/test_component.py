@@ -640,8 +640,10 @@ def test_a_distance_between_photographs_begins_ends_and_is_refused_with_a_senten
     found = rig.series.statistics()
     assert found is not None
     assert found.wanted == Spacing(12.5)
-    assert rig.command(206, 0) == mavlink.MAV_RESULT_ACCEPTED
-    assert rig.series.statistics() is None
+    for command in ((206, 0), (2001,)):  # a pilot's "stop" ends every series
+        rig.command(206, 12.5)
+        assert rig.command(*command) == mavlink.MAV_RESULT_ACCEPTED
+        assert rig.series.statistics() is None
     said = ""
     for wrong in (-5.0, math.nan, math.inf, 1e9):
         assert rig.command(206, wrong) == mavlink.MAV_RESULT_DENIED

@@ -14,7 +14,7 @@ from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.console.requests import DEADLINE_MS, HEARD_MS, ConsoleRequests, token
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.shutter import IntervalEnd, Shutter
 from dappled.drivers.camera import PlainCamera, Setting, SettingName
 from tests.daemon.fakes import FakeSink, Rig, rig
 
@@ -30,7 +30,20 @@ def pipeline(tmp_path: Path) -> Iterator[Rig]:
 
 
 def asked(shutter: Shutter) -> ConsoleRequests:
-    return ConsoleRequests(shutter, Parameters(Body()), NoLook(), Logbook(RecordedClock(7)), SystemClock())
+    return ConsoleRequests(
+        shutter, Parameters(Body()), NoLook(), Logbook(RecordedClock(7)), series=NoSeries(), clock=SystemClock()
+    )
+
+
+class NoSeries:
+    """Photographs by distance. `ran`: what a stop finds."""
+
+    def __init__(self, ran: IntervalEnd = "none ran") -> None:
+        self.ran, self.asked_ns = ran, 0
+
+    def end(self, *, asked_ns: int | None = None) -> IntervalEnd:
+        self.asked_ns = asked_ns or 0
+        return self.ran
 
 
 class NoLook:
@@ -96,7 +109,9 @@ def test_the_log_is_told_from_a_number_on(pipeline: Rig) -> None:
     logbook = Logbook(RecordedClock(7))
     logbook.add("one")
     logbook.add("two", "warning")
-    requests = ConsoleRequests(pipeline.shutter, Parameters(Body()), NoLook(), logbook, SystemClock())
+    requests = ConsoleRequests(
+        pipeline.shutter, Parameters(Body()), NoLook(), logbook, series=NoSeries(), clock=SystemClock()
+    )
     assert requests.answer({"do": "log", "after": 1})["lines"] == [
         {"number": 2, "utc_ns": 7, "level": "warning", "text": "two"}
     ]
@@ -110,7 +125,9 @@ class Late:
         self.clock = RecordedClock(1000 * MS)
         self.sink = FakeSink()
         self.body, self.shutter = Body(), Shutter(self.sink, self.clock, next_index=0)
-        self.requests = ConsoleRequests(self.shutter, Parameters(self.body), NoLook(), Logbook(self.clock), self.clock)
+        self.requests = ConsoleRequests(
+            self.shutter, Parameters(self.body), NoLook(), Logbook(self.clock), series=NoSeries(), clock=self.clock
+        )
         self.token = token(self.requests.run, self.clock.monotonic_ns())
 
     def at(self, ms: int, **request: Any) -> dict[str, Any]:
@@ -169,6 +186,23 @@ def test_a_stop_that_a_link_held_back_leaves_alone_what_was_begun_since() -> Non
     assert other["text"] == "no interval of then is running: the daemon was started again since"
     assert one.shutter.statistics().interval_s == 60
     assert one.at(80_000, elapsed_ms=16_000, do="stop interval")["text"] == "the interval is stopped"
+
+
+@pytest.mark.parametrize(
+    ("ran", "ok", "words"),
+    [
+        ("stopped", True, "the interval is stopped"),
+        ("none ran", True, "no interval was running"),
+        ("began later", False, "press it again"),
+    ],
+)
+def test_a_stop_also_ends_photographs_by_distance(ran: IntervalEnd, ok: bool, words: str) -> None:
+    shutter, clock, series = Late().shutter, SystemClock(), NoSeries(ran)
+    one = ConsoleRequests(shutter, Parameters(Body()), NoLook(), Logbook(RecordedClock(7)), series=series, clock=clock)
+    answer = do(one, do="stop interval")
+    assert answer["ok"] == ok
+    assert words in answer.get("text", "") + answer.get("error", "")
+    assert abs(series.asked_ns - clock.monotonic_ns()) < 60 * 10**9  # when it was pressed
 
 
 def test_a_stop_right_after_the_start_that_the_page_has_seen_is_meant_for_it() -> None:

@@ -16,6 +16,7 @@ from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
+from dappled.daemon.pipeline.spacing import Spacing, SpacingStatistics
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.decode.geometry import Gnss, Pose
 from dappled.drivers.camera import BodyState
@@ -160,3 +161,12 @@ def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) 
     assert len(record(tmp_path, link=never)["problems"]) == 1
     silent = record(tmp_path, links=[never])["problems"]  # the autopilot's cable may be the silent one
     assert any("udpin:127.0.0.1:2: nothing was heard for 5 s" in text for text in silent)
+
+
+def test_photographs_by_distance_are_an_interval_in_metres(tmp_path: Path) -> None:
+    none = record(tmp_path)
+    assert none["interval"] is None
+    by_overlap = SpacingStatistics(Spacing(overlap=0.7), 8.5, 12, 1, None, "the body is not ready in time")
+    found = record(tmp_path, series=by_overlap)
+    assert found["interval"] == {"taken": 12, "count": None, "next_s": None, "distance_m": 8.5}
+    assert "the body is not ready in time" in found["problems"]

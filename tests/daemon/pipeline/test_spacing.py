@@ -233,8 +233,8 @@ def test_it_ends_and_begins_again_and_the_same_wish_twice_is_one() -> None:
     rig.trigger.begin(Spacing(5.0), "mavlink:255/190", at_once=True)  # a retry
     rig.fly(0.3)
     assert len(rig.shots_m) == 1
-    assert rig.trigger.end()
-    assert not rig.trigger.end()
+    assert rig.trigger.end() == "stopped"
+    assert rig.trigger.end() == "none ran"
     rig.fly(10)
     assert len(rig.shots_m) == 1
     assert rig.trigger.statistics() is None
@@ -246,6 +246,15 @@ def test_it_ends_and_begins_again_and_the_same_wish_twice_is_one() -> None:
 def test_what_can_not_be_flown_is_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=r"distance|overlap"):
         Spacing(**wrong)
+
+
+def test_a_stop_that_a_link_held_back_ends_no_later_series() -> None:
+    rig = Rig()
+    pressed_ns = rig.clock.monotonic_ns()
+    rig.fly(1)
+    rig.trigger.begin(Spacing(5.0), "mavlink:255/190")
+    assert rig.trigger.end(asked_ns=pressed_ns) == "began later"
+    assert rig.trigger.end(asked_ns=rig.clock.monotonic_ns()) == "stopped"
 
 
 def surveying(**changes: object) -> Rig:
@@ -274,7 +283,7 @@ def test_the_series_of_the_settings_begins_above_its_height_and_ends_a_fifth_low
 def test_a_series_that_somebody_ended_begins_again_only_from_below() -> None:
     rig = surveying(climbed_m=40.0)
     rig.fly(1)
-    assert rig.trigger.end()
+    assert rig.trigger.end() == "stopped"
     rig.fly(10)
     assert len(rig.shots_m) == 1
     rig.climbed_m = 10.0

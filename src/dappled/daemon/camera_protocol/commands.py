@@ -101,7 +101,7 @@ class DistanceSeries(Protocol):
     def begin_configured(self, source: str) -> bool:
         """See DistanceTrigger."""
 
-    def end(self) -> bool:
+    def end(self) -> object:
         """See DistanceTrigger."""
 
 
@@ -192,6 +192,7 @@ class CameraCommands:
 
     def _stop_capture(self, command: Command) -> CommandAnswer:
         self._shutter.stop_interval(command.source)
+        self._series.end()
         return CommandAnswer(ACCEPTED)
 
     def _digicam_control(self, command: Command) -> CommandAnswer:

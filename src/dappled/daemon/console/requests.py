@@ -15,7 +15,7 @@ from typing import Any, Protocol
 from dappled.clock import Clock
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.repeats import CaptureRequest
-from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
+from dappled.daemon.pipeline.shutter import IntervalEnd, ShotDecision, Shutter
 from dappled.drivers.camera import CameraError
 
 DEADLINE_MS = 2000  # from the press to the daemon
@@ -36,6 +36,13 @@ class Settable(Protocol):
         """Ask for another value. Whether it is set already; else the body will report it. Raises CameraError."""
 
 
+class Series(Protocol):
+    """Photographs by distance: `pipeline.spacing.DistanceTrigger`."""
+
+    def end(self, *, asked_ns: int | None = None) -> IntervalEnd:
+        """End them; one that began after `asked_ns` goes on."""
+
+
 class LiveAnswers(Protocol):
     """What shows a page the camera's live view: `live_view.CameraLook`."""
 
@@ -47,11 +54,19 @@ class ConsoleRequests:
     """Answers the console's questions. One thread asks."""
 
     def __init__(
-        self, shutter: Shutter, parameters: Settable, look: LiveAnswers, logbook: Logbook, clock: Clock
+        self,
+        shutter: Shutter,
+        parameters: Settable,
+        look: LiveAnswers,
+        logbook: Logbook,
+        *,
+        series: Series,
+        clock: Clock,
     ) -> None:
         self.run = secrets.token_hex(4)
         self.logbook = logbook
-        self._shutter, self._parameters, self._look, self._clock = shutter, parameters, look, clock
+        self._shutter, self._series = shutter, series
+        self._parameters, self._look, self._clock = parameters, look, clock
         self._done: OrderedDict[int, dict[str, Any]] = OrderedDict()
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
@@ -111,14 +126,11 @@ class ConsoleRequests:
             if pressed_ms is None:
                 return {"ok": True, "text": "no interval of then is running: the daemon was started again since"}
             asked_ns = (pressed_ms + 1) * 10**6  # the token counts whole milliseconds
-        match self._shutter.stop_interval(asked_ns=asked_ns):
-            case "stopped":
-                return {"ok": True, "text": "the interval is stopped"}
-            case "none ran":
-                return {"ok": True, "text": "no interval was running"}
-            case "began later":
-                text = "not stopped: this interval was begun after Stop was pressed; press it again to end it"
-                return {"ok": False, "error": text}
+        ends = {self._shutter.stop_interval(asked_ns=asked_ns), self._series.end(asked_ns=asked_ns)}
+        if "began later" in ends:
+            text = "not stopped: this interval was begun after Stop was pressed; press it again to end it"
+            return {"ok": False, "error": text}
+        return {"ok": True, "text": "the interval is stopped" if "stopped" in ends else "no interval was running"}
 
     def _outcome(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """What became of a number. "waiting": it may still arrive in time; "never": it did not, and is refused now."""

@@ -15,6 +15,7 @@ from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
+from dappled.daemon.pipeline.spacing import SpacingStatistics
 from dappled.daemon.pipeline.verdicts import STATES, VerdictCounts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
@@ -89,12 +90,14 @@ def record(
     parameters: Sequence[Mapping[str, Any]] = (),
     frame_bytes: float | None = None,
     body: BodyReport | None = None,
+    series: SpacingStatistics | None = None,
 ) -> dict[str, Any]:
     """The header of a `health` message. Its `problems` are sentences, none when all is well.
 
     `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to. `parameters`
     are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames, None before the first.
-    `body` is how the camera's settings stand to the plan; None where nothing is compared.
+    `body` is how the camera's settings stand to the plan; None where nothing is compared. `series` are photographs by
+    distance, while they run.
     """
     decoding = decoding or DecodingState()
     fresh = vehicle is not None and vehicle.age_ms is not None and vehicle.age_ms * 1e6 < SILENT_NS
@@ -105,6 +108,7 @@ def record(
         *([] if shots.state in ("starting", "ready", "busy") else [shots.camera_sentence()]),
         *silences,
         *doubts,
+        *([] if series is None or series.problem is None else [series.problem]),
         *([] if body is None else body.problems()),
         *([_NO_GIMBAL] if fresh and settings.pose.on_gimbal and vehicle and not vehicle.gimbal_attitude else []),
         *([] if utc_known else [_NO_UTC]),
@@ -131,7 +135,7 @@ def record(
         "dead": list(dead_threads),
         "utc_known": utc_known,
         "interval_s": shutter.interval_s,
-        "interval": _interval(shutter),
+        "interval": _interval(shutter, series),
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
         "gnss": None if vehicle is None else _receiver(vehicle),
         "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
@@ -212,8 +216,10 @@ def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[st
     return facts, [f"the disk is filling up: {left}; shots are refused below {record.min_free_mb} MB"]
 
 
-def _interval(shutter: ShutterStatistics) -> dict[str, Any] | None:
-    """How far an interval has got; None while none runs."""
+def _interval(shutter: ShutterStatistics, series: SpacingStatistics | None) -> dict[str, Any] | None:
+    """How far an interval has got, or photographs by distance; None while neither runs."""
+    if shutter.interval_s is None and series is not None:
+        return {"taken": series.taken, "count": None, "next_s": None, "distance_m": series.spacing_m}
     if shutter.interval_s is None:
         return None
     return {"taken": shutter.interval_taken, "count": shutter.interval_count, "next_s": shutter.interval_next_s}

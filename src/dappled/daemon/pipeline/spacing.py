@@ -17,7 +17,7 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import CaptureRequest
-from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.shutter import IntervalEnd, Shutter
 from dappled.decode.geometry import Pose, Quaternion, Vector3, conjugate, metres_per_radian, turned
 from dappled.errors import report
 from dappled.workers import Loop
@@ -95,6 +95,7 @@ class _Way:
     source: str
     wanted: Spacing
     at_once: bool
+    began_ns: int
     last: tuple[float, float, float] | None = None
     spacing_m: float | None = None
     height: Height | None = None
@@ -152,7 +153,7 @@ class DistanceTrigger:
         with self._lock:
             if self._way is not None and (self._way.wanted, self._way.source) == (wanted, source):
                 return
-            self._way = _Way(source, wanted, at_once)
+            self._way = _Way(source, wanted, at_once, self._clock.monotonic_ns())
         self._wake.set()
 
     def begin_configured(self, source: str) -> bool:
@@ -162,11 +163,16 @@ class DistanceTrigger:
         self.begin(self._configured, source)
         return True
 
-    def end(self) -> bool:
-        """End a running series, from any source. Whether there was one."""
+    def end(self, *, asked_ns: int | None = None) -> IntervalEnd:
+        """End a running series, from any source; one that began after `asked_ns` (monotonic) goes on, as an interval
+        (see `Shutter.stop_interval`)."""
         with self._lock:
-            ran, self._way = self._way is not None, None
-        return ran
+            if self._way is None:
+                return "none ran"
+            if asked_ns is not None and self._way.began_ns > asked_ns:
+                return "began later"
+            self._way = None
+        return "stopped"
 
     def statistics(self) -> SpacingStatistics | None:
         """Of the series that runs; None without one."""

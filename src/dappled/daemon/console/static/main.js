@@ -71,6 +71,10 @@ function showInterval() {
   $("interval").dataset.running = live ? "yes" : "";
   const due = live && interval.next_s !== null ? Math.max(0, interval.next_s - (performance.now() - heardAt) / 1000) : null;
   const count = live ? (interval.count === null ? `${interval.taken} taken` : `${interval.taken} of ${interval.count}`) : "";
+  if (live && "distance_m" in interval) {
+    $("progress").textContent = `${count}, ${interval.distance_m === null ? "by overlap" : `one each ${fixed(interval.distance_m, 1)} m`}`;
+    return;
+  }
   $("progress").textContent = !live ? "" : `${count}, ${due < 0.5 ? "next now" : `next in ${Math.round(due)} s`}`;
 }
 
