@@ -71,6 +71,8 @@ ELSEWHERE = {
     "maps/ground.tif": "tests/products/maps/test_georeference.py",  # what comes of them
     "dappled open": "tests/cli/test_open.py",  # serves pages until Ctrl-C
     "--scheduler tcp:": "tests/products/batch/test_batch.py",  # a Dask cluster
+    "trigger --distance": "tests/system/test_distance_trigger.py",  # settings that have a series
+    "flight gnss": "tests/system/test_gnss_receiver.py",  # a receiver on a serial port
 }
 """Commands that need more than this stage has, and the tests that give it to them."""
 
