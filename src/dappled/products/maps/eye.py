@@ -50,8 +50,14 @@ class Eye:
     def pixels(self, seen: Floats) -> Floats:
         """(n, 2) pixels of points (n, 3) in camera axes; NaN behind the camera."""
         ahead = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.nan)
-        bent = distorted(seen[:, :2] / ahead[:, None], self.distortion)
-        return bent @ self.matrix[:2, :2].T + self.matrix[:2, 2]
+        return self.imaged(seen[:, :2] / ahead[:, None])
+
+    def imaged(self, plane: Floats) -> Floats:
+        """(n, 2) pixels of points (n, 2) on the plane at distance 1."""
+        bent = distorted(plane, self.distortion)
+        x, y = bent[:, 0], bent[:, 1]
+        # Not as a matrix product: BLAS starts threads for it, which wait for each other on a busy machine.
+        return np.stack([row[0] * x + row[1] * y + row[2] for row in self.matrix[:2]], axis=1)
 
     def rays(self, pixels: Floats) -> Floats:
         """(n, 3) directions on the map of pixels (n, 2); a forward component of 1 in camera axes."""

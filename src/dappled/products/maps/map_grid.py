@@ -16,7 +16,7 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps.earth import GEODETIC, Projection, wrapped
-from dappled.products.maps.eye import Eye, distorted
+from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.photographs import Photograph
 
@@ -128,22 +128,26 @@ def sample(image: Singles, at: Floats) -> Singles:
 def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> Floats:
     """(rows, columns, 2): the view's pixel (x, y) that shows each map cell; NaN where none does."""
     east, north = grid.places(projection)
+    rows, columns = eye.shape
     if isinstance(ground, Flat):  # one homography for the whole frame
+        bent = any(eye.distortion)
         to_view = eye.homography(ground.height_m)
-        from_view = np.linalg.inv(eye.matrix)
+        from_ground = np.linalg.inv(eye.matrix) @ to_view if bent else to_view
         x, y = east - eye.centre[0], north - eye.centre[1]
-        u, v, w = (row[0] * x + row[1] * y + row[2] for row in from_view @ to_view)
+        u, v, w = (row[0] * x + row[1] * y + row[2] for row in from_ground)
         ahead = np.where(w > 0, w, np.nan)
-        plane = distorted(np.stack([u / ahead, v / ahead], axis=-1).reshape(-1, 2), eye.distortion)
-        at = plane @ eye.matrix[:2, :2].T + eye.matrix[:2, 2]
-        seen = np.ones(len(at), dtype=bool)
+        at = np.stack([u / ahead, v / ahead], axis=-1)
+        if bent:
+            at = eye.imaged(at.reshape(-1, 2)).reshape(at.shape)
+        inside = np.ones(grid.shape, dtype=bool)
     else:
         height = ground.heights(east, north)
-        at = eye.project(np.stack([east, north, height], axis=-1).reshape(-1, 3))
-        seen = ground.sees(eye, east, north, height).ravel()
-    rows, columns = eye.shape
-    inside = seen & (np.abs(at - [(columns - 1) / 2, (rows - 1) / 2]) <= [columns / 2, rows / 2]).all(axis=1)
-    return np.where(inside[:, None], at, np.nan).reshape(*grid.shape, 2)
+        at = eye.project(np.stack([east, north, height], axis=-1).reshape(-1, 3)).reshape(*grid.shape, 2)
+        inside = ground.sees(eye, east, north, height)
+    for axis, side in enumerate((columns, rows)):  # one after the other: NumPy is slow along an axis of two
+        inside = inside & (np.abs(at[..., axis] - (side - 1) / 2) <= side / 2)
+    at[~inside] = np.nan
+    return at
 
 
 def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground) -> Singles:
@@ -233,7 +237,8 @@ def pieces(
 def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Singles:
     """(rows, columns, 1): the weight of a view of this shape where its pixels (rows, columns, 2) are looked up."""
     share = (at + 0.5) / (shape[1], shape[0])
-    inward = np.minimum(share, 1 - share).min(axis=-1)
+    inward = np.minimum(share, 1 - share)
+    inward = np.minimum(inward[..., 0], inward[..., 1])
     return np.asarray((2 * np.clip(np.nan_to_num(inward), 0, 0.5) + 1e-3) ** _SHARPNESS, np.float32)[..., None]
 
 
