@@ -14,7 +14,7 @@ from tests.benchmarks import FOLDER
 sys.path.insert(0, str(FOLDER))
 
 from limits import Limit, flat, read_limits  # once their folder is known
-from table import Row, measured, page  # the same
+from table import Row, added, measured, page, with_stored  # the same
 
 
 def limit(at_most: float | None = None, at_least: float | None = None, noise: float = 0.1) -> Limit:
@@ -85,6 +85,31 @@ def test_the_page_marks_what_is_missed() -> None:
         1,
     )
     assert "| a ratio | SciPy | 1.7 |  | at most 1.5 | **missed** |  |" in text
+
+
+def test_figures_of_a_run_apart_are_added_and_named(tmp_path: Path) -> None:
+    on: dict[str, str | int | float] = {"model": "m", "cores": 2, "python": "3", "date": "one day", "load_before": 0}
+    later = on | {"date": "another day", "repeats": 3}
+    first, second = limit(at_most=2.0), Limit("depth", "ratio", "depth", "OpenCV", 2.0, None, 0.1)
+    path = tmp_path / "baseline.json"
+    path.write_text(json.dumps({"machine": on, "figures": {"decode.ratio": 1.0, "decode.gone": 1.0}}), encoding="utf-8")
+    now = [Row(second, 1.5, 0.0, None)]
+    stored = added(path, [first, second], now, later)
+    assert json.loads(path.read_text(encoding="utf-8")) == stored
+    assert stored["figures"] == {"decode.ratio": 1.0, "depth.ratio": 1.5}
+    rows = with_stored(now, [first, second], stored["figures"])
+    assert [row.name for row in rows] == ["decode.ratio", "depth.ratio"]
+    before, after = page(rows, stored["machine"], 1, stored["apart"]).split("## depth")
+    assert "one day" in before
+    assert "another day" not in before
+    assert "Measured apart: m, 2 cores, Python 3, another day; load before the run 0; median of 3." in after
+
+
+def test_the_page_says_what_no_pi_told() -> None:
+    on: dict[str, str | int | float] = {"model": "m", "cores": 2, "python": "3", "date": "d", "load_before": 0}
+    row = Row(Limit("onboard", "cpu_s_a_frame", "a frame", "", None, None, 0.2), 0.41, 0.0, None)
+    assert "slices (0.41 CPU seconds)" in page([row], on, 1)
+    assert "None was measured" in page([], on, 1)
 
 
 def test_a_benchmark_that_fails_ends_1(tmp_path: Path) -> None:
