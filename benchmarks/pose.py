@@ -25,6 +25,7 @@ from limits import show
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, Telemetry, navigation
 from dappled.daemon.navigation.clocks import TAGGING_RULES, exposure_from_camera, mid_exposure
+from dappled.daemon.navigation.positions import position_at
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
@@ -154,7 +155,7 @@ def _samples(log: File) -> tuple[list[PositionSample], list[AttitudeSample]]:
 
 
 def _position_miss(before: PositionSample, left_out: PositionSample, after: PositionSample) -> tuple[float, float]:
-    found, doubt_m, _ = navigation.position_at((before, after), left_out.boot_ns)
+    found, doubt_m, _ = position_at((before, after), left_out.boot_ns)
     north_m, east_m = metres_per_radian(left_out.latitude_rad, left_out.altitude_msl_m)
     north = (found.latitude_rad - left_out.latitude_rad) * north_m
     east = (found.longitude_rad - left_out.longitude_rad) * east_m

@@ -379,6 +379,7 @@ class Service:
             navigation.utc.doubt(),
             navigation.telemetry.clock_problem(self._clock.utc_ns()),
             navigation.telemetry.impossible(self._clock.utc_ns()),
+            navigation.telemetry.jumped(self._clock.utc_ns()),
             self._events.doubt,
             self._control.shortage,
             None if self._gnss is None else self._gnss.problem(),

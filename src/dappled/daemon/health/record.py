@@ -195,6 +195,7 @@ def _link(
         "packets": telemetry.packets,
         "positions": telemetry.positions,
         "impossible": telemetry.impossible,
+        "jumps": telemetry.jumps,
         "each": [_counters(link) for link in links],
     }
     return facts, problems if settings.mavlink.url else [_NO_LINK, *problems]

@@ -29,13 +29,13 @@ from dappled.daemon.navigation.clocks import (
     refine,
     unseen,
 )
+from dappled.daemon.navigation.positions import position_at
 from dappled.daemon.navigation.rangefinder import Rangefinder
 from dappled.daemon.navigation.samples import (
     HALF_MS_NS,
     Around,
     AttitudeSample,
     Counts,
-    PositionSample,
     TelemetryStatistics,
     UtcCorrection,
 )
@@ -46,9 +46,6 @@ from dappled.decode.geometry import (
     Quaternion,
     Symmetric,
     Vector3,
-    hermite,
-    hermite_doubt,
-    metres_per_radian,
     norm,
     slerp,
     slerp_doubt,
@@ -247,6 +244,14 @@ class Telemetry:
         recent = self._counts.impossible and utc_ns - self._counts.impossible_ns <= _SHOWN_NS
         return "the autopilot sends impossible positions, attitudes or times: they are not used" if recent else None
 
+    def jumped(self, utc_ns: int) -> str | None:
+        """A sentence where positions of the last minute jumped."""
+        with self._lock:
+            by_m, at_ns = self._counts.jump_m, self._counts.jump_ns
+        if not at_ns or utc_ns - at_ns > _SHOWN_NS:
+            return None
+        return f"the autopilot's position jumped by {by_m:.1f} m against its velocity: poses next to that are in doubt"
+
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
         with self._lock:
@@ -270,6 +275,7 @@ class Telemetry:
                 feedbacks=counts.feedbacks,
                 gimbals=history.gimbals.seen,
                 impossible=counts.impossible,
+                jumps=counts.jumps,
             )
 
 
@@ -346,9 +352,9 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
 
     Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
     marked "nearest". Sigmas: time (exposure and clocks) × speed and × turn rate, with the age of a single sample; the
-    uncertainty of the interpolation; the receiver's accuracy (without one the position's sigmas are None); the
-    attitude's own, as the autopilot reports it or `attitude_sigma_rad`, the larger (without either the attitude's are
-    None).
+    uncertainty of the interpolation; jumps of the position near to it; the receiver's accuracy (without one the
+    position's sigmas are None); the attitude's own, as the autopilot reports it or `attitude_sigma_rad`, the larger
+    (without either the attitude's are None).
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
     attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad, rules)
@@ -365,7 +371,8 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
     )
     if not at.positions:
         return made
-    found, across_doubt_m, upright_doubt_m = position_at(at.positions, at.boot_ns)
+    found, *doubts_m = position_at(at.positions, at.boot_ns)
+    across_doubt_m, upright_doubt_m = map(math.hypot, doubts_m, at.jumped_m)
     age_s = min(abs(sample.boot_ns - at.boot_ns) for sample in at.positions) / 1e9
     blur_s = sigma_s if len(at.positions) == 2 else math.hypot(sigma_s, age_s)
     north, east, down = found.velocity_ned_m_s
@@ -391,39 +398,6 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
     )
-
-
-def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:
-    """The position at `boot_ns` from one or two samples, and its interpolation error (1 σ, metres), horizontal and
-    vertical."""
-    a = samples[0]
-    if len(samples) == 1:
-        return a, 0.0, 0.0
-    b = samples[1]
-    span_s = (b.boot_ns - a.boot_ns) / 1e9
-    share = (boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
-    north_m, east_m = metres_per_radian(a.latitude_rad, a.altitude_msl_m)
-    va, vb = a.velocity_ned_m_s, b.velocity_ned_m_s
-    to_b = (
-        (b.latitude_rad - a.latitude_rad) * north_m,
-        math.remainder(b.longitude_rad - a.longitude_rad, 2 * math.pi) * east_m,
-        a.altitude_msl_m - b.altitude_msl_m,
-    )
-    north, east, down = (hermite((0.0, to_b[i]), (va[i], vb[i]), span_s, share) for i in range(3))
-    height = b.height_above_home_m - a.height_above_home_m
-    vn, ve, vd = ((1 - share) * va[i] + share * vb[i] for i in range(3))
-    found = PositionSample(
-        b.number,
-        b.stamp_ns,
-        boot_ns,
-        a.latitude_rad + north / north_m,
-        math.remainder(a.longitude_rad + east / east_m, 2 * math.pi),
-        a.altitude_msl_m - down,
-        a.height_above_home_m + hermite((0.0, height), (-va[2], -vb[2]), span_s, share),
-        (vn, ve, vd),
-    )
-    doubts = [hermite_doubt(to_b[i], (va[i], vb[i]), span_s, share) for i in range(3)]
-    return found, math.hypot(doubts[0], doubts[1]), doubts[2]
 
 
 def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quaternion, float]:

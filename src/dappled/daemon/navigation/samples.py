@@ -24,6 +24,7 @@ EPOCH_US = 10**15  # 2001: a time above is UTC, one below counts since boot
 WRAP_US = 2**32  # ArduPilot counts the microseconds of its feedback pin in 32 bits
 NEAREST_NS = 10 * 10**9
 _HIGHEST_MM = 10**8
+_ONE_JUMP_NS = 10**9
 _ARRIVED_NS, _ARRIVED_FEW, _ARRIVED_MOST = 5 * 10**9, 10, 1024
 _SOONER_NS, _SOONER_SHARE = 60_000_000, 5.0
 MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
@@ -157,16 +158,24 @@ class Counts:
     out_of_order: int = 0
     impossible: int = 0
     impossible_ns: int = 0  # the last one's stamp
+    jumps: int = 0
+    jump_ns: int = 0  # the last one's stamp
+    jump_m: float = 0.0  # and its size
 
     def refuse(self, stamp_ns: int) -> None:
         """Count one that can't be true."""
         self.impossible += 1
         self.impossible_ns = stamp_ns
 
+    def jumped(self, stamp_ns: int, by_m: float) -> None:
+        """Count a position that contradicts its velocity, once for all that follow within a second."""
+        self.jumps += not self.jumps or stamp_ns - self.jump_ns > _ONE_JUMP_NS
+        self.jump_ns, self.jump_m = stamp_ns, by_m
+
 
 @dataclass(frozen=True, slots=True)
 class TelemetryStatistics:
-    """What was fed so far. `impossible` were not used: they can't be true."""
+    """What was fed so far. `impossible` were not used: they can't be true. `jumps` contradicted their velocity."""
 
     packets: int
     positions: int
@@ -176,6 +185,7 @@ class TelemetryStatistics:
     feedbacks: int = 0
     gimbals: int = 0
     impossible: int = 0
+    jumps: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -198,7 +208,8 @@ class Around:
     the nearest one.
 
     `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
-    `placed`: False where the clock stepped so near to it that the samples may be from before or after it.
+    `placed`: False where the clock stepped so near to it that the samples may be from before or after it. `jumped_m`:
+    by how much positions near to it contradict it, horizontally and vertically.
     """
 
     utc_ns: int
@@ -210,6 +221,7 @@ class Around:
     gimbals: Sequence[GimbalSample] = ()
     gimbal_boot_ns: int = 0
     placed: bool = True
+    jumped_m: tuple[float, float] = (0.0, 0.0)
 
 
 def boot_ns(message: MavlinkMessage) -> int:
@@ -385,6 +397,37 @@ def keep(history: list[N], sample: N) -> None:
 def prune(history: list[N], before_ns: int) -> None:
     """Forget what came before."""
     del history[: bisect_left(history, before_ns, key=lambda sample: sample.stamp_ns)]
+
+
+def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
+    """Those of the packets first <= number < limit."""
+    return history[place_of(history, first) : place_of(history, limit)]
+
+
+def place_of(history: Sequence[Numbered], number: int) -> int:
+    """Where packet `number` would stand."""
+    return bisect_left(history, number, key=lambda sample: sample.number)
+
+
+def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
+    """Those that arrived in the last `window_ns` before the last one."""
+    if not history:
+        return history
+    since = history[-1].stamp_ns - window_ns
+    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
+
+
+def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
+    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
+    none. `boot_ns` of the history must rise."""
+    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
+    sides = tuple(history[max(0, at - 1) : at + 1])
+    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
+        return sides
+    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
+    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
+        return ()
+    return (nearest,)
 
 
 class ArrivalSteps:

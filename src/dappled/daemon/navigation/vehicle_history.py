@@ -20,6 +20,7 @@ from dappled.daemon.navigation.clocks import (
     from_timesync,
     step_ns,
 )
+from dappled.daemon.navigation.positions import Jump, JumpFinder, doubt_m
 from dappled.daemon.navigation.samples import (
     EPOCH_US,
     GIMBAL_COMPONENTS,
@@ -33,15 +34,16 @@ from dappled.daemon.navigation.samples import (
     Feedback,
     GimbalSample,
     GnssSample,
-    N,
-    Numbered,
     PositionSample,
-    S,
     Sample,
+    around_instant,
+    between,
     feedback_boot_ns,
     keep,
+    latest,
     prune,
 )
+from dappled.decode.geometry import norm
 from dappled.drivers.mavlink import MavlinkMessage
 
 POSITION_GAP_NS = 2_500_000_000
@@ -62,37 +64,6 @@ _REPEATS = 64
 _MOST_BOOT_NS = 2**62  # differences of such times fit 64 bits
 _AUTOPILOT = 1
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the epoch's first packet, the last packets
-
-
-def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
-    """Those of the packets first <= number < limit."""
-    return history[place_of(history, first) : place_of(history, limit)]
-
-
-def place_of(history: Sequence[Numbered], number: int) -> int:
-    """Where packet `number` would stand."""
-    return bisect_left(history, number, key=lambda sample: sample.number)
-
-
-def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
-    """Those that arrived in the last `window_ns` before the last one."""
-    if not history:
-        return history
-    since = history[-1].stamp_ns - window_ns
-    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
-
-
-def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
-    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
-    none. `boot_ns` of the history must rise."""
-    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
-    sides = tuple(history[max(0, at - 1) : at + 1])
-    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
-        return sides
-    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
-        return ()
-    return (nearest,)
 
 
 class AutopilotTime:
@@ -338,6 +309,7 @@ class VehicleHistory:
         self.time = AutopilotTime(component_id, rules)
         self.gimbals = Gimbals(rules)
         self._positions: list[PositionSample] = []
+        self._finder, self._jumps = JumpFinder(), list[Jump]()
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
         self._feedbacks: list[Feedback] = []
@@ -350,6 +322,7 @@ class VehicleHistory:
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
         prune(self._positions, before_ns)
+        prune(self._jumps, before_ns)
         prune(self._attitudes, before_ns)
         prune(self._receiver, before_ns)
         prune(self._feedbacks, before_ns)
@@ -391,6 +364,7 @@ class VehicleHistory:
             gimbals,
             gimbal_boot_ns,
             placed,
+            doubt_m(between(self._jumps, first, limit), boot_ns),
         )
 
     def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
@@ -398,6 +372,10 @@ class VehicleHistory:
         if sample is not None and self._believed(sample, message, self._positions):
             self.counts.positions += 1
             keep(self._positions, sample)
+            jump = self._finder.jump(sample, self.time.first(number + 1)) if self._rules > 4 else None
+            if jump is not None:
+                self.counts.jumped(stamp_ns, norm(jump.by_m))
+                keep(self._jumps, jump)
 
     def _attitude(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._refuses(stamp_ns, message):
