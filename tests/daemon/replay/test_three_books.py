@@ -44,7 +44,8 @@ def requested(
 @pytest.fixture
 def fly(tmp_path: Path) -> Callable[..., Path]:
     """Record a flight of these shots; those in `failed` (places in the list) have no file. `heard` are requests in the
-    telemetry; `late_s` is when the autopilot was started, after that of the logs."""
+    telemetry; `late_s` is when the autopilot was started, after that of the logs; `ahead_s` its UTC in the telemetry
+    against that of the logs. SYSTEM_TIME comes later by `time_delays_s`, in turn."""
 
     def record(
         shots: list[_Shot],
@@ -53,15 +54,18 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
         heard: Sequence[_Shot] = (),
         late_s: float = 0.0,
         ends_s: float = SPAN_S + 2,
+        time_delays_s: Sequence[float] = (0.0,),
+        ahead_s: float = 0.0,
     ) -> Path:
         flight = recording.begin(tmp_path / "flights", RecordedClock(UTC_US * 1000), {"settings": {}})
         flight.ledger.set_fact("vehicles", [[0, 1]])
         packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         for step in range(-2, round(2 * ends_s)):
             t_us = 250_000 + 500_000 * step
-            utc_us = UTC_US + t_us + round(late_s * 1e6)
+            utc_us = UTC_US + t_us + round((late_s + ahead_s) * 1e6)
+            delay_us = round(time_delays_s[step % len(time_delays_s)] * 1e6)
             message = mavlink.MAVLink_system_time_message(utc_us, (BOOT_US + t_us) // 1000)
-            flight.telemetry.append(UTC_US + t_us + LINK_US, pack(message, packer, version_1=False))
+            flight.telemetry.append(UTC_US + t_us + LINK_US + delay_us, pack(message, packer, version_1=False))
         for t_s, _, _, number in heard:
             command = mavlink.MAVLink_command_long_message(
                 1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, number or 0, 0, 0, 0
@@ -148,6 +152,63 @@ def test_shots_without_numbers_belong_to_the_triggers_next_to_them(
     found = three_books.reconcile(flight, [bin_log])
     assert [(one.kind, one.number) for one in found.imbalances] == ([("lost", removed)] if removed else [])
     assert found.balanced == (removed is None)
+
+
+@pytest.mark.parametrize("removed", [1, 4, 9])
+@pytest.mark.parametrize("ahead_s", [0.6, -0.6])
+def test_the_difference_of_two_utcs_changes_nothing(
+    fly: Callable[..., Path], bin_log: Path, removed: int, ahead_s: float
+) -> None:
+    """UTC says whose log it is; the log is placed by the time since boot."""
+    add_triggers(bin_log, TIMES_S)
+    kept = {number: t_s for number, t_s in TIMES_S.items() if number != removed}
+    flight = fly(requested(kept, "DO_DIGICAM_CONTROL", numbers=False), ahead_s=ahead_s)
+    (one,) = three_books.reconcile(flight, [bin_log]).imbalances
+    assert (one.kind, one.number, one.instead) == ("lost", removed, ())
+
+
+@pytest.mark.parametrize(
+    ("late_s", "time_delays_s"), [(0.3, (0.0,)), (0.0, (0.3,)), (0.0, (0.0, 0.3, 0.4)), (0.0, (0.1, 0.45))]
+)
+def test_the_one_lost_between_others_is_named_over_links_that_delay(
+    fly: Callable[..., Path], bin_log: Path, late_s: float, time_delays_s: Sequence[float]
+) -> None:
+    """More than half of the interval: its neighbour was named, and one that was taken was doubled."""
+    add_triggers(bin_log, TIMES_S)
+    late = {number: t_s + late_s for number, t_s in TIMES_S.items() if number != 4}
+    flight = fly(requested(late, "DO_DIGICAM_CONTROL", numbers=False), time_delays_s=time_delays_s)
+    (one,) = three_books.reconcile(flight, [bin_log]).imbalances
+    assert (one.kind, one.number, one.instead) == ("lost", 4, ())
+    flight = fly(requested(late), time_delays_s=time_delays_s)
+    (one,) = three_books.reconcile(flight, [bin_log]).imbalances
+    assert (one.kind, one.number, one.instead) == ("lost", 4, ())
+
+
+@pytest.mark.parametrize("removed", [1, 9])
+def test_where_time_can_t_tell_the_report_names_both(
+    fly: Callable[..., Path], bin_log: Path, removed: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """All 0.3 s late at 0.5 s; all 0.2 s early say the same but for the ends."""
+    add_triggers(bin_log, TIMES_S)
+    late = {number: t_s + 0.3 for number, t_s in TIMES_S.items() if number != removed}
+    flight = fly(requested(late, "DO_DIGICAM_CONTROL", numbers=False), failed=(3,))
+    code, said = report(capsys, flight, "--log", bin_log)
+    assert code == 1
+    lost = next(line for line in said if line.startswith("lost"))
+    assert lost.startswith(("lost: trigger 1 or 9 at ", "lost: trigger 9 or 1 at "))
+    fileless = next(line for line in said if line.startswith("without a file"))
+    numbers = sorted(int(word) for word in fileless.partition(" (")[0].split() if word.isdigit())
+    assert numbers == [4, 5]
+    assert said[-1] == "THE THREE BOOKS DO NOT BALANCE: 1 lost, 1 without a file"
+    flight = fly(requested(late))
+    (one,) = three_books.reconcile(flight, [bin_log]).imbalances
+    assert (one.number, one.instead) == (removed, ())
+
+
+def test_a_long_row_of_triggers_in_doubt_is_counted() -> None:
+    one = three_books.Imbalance("lost", 12, (), None, None, "no request", (9, 10, 11, 13, 14))
+    assert one.text() == "lost: trigger 12 or one of 5 others from 9 to 14: no request"
+    assert three_books.Imbalance("phantom", None, (4,), None, None, "none", (5,)).text() == "phantom: shot 4 or 5: none"
 
 
 def test_a_stations_request_that_the_autopilot_executed_is_its_trigger(fly: Callable[..., Path], bin_log: Path) -> None:

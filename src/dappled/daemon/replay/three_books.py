@@ -2,8 +2,8 @@
 
 The log is placed in the flight by the autopilot's time (SYSTEM_TIME in the telemetry): a log of another boot is
 refused. A trigger and a shot are the same where the shot has the trigger's number, within `_NUMBERED_US`. Shots whose
-message has no number (DO_DIGICAM_CONTROL, PX4's commands) belong to the nearest trigger left, up to `_LATE_US` before
-them; shots of ground stations to one within `_BROADCAST_US`, which the autopilot executed too.
+message has no number (DO_DIGICAM_CONTROL, PX4's commands) belong to the triggers left by order and time (`in_order`),
+which may leave a doubt; shots of ground stations to one within `_BROADCAST_US`, which the autopilot executed too.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings
 from dappled.daemon.navigation import recorded_vehicles
+from dappled.daemon.replay.in_order import paired_in_order
 from dappled.daemon.replay.replay import own_log
 from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import PacketParser, mavlink
@@ -33,6 +34,9 @@ _NUMBERED_US = 6_000_000  # a trigger that is reported later than 5 s is no shot
 _LATE_US = 2_600_000  # over a second link
 _BROADCAST_US = 300_000
 _SAME_BOOT_US = 3_000_000
+_STEADY_US = 100_000  # a link that delays less places a log so well
+_WINDOW_US = 15_000_000  # of SYSTEM_TIME: the one that was delayed least counts
+_MOST_NAMED = 3
 _MOST_PASSED_OVER = 256
 _UTC_FROM_US = 1_483_228_800 * 10**6  # 2017: an earlier time is not known yet
 _START = mavlink.MAV_CMD_IMAGE_START_CAPTURE
@@ -53,7 +57,8 @@ class BooksError(DappledError):
 @dataclass(frozen=True, slots=True)
 class Imbalance:
     """What does not balance: a trigger, a shot or a file, each with what is known of it. `utc_ns` is None where UTC
-    was never known, `place` is latitude and longitude (degrees)."""
+    was never known, `place` is latitude and longitude (degrees). `instead`: numbers of the triggers (of shots without
+    one, the shots) of which any may be meant, as requests without numbers were told apart by time alone."""
 
     kind: Kind
     number: int | None
@@ -61,13 +66,16 @@ class Imbalance:
     utc_ns: int | None
     place: tuple[float, float] | None
     reason: str
+    instead: tuple[int, ...] = ()
 
     def text(self) -> str:
         """One line."""
         shots = " and ".join(str(index) for index in self.shots)
         subject = f"shot{'s' * (len(self.shots) > 1)} {shots}" if self.shots else "file"
         if self.number is not None:
-            subject = f"trigger {self.number}" + (f" ({subject})" if self.shots else "")
+            subject = f"trigger {self.number}{_or(self.instead)}" + (f" ({subject})" if self.shots else "")
+        else:
+            subject += _or(self.instead)
         return f"{self.kind}: {subject}{_when(self.utc_ns)}{_where(self.place)}: {self.reason}"
 
 
@@ -103,6 +111,19 @@ class _Trigger:
     utc_us: int
     numbered: frozenset[str]  # the kinds of messages that have its number
     passed_over: range = range(0)
+
+
+@dataclass(frozen=True, slots=True)
+class _Pairs:
+    """The shot of each trigger that has one, by place among the triggers; triggers that repeat an earlier one's number,
+    with the place of that one. Requests without numbers came `delay_us` after their triggers; `instead` are the numbers
+    of others that a place may stand for, `beside` the shots that another may stand for."""
+
+    shots: Mapping[int, int]
+    repeated: Mapping[int, int]
+    delay_us: float
+    instead: Mapping[int, tuple[int, ...]]
+    beside: Mapping[int, tuple[int, ...]]
 
 
 @dataclass(slots=True)
@@ -161,16 +182,18 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     settings = configuration.of_tables(tables, str(folder.settings))
     heard = _heard(folder.telemetry, systems, settings.mavlink, outside=settings.camera.fired_outside)
     read = [(path, _read(path, settings.mavlink.cam_idx)) for path in logs]
-    triggers, spans, elsewhere = [], [], 0
+    triggers: list[_Trigger] = []
+    spans, elsewhere, steady = [], 0, True
     for path, log in read:
-        offsets = _placed(path, log, heard)
+        offsets, late_us = _placed(path, log, heard)
+        steady = steady and late_us <= _STEADY_US
         spans.append((_at_us(log.begins_us, offsets), _at_us(log.ends_us, offsets)))
         within = [one for one in _triggers(log, offsets) if (heard.first_us or 0) <= one.at_us <= heard.last_us]
         elsewhere += len(log.triggers) - len(within)
         triggers += within
     contacts = [log.contacts for _, log in read if log.contacts is not None]
-    pairs, repeated = _paired(triggers, found)
-    made = [pairs[number] for number in sorted(pairs)]
+    pairs = _paired(triggers, found, steady=steady)
+    made = [pairs.shots[place] for place in sorted(pairs.shots)]
     uncovered = tuple(
         index
         for index in found.rows
@@ -180,13 +203,13 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     )
     return ThreeBooks(
         by=" and ".join(sorted({log.by for _, log in read})),
-        triggers=len(triggers) - len(repeated),
+        triggers=len(triggers) - len(pairs.repeated),
         contacts=sum(contacts) if contacts else None,
         shots=len(made),
         files=len(found.files.intersection(made)),
         elsewhere=elsewhere,
         uncovered=uncovered,
-        imbalances=tuple(_Comparison(triggers, pairs, repeated, found, heard).imbalances(uncovered)),
+        imbalances=tuple(_Comparison(triggers, pairs, found, heard).imbalances(uncovered)),
     )
 
 
@@ -234,9 +257,9 @@ def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside
     return found
 
 
-def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[Floats, Floats]:
-    """The daemon's time minus the time since boot, at times since boot: (n,) µs each. Raises BooksError where the
-    flight heard no such boot."""
+def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[tuple[Floats, Floats], float]:
+    """The daemon's time minus the time since boot, at times since boot: (n,) µs each; and by how much the link delays
+    half of its messages. Raises BooksError where the flight heard no such boot."""
     mine = [
         (boot_us, stamp_us - boot_us)
         for boot_us, unix_minus_boot_us, stamp_us in heard.times
@@ -244,7 +267,9 @@ def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[Floats, Floats]
     ]
     if mine:
         boots_us, offsets_us = np.array(sorted(mine), dtype=np.float64).T
-        return boots_us, offsets_us
+        near = zip(*(np.searchsorted(boots_us, boots_us + way * _WINDOW_US) for way in (-1, 1)), strict=True)
+        least_us = np.array([offsets_us[begins : ends + 1].min() for begins, ends in near])
+        return (boots_us, least_us), float(np.median(offsets_us - least_us))
     if not heard.times:
         raise BooksError(
             "the flight's telemetry has no time of the autopilot (SYSTEM_TIME with UTC), so no log can be placed in it"
@@ -273,9 +298,8 @@ def _triggers(log: TriggerLog, offsets: tuple[Floats, Floats]) -> Iterator[_Trig
         before = one.number
 
 
-def _paired(triggers: Sequence[_Trigger], flight: _Flight) -> tuple[dict[int, int], dict[int, int]]:
-    """The shot of each trigger that has one, by place in `triggers`; and triggers that repeat an earlier one's number,
-    with the place of that one."""
+def _paired(triggers: Sequence[_Trigger], flight: _Flight, *, steady: bool) -> _Pairs:
+    """What belongs together. `steady`: the links delay nothing much, so the log is placed well."""
     repeated: dict[int, int] = {}
     last: dict[int, int] = {}
     for place, one in enumerate(triggers):
@@ -291,20 +315,44 @@ def _paired(triggers: Sequence[_Trigger], flight: _Flight) -> tuple[dict[int, in
             continue
         first = bisect_left(shots, one.at_us - _NUMBERED_US, key=flight.at_us)
         for index in shots[first : bisect_right(shots, one.at_us + _NUMBERED_US, key=flight.at_us)]:
-            after_us = flight.at_us(index) - one.at_us
+            away_us = abs(flight.at_us(index) - one.at_us)
             number = _number(flight, index, one.numbered)
-            if number is not None:
-                if number == one.logged.number:
-                    numbered.append((abs(after_us), place, index))
-            elif abs(after_us) <= _BROADCAST_US or (flight.of_autopilot(index) and 0 <= after_us <= _LATE_US):
-                nearby.append((abs(after_us), place, index))
-    pairs: dict[int, int] = {}
-    taken: set[int] = set()
-    for _, place, index in [*sorted(numbered), *sorted(nearby)]:
-        if place not in pairs and index not in taken:
-            pairs[place] = index
+            if number is not None and number == one.logged.number:
+                numbered.append((away_us, place, index))
+            elif away_us <= _BROADCAST_US and not flight.of_autopilot(index):
+                nearby.append((away_us, place, index))
+    pairs = _nearest(numbered, {})
+    kinds = frozenset[str]().union(*(one.numbered for one in triggers))
+    bare = [index for index in shots if flight.of_autopilot(index) and _number(flight, index, kinds) is None]
+    left = [place for place in range(len(triggers)) if place not in pairs and place not in repeated]
+    left.sort(key=lambda place: triggers[place].at_us)
+    found = paired_in_order(
+        [triggers[place].at_us for place in left],
+        [flight.at_us(index) for index in bare],
+        known_us=_STEADY_US if steady else 0,
+        late_us=_LATE_US,
+    )
+    pairs |= {left[place]: bare[shot] for place, shot in found.pairs.items()}
+    return _Pairs(
+        _nearest(nearby, pairs),
+        repeated,
+        found.delay_us,
+        {
+            left[place]: tuple(triggers[left[other]].logged.number for other in others)
+            for place, others in {**found.of, **found.triggers}.items()
+        },
+        {bare[shot]: tuple(bare[other] for other in others) for shot, others in found.shots.items()},
+    )
+
+
+def _nearest(candidates: Sequence[tuple[int, int, int]], pairs: Mapping[int, int]) -> dict[int, int]:
+    """`pairs` and, of (distance, place, shot), the nearest ones of what is left."""
+    found, taken = dict(pairs), set(pairs.values())
+    for _, place, index in sorted(candidates):
+        if place not in found and index not in taken:
+            found[place] = index
             taken.add(index)
-    return pairs, repeated
+    return found
 
 
 def _number(flight: _Flight, index: int, kinds: frozenset[str]) -> int | None:
@@ -318,8 +366,7 @@ class _Comparison:
     """Triggers and shots with what belongs together (see `_paired`)."""
 
     triggers: Sequence[_Trigger]
-    pairs: Mapping[int, int]
-    repeated: Mapping[int, int]
+    pairs: _Pairs
     flight: _Flight
     heard: _Heard
 
@@ -331,7 +378,7 @@ class _Comparison:
         for place, one in enumerate(self.triggers):
             yield from _passed_over(one, known)
             yield from self._of_trigger(place, one)
-        made = frozenset(self.pairs.values())
+        made = frozenset(self.pairs.shots.values())
         for index in self.flight.rows:
             if index not in made and index not in uncovered:
                 yield from self._of_shot(index)
@@ -341,17 +388,19 @@ class _Comparison:
 
     def _of_trigger(self, place: int, one: _Trigger) -> Iterator[Imbalance]:
         number, at = one.logged.number, (one.utc_us * 1000, one.logged.place)
-        if place in self.repeated:
+        instead = self.pairs.instead.get(place, ())
+        if place in self.pairs.repeated:
             yield Imbalance("doubled", number, (), *at, "the log has this trigger twice")
-        elif place not in self.pairs:
+        elif place not in self.pairs.shots:
             if self._reached(one):
                 reason = "it reached the camera, and made no shot (dappled flight show --json: events)"
                 yield Imbalance("refused", number, (), *at, reason)
             else:
-                yield Imbalance("lost", number, (), *at, "no request reached the camera")
-        elif self.pairs[place] not in self.flight.files:
-            row = self.flight.rows[self.pairs[place]]
-            yield Imbalance("without a file", number, (row.shot.index,), *at, row.reason or f"the shot is {row.state}")
+                yield Imbalance("lost", number, (), *at, "no request reached the camera", instead)
+        elif self.pairs.shots[place] not in self.flight.files:
+            row = self.flight.rows[self.pairs.shots[place]]
+            reason = row.reason or f"the shot is {row.state}"
+            yield Imbalance("without a file", number, (row.shot.index,), *at, reason, instead)
 
     def _reached(self, one: _Trigger) -> bool:
         """Whether a message with a trigger's number reached the camera."""
@@ -361,18 +410,29 @@ class _Comparison:
     def _of_shot(self, index: int) -> Iterator[Imbalance]:
         """A shot without a trigger of its own: a second one of a trigger, or the autopilot's without any."""
         flight, shot = self.flight, self.flight.rows[index].shot
-        for place, other in self.pairs.items():
+        beside = self.pairs.beside.get(index, ())
+        delay_us = self.pairs.delay_us if index in self.pairs.beside else 0.0
+        for place, other in self.pairs.shots.items():
             one = self.triggers[place]
-            away_us = abs(flight.at_us(index) - one.at_us)
+            away_us = abs(flight.at_us(index) - one.at_us - delay_us)
             same = _number(flight, index, one.numbered) == one.logged.number and away_us <= _NUMBERED_US
             if same or away_us <= _BROADCAST_US:
                 at = (one.utc_us * 1000, one.logged.place)
-                yield Imbalance("doubled", one.logged.number, (other, index), *at, "one trigger made both")
+                yield Imbalance(
+                    "doubled",
+                    one.logged.number,
+                    (other, index),
+                    *at,
+                    "one trigger made both",
+                    self.pairs.instead.get(place, ()),
+                )
                 return
         if flight.of_autopilot(index):
             number = "" if shot.cause.sequence is None else f", number {shot.cause.sequence}"
             reason = f"requested by {shot.cause.source} ({shot.cause.kind}{number}); the log has no such trigger"
-            yield Imbalance("phantom", None, (index,), flight.utc_ns(shot.wished_utc_ns), flight.place(index), reason)
+            yield Imbalance(
+                "phantom", None, (index,), flight.utc_ns(shot.wished_utc_ns), flight.place(index), reason, beside
+            )
 
 
 def _passed_over(one: _Trigger, known: set[int]) -> Iterator[Imbalance]:
@@ -384,6 +444,13 @@ def _passed_over(one: _Trigger, known: set[int]) -> Iterator[Imbalance]:
         return
     reason = f"neither a shot nor in the log, which passes over it before trigger {number}"
     yield from (Imbalance("lost", missing, (), *at, reason) for missing in one.passed_over if missing not in known)
+
+
+def _or(others: tuple[int, ...]) -> str:
+    """What is meant instead, perhaps."""
+    if len(others) > _MOST_NAMED:
+        return f" or one of {len(others)} others from {others[0]} to {others[-1]}"
+    return "".join(f" or {one}" for one in others)
 
 
 def _when(utc_ns: int | None) -> str:
