@@ -82,7 +82,7 @@ def test_uneven_triggers_are_certain_at_any_delay(lost: int, delay_s: float, see
 
 
 def test_where_requests_are_as_uneven_as_triggers_the_lost_one_is_in_doubt() -> None:
-    """0 to 0.5 s late at 0.4 s: of a hundred flights few are certain, and these are right; the others name it in most."""
+    """0 to 0.5 s late at 0.4 s: of a hundred flights few are certain, and right; most others name it."""
     certain = wrong = covered = 0
     for seed in range(100):
         lost = random.Random(seed).randrange(5, 25)  # noqa: S311  a simulation
