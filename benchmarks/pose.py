@@ -25,7 +25,7 @@ from limits import show
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, Telemetry, navigation
 from dappled.daemon.navigation.clocks import TAGGING_RULES, exposure_from_camera, mid_exposure
-from dappled.daemon.navigation.positions import position_at
+from dappled.daemon.navigation.navigation import position_at
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad

@@ -377,9 +377,7 @@ class Service:
         doubts = (
             self._component.doubt(),
             navigation.utc.doubt(),
-            navigation.telemetry.clock_problem(self._clock.utc_ns()),
-            navigation.telemetry.impossible(self._clock.utc_ns()),
-            navigation.telemetry.jumped(self._clock.utc_ns()),
+            *navigation.telemetry.doubts(self._clock.utc_ns()),
             self._events.doubt,
             self._control.shortage,
             None if self._gnss is None else self._gnss.problem(),

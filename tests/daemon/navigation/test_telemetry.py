@@ -361,8 +361,10 @@ def test_an_impossible_message_is_no_pose_and_is_counted(message: MavlinkMessage
         expected.attitude,
     )
     assert (telemetry.statistics().impossible, good.statistics().impossible) == (1, 0)
-    assert telemetry.impossible(at_ns) is not None
-    assert telemetry.impossible(at_ns + 70 * 10**9) is None
+    assert telemetry.doubts(at_ns) == (
+        "the autopilot sends impossible positions, attitudes or times: they are not used",
+    )
+    assert telemetry.doubts(at_ns + 70 * 10**9) == ()
 
 
 def test_an_answer_to_timesync_that_can_t_be_true_is_counted() -> None:

@@ -29,13 +29,14 @@ from dappled.daemon.navigation.clocks import (
     refine,
     unseen,
 )
-from dappled.daemon.navigation.positions import position_at
+from dappled.daemon.navigation.doubts import doubts
 from dappled.daemon.navigation.rangefinder import Rangefinder
 from dappled.daemon.navigation.samples import (
     HALF_MS_NS,
     Around,
     AttitudeSample,
     Counts,
+    PositionSample,
     TelemetryStatistics,
     UtcCorrection,
 )
@@ -46,6 +47,10 @@ from dappled.decode.geometry import (
     Quaternion,
     Symmetric,
     Vector3,
+    displacement,
+    hermite,
+    hermite_doubt,
+    metres_per_radian,
     norm,
     slerp,
     slerp_doubt,
@@ -59,11 +64,10 @@ from dappled.flight import LedgerReader, Recording
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
 AHEAD_NS = 10**9  # a body's latency and half an exposure; an exposure further ahead is not waited for
 RATES_GAP_NS, TURN_GAP_NS = 150_000_000, 60_000_000  # a multicopter sways within more; without rates in the messages
+JUMP_AFTER_NS, JUMP_BEFORE_NS = 30 * 10**9, 10 * 10**9  # so long after and before a jump a position is in doubt
 _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
-_PRUNE_EVERY = 256
-_SHOWN_NS = 60 * 10**9
-_LOOK_S = 0.005
+_PRUNE_EVERY, _LOOK_S = 256, 0.005
 _MARK_COMES_NS = 1_100_000_000  # a receiver sends its marks with the next solution, at 1 Hz up to 1 s later
 # A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
 METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
@@ -229,28 +233,10 @@ class Telemetry:
             return None
         return turn_rates((a.attitude, b.attitude), rates, span_ns / 1e9, (boot_ns - a.boot_ns) / span_ns)
 
-    def clock_problem(self, utc_ns: int) -> str | None:
-        """A sentence where the autopilot's clock has stepped in the last minute."""
+    def doubts(self, utc_ns: int) -> tuple[str, ...]:
+        """A sentence for each thing in the telemetry of the last minute for which poses are in doubt."""
         with self._lock:
-            last, unsteady = self._history.time.last_step(), self._history.time.is_unsteady()
-        if last is None or last.step_ns is None or utc_ns - last.since_ns > _SHOWN_NS:
-            return None
-        if unsteady:
-            return "the autopilot's clock does not run steadily: poses are in doubt"
-        return f"the autopilot's clock stepped by {last.step_ns / 1e9:+.3f} s: poses next to that are in doubt"
-
-    def impossible(self, utc_ns: int) -> str | None:
-        """A sentence where messages of the last minute could not be true."""
-        recent = self._counts.impossible and utc_ns - self._counts.impossible_ns <= _SHOWN_NS
-        return "the autopilot sends impossible positions, attitudes or times: they are not used" if recent else None
-
-    def jumped(self, utc_ns: int) -> str | None:
-        """A sentence where positions of the last minute jumped."""
-        with self._lock:
-            by_m, at_ns = self._counts.jump_m, self._counts.jump_ns
-        if not at_ns or utc_ns - at_ns > _SHOWN_NS:
-            return None
-        return f"the autopilot's position jumped by {by_m:.1f} m against its velocity: poses next to that are in doubt"
+            return tuple(doubts(self._history, utc_ns))
 
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
@@ -295,8 +281,7 @@ class Navigation:
             attitude_sigma_rad=math.radians(now.pose.attitude_sigma_deg),
         )
         self.utc = UtcLearner(recording, known=utc_known)
-        self._vehicles: list[tuple[int, int]] = []
-        self._vehicles_noted = 0
+        self._vehicles, self._vehicles_noted = list[tuple[int, int]](), 0
 
     def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
         """See PacketLog."""
@@ -372,7 +357,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
     if not at.positions:
         return made
     found, *doubts_m = position_at(at.positions, at.boot_ns)
-    across_doubt_m, upright_doubt_m = map(math.hypot, doubts_m, at.jumped_m)
+    across_doubt_m, upright_doubt_m = map(math.hypot, doubts_m, _jumped_m(at))
     age_s = min(abs(sample.boot_ns - at.boot_ns) for sample in at.positions) / 1e9
     blur_s = sigma_s if len(at.positions) == 2 else math.hypot(sigma_s, age_s)
     north, east, down = found.velocity_ned_m_s
@@ -398,6 +383,48 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
     )
+
+
+def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:
+    """The position at `boot_ns` from one or two samples, and its interpolation error (1 σ, metres), horizontal and
+    vertical."""
+    a = samples[0]
+    if len(samples) == 1:
+        return a, 0.0, 0.0
+    b = samples[1]
+    span_s = (b.boot_ns - a.boot_ns) / 1e9
+    share = (boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
+    north_m, east_m = metres_per_radian(a.latitude_rad, a.altitude_msl_m)
+    va, vb = a.velocity_ned_m_s, b.velocity_ned_m_s
+    to_b = displacement(a, b)
+    north, east, down = (hermite((0.0, to_b[i]), (va[i], vb[i]), span_s, share) for i in range(3))
+    height = b.height_above_home_m - a.height_above_home_m
+    vn, ve, vd = ((1 - share) * va[i] + share * vb[i] for i in range(3))
+    found = replace(
+        b,
+        boot_ns=boot_ns,
+        latitude_rad=a.latitude_rad + north / north_m,
+        longitude_rad=math.remainder(a.longitude_rad + east / east_m, 2 * math.pi),
+        altitude_msl_m=a.altitude_msl_m - down,
+        height_above_home_m=a.height_above_home_m + hermite((0.0, height), (-va[2], -vb[2]), span_s, share),
+        velocity_ned_m_s=(vn, ve, vd),
+    )
+    errors_m = [hermite_doubt(to_b[i], (va[i], vb[i]), span_s, share) for i in range(3)]
+    return found, math.hypot(errors_m[0], errors_m[1]), errors_m[2]
+
+
+def _jumped_m(at: Around) -> tuple[float, float]:
+    """How far the positions around an instant contradict that of the instant, metres horizontally and vertically: over
+    jumps up to `JUMP_AFTER_NS` before it and `JUMP_BEFORE_NS` after it. A jump there and back is one of them."""
+    before = [one for one in at.jumps if at.boot_ns - JUMP_AFTER_NS < one.boot_ns <= at.boot_ns]
+    after = [one for one in at.jumps if at.boot_ns < one.boot_ns < at.boot_ns + JUMP_BEFORE_NS]
+    across_m = upright_m = 0.0
+    for side in (before[::-1], after):
+        north = east = down = 0.0
+        for one in side:
+            north, east, down = north + one.by_m[0], east + one.by_m[1], down + one.by_m[2]
+            across_m, upright_m = max(across_m, math.hypot(north, east)), max(upright_m, abs(down))
+    return across_m, upright_m
 
 
 def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quaternion, float]:
@@ -463,9 +490,7 @@ def _gimbal(at: Around, vehicle: Quaternion | None) -> tuple[Quaternion | None, 
 
 
 def _gnss(at: Around) -> Gnss | None:
-    if at.gnss is None:
-        return None
-    return replace(at.gnss.reported, age_ms=abs(at.utc_ns - at.gnss.stamp_ns) / 1e6)
+    return None if at.gnss is None else replace(at.gnss.reported, age_ms=abs(at.utc_ns - at.gnss.stamp_ns) / 1e6)
 
 
 def _receiver_sigma_m(receiver: Gnss, accuracy_m: float | None, dilution: float | None) -> float | None:

@@ -66,6 +66,16 @@ class PositionSample:
 
 
 @dataclass(frozen=True, slots=True)
+class Jump:
+    """What the position moved (north, east, down) up to a sample beyond what its velocity explains."""
+
+    number: int
+    stamp_ns: int
+    boot_ns: int
+    by_m: Vector3
+
+
+@dataclass(frozen=True, slots=True)
 class AttitudeSample:
     """One ATTITUDE_QUATERNION, ATTITUDE or ATTITUDE_QUATERNION_COV. Rates are of the body, None where the autopilot
     gave none; `sigma_rad` is of the whole rotation, None where it isn't given."""
@@ -208,8 +218,8 @@ class Around:
     the nearest one.
 
     `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
-    `placed`: False where the clock stepped so near to it that the samples may be from before or after it. `jumped_m`:
-    by how much positions near to it contradict it, horizontally and vertically.
+    `placed`: False where the clock stepped so near to it that the samples may be from before or after it. `jumps`: all
+    that are known of, near to it or not.
     """
 
     utc_ns: int
@@ -221,7 +231,7 @@ class Around:
     gimbals: Sequence[GimbalSample] = ()
     gimbal_boot_ns: int = 0
     placed: bool = True
-    jumped_m: tuple[float, float] = (0.0, 0.0)
+    jumps: Sequence[Jump] = ()
 
 
 def boot_ns(message: MavlinkMessage) -> int:
@@ -379,8 +389,23 @@ def feedback_boot_ns(
     return time_us * 1000
 
 
-def feedback(number: int, stamp_ns: int, boot_ns: int, message: MavlinkMessage, *, mark: bool, older: bool) -> Feedback:
-    """The message as a Feedback at `boot_ns`. `mark`: see `is_mark`; `older`: by the first tagging rules."""
+def feedback(
+    number: int,
+    stamp_ns: int,
+    message: MavlinkMessage,
+    now_boot_ns: int | None,
+    unix_minus_boot_ns: int | None,
+    *,
+    mark: bool,
+    older: bool,
+) -> Feedback | None:
+    """The message as a Feedback; None where its time is unknown or further from now than `NEAREST_NS`. `mark`: see
+    `is_mark`; `older`: by the first tagging rules."""
+    if now_boot_ns is None:
+        return None
+    boot_ns = feedback_boot_ns(message, unix_minus_boot_ns, now_boot_ns, unwrap=not older)
+    if boot_ns is None or abs(boot_ns - now_boot_ns) > NEAREST_NS:
+        return None
     by_pin, time_us = message.get_type() == "CAMERA_FEEDBACK", int(message.time_usec)
     contact = older or mark or (by_pin and time_us < EPOCH_US)
     image = message.img_idx if by_pin else message.seq
@@ -397,37 +422,6 @@ def keep(history: list[N], sample: N) -> None:
 def prune(history: list[N], before_ns: int) -> None:
     """Forget what came before."""
     del history[: bisect_left(history, before_ns, key=lambda sample: sample.stamp_ns)]
-
-
-def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
-    """Those of the packets first <= number < limit."""
-    return history[place_of(history, first) : place_of(history, limit)]
-
-
-def place_of(history: Sequence[Numbered], number: int) -> int:
-    """Where packet `number` would stand."""
-    return bisect_left(history, number, key=lambda sample: sample.number)
-
-
-def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
-    """Those that arrived in the last `window_ns` before the last one."""
-    if not history:
-        return history
-    since = history[-1].stamp_ns - window_ns
-    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
-
-
-def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
-    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
-    none. `boot_ns` of the history must rise."""
-    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
-    sides = tuple(history[max(0, at - 1) : at + 1])
-    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
-        return sides
-    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
-        return ()
-    return (nearest,)
 
 
 class ArrivalSteps:

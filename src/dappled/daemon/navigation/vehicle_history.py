@@ -20,39 +20,30 @@ from dappled.daemon.navigation.clocks import (
     from_timesync,
     step_ns,
 )
-from dappled.daemon.navigation.positions import Jump, JumpFinder, doubt_m
+from dappled.daemon.navigation.jumps import JumpFinder
 from dappled.daemon.navigation.samples import (
-    EPOCH_US,
-    GIMBAL_COMPONENTS,
-    HALF_MS_NS,
     NEAREST_NS,
     Around,
-    ArrivalSteps,
     AttitudeSample,
     Counts,
     Epoch,
     Feedback,
     GimbalSample,
     GnssSample,
+    Jump,
+    N,
     PositionSample,
+    S,
     Sample,
-    around_instant,
-    between,
-    feedback_boot_ns,
     keep,
-    latest,
     prune,
 )
 from dappled.decode.geometry import norm
 from dappled.drivers.mavlink import MavlinkMessage
 
-POSITION_GAP_NS = 2_500_000_000
-ATTITUDE_GAP_NS = 1_500_000_000
-GIMBAL_GAP_NS = 1_500_000_000
-TIMESYNC_WINDOW_NS = 120 * 10**9
-ARRIVAL_WINDOW_NS = 60 * 10**9
-REBOOT_BACK_NS = 2 * 10**9
-REBOOT_CONFIRM_NS = 500_000_000
+POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
+TIMESYNC_WINDOW_NS, ARRIVAL_WINDOW_NS = 120 * 10**9, 60 * 10**9
+REBOOT_BACK_NS, REBOOT_CONFIRM_NS = 2 * 10**9, 500_000_000
 _ALIVE_NS = 5 * 10**9
 _REQUESTS_KEPT = 64
 _UNSTEADY_NS = 10 * 10**9  # two steps within this time: the clock does not run steadily
@@ -64,6 +55,37 @@ _REPEATS = 64
 _MOST_BOOT_NS = 2**62  # differences of such times fit 64 bits
 _AUTOPILOT = 1
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the epoch's first packet, the last packets
+
+
+def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
+    """Those of the packets first <= number < limit."""
+    return history[place_of(history, first) : place_of(history, limit)]
+
+
+def place_of(history: Sequence[telemetry_samples.Numbered], number: int) -> int:
+    """Where packet `number` would stand."""
+    return bisect_left(history, number, key=lambda sample: sample.number)
+
+
+def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
+    """Those that arrived in the last `window_ns` before the last one."""
+    if not history:
+        return history
+    since = history[-1].stamp_ns - window_ns
+    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
+
+
+def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
+    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
+    none. `boot_ns` of the history must rise."""
+    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
+    sides = tuple(history[max(0, at - 1) : at + 1])
+    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
+        return sides
+    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
+    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
+        return ()
+    return (nearest,)
 
 
 class AutopilotTime:
@@ -83,7 +105,7 @@ class AutopilotTime:
         self._answers: list[TimesyncAnswer] = []
         self._requests: dict[int, int] = {}
         self._epochs = [Epoch(0, 0, 0)]
-        self._arrivals = ArrivalSteps()
+        self._arrivals = telemetry_samples.ArrivalSteps()
         self._back_since_ns: int | None = None
         self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
@@ -166,8 +188,10 @@ class AutopilotTime:
 
     def system_time(self, message: MavlinkMessage) -> None:
         """Take a SYSTEM_TIME of the autopilot."""
-        if message.time_unix_usec > EPOCH_US and message.time_boot_ms > 0:
-            self.unix_minus_boot_ns = message.time_unix_usec * 1000 - (message.time_boot_ms * 10**6 + HALF_MS_NS)
+        if message.time_unix_usec > telemetry_samples.EPOCH_US and message.time_boot_ms > 0:
+            self.unix_minus_boot_ns = message.time_unix_usec * 1000 - (
+                message.time_boot_ms * 10**6 + telemetry_samples.HALF_MS_NS
+            )
 
     def timesync(self, number: int, stamp_ns: int, message: MavlinkMessage, *, from_autopilot: bool) -> bool:
         """Take a TIMESYNC, request or answer. Whether it is an answer to us that can't be true."""
@@ -258,7 +282,7 @@ class Gimbals:
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """Take a packet of the vehicle's system."""
-        if message.get_srcComponent() not in GIMBAL_COMPONENTS:
+        if message.get_srcComponent() not in telemetry_samples.GIMBAL_COMPONENTS:
             return
         sample = telemetry_samples.next_gimbal(self._samples[-1] if self._samples else None, number, stamp_ns, message)
         if sample is not None:
@@ -364,7 +388,7 @@ class VehicleHistory:
             gimbals,
             gimbal_boot_ns,
             placed,
-            doubt_m(between(self._jumps, first, limit), boot_ns),
+            between(self._jumps, first, limit),
         )
 
     def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
@@ -414,15 +438,12 @@ class VehicleHistory:
         mark = telemetry_samples.is_mark(message, self.system_id)
         if not (mark or self._ours(message)) or (by_pin and message.cam_idx != self._cam_idx and not older):
             return
-        now_ns = self.time.now_boot_ns
-        boot_ns = (
-            None
-            if now_ns is None
-            else feedback_boot_ns(message, self.time.unix_minus_boot_ns, now_ns, unwrap=not older)
+        clock = self.time
+        found = telemetry_samples.feedback(
+            number, stamp_ns, message, clock.now_boot_ns, clock.unix_minus_boot_ns, mark=mark, older=older
         )
-        if boot_ns is None or now_ns is None or abs(boot_ns - now_ns) > NEAREST_NS:
+        if found is None:
             return
-        found = telemetry_samples.feedback(number, stamp_ns, boot_ns, message, mark=mark, older=older)
         told = self._feedbacks[-_REPEATS:]
         if not older and any(one.time_us == found.time_us and one.image != found.image for one in told):
             return  # the report of another camera repeats this one's last time, with the number of a trigger to come

@@ -11,6 +11,7 @@ from dappled.decode.geometry.pose import (
     Symmetric,
     Vector3,
     conjugate,
+    displacement,
     from_euler,
     hermite,
     hermite_doubt,
@@ -29,7 +30,7 @@ from dappled.decode.geometry.pose import (
 )
 
 __all__ = [
-    "FrameGeometry", "Gnss", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "from_euler", "hermite",
-    "hermite_doubt", "image_motion", "metres_per_radian", "multiply", "norm", "normalised", "rotation_vector", "slerp",
-    "slerp_doubt", "turn_rad", "turn_rates", "turned", "turned_by_heading",
+    "FrameGeometry", "Gnss", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "displacement", "from_euler",
+    "hermite", "hermite_doubt", "image_motion", "metres_per_radian", "multiply", "norm", "normalised",
+    "rotation_vector", "slerp", "slerp_doubt", "turn_rad", "turn_rates", "turned", "turned_by_heading",
 ]  # fmt: skip

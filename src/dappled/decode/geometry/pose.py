@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Protocol
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -71,6 +71,19 @@ class Pose:
     def unknown(cls, utc_ns: int, packets: int) -> Pose:
         """A pose without any telemetry in so many packets."""
         return cls("none", utc_ns, None, None, None, None, None, None, None, None, None, None, packets)
+
+
+class Located(Protocol):
+    """Whatever has latitude, longitude and altitude."""
+
+    @property
+    def latitude_rad(self) -> float: ...
+
+    @property
+    def longitude_rad(self) -> float: ...
+
+    @property
+    def altitude_msl_m(self) -> float: ...
 
 
 def hermite(ends: tuple[float, float], slopes: tuple[float, float], span_s: float, share: float) -> float:
@@ -209,6 +222,16 @@ def metres_per_radian(latitude_rad: float, altitude_m: float) -> tuple[float, fl
     north = _WGS84_A_M * (1 - _WGS84_E2) / curvature**1.5 + altitude_m
     east = (_WGS84_A_M / math.sqrt(curvature) + altitude_m) * math.cos(latitude_rad)
     return north, east
+
+
+def displacement(a: Located, b: Located) -> Vector3:
+    """From `a` to `b`: north, east and down, metres."""
+    north_m, east_m = metres_per_radian(a.latitude_rad, a.altitude_msl_m)
+    return (
+        (b.latitude_rad - a.latitude_rad) * north_m,
+        math.remainder(b.longitude_rad - a.longitude_rad, 2 * math.pi) * east_m,
+        a.altitude_msl_m - b.altitude_msl_m,
+    )
 
 
 def norm(vector: Vector3) -> float:

@@ -1,4 +1,4 @@
-"""Interpolate positions, and find those that contradict the velocities sent with them: jumps.
+"""Find positions that contradict the velocities sent with them: jumps.
 
 A receiver that has lost its way, or an estimator that was reset, moves the position by metres while the velocity says
 nothing of it. Which side of a jump is right can't be known: a position near one is in doubt by its size.
@@ -8,28 +8,16 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dappled.daemon.navigation.samples import NEAREST_NS, PositionSample
-from dappled.decode.geometry import Vector3, hermite, hermite_doubt, metres_per_radian
+from dappled.daemon.navigation.samples import NEAREST_NS, Jump, PositionSample
+from dappled.decode.geometry import Vector3, displacement
 
-AFTER_NS, BEFORE_NS = 30 * 10**9, 10 * 10**9  # so long after and before a jump a position is in doubt
 _WINDOW_NS = 10**9  # a jump that is spread over several samples is whole within
 _FLOOR_M = 2.0  # a position and a velocity that drift apart as filters do
 _STALE_S = 0.25  # by which a position may be older than its time says: a receiver's interval, in messages sent faster
 _BETWEEN_M_S2 = 2.5  # × time²: there and back at 10 m/s² between two samples with the same velocity
 _UNKNOWN_M_S = 60.0  # of a vehicle whose messages have no velocity (exactly 0, 0, 0)
-
-
-@dataclass(frozen=True, slots=True)
-class Jump:
-    """What the position moved (north, east, down) up to a sample beyond what its velocity explains."""
-
-    number: int
-    stamp_ns: int
-    boot_ns: int
-    by_m: Vector3
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,37 +65,13 @@ class JumpFinder:
         return Jump(sample.number, sample.stamp_ns, sample.boot_ns, by_m) if most > 0 else None
 
 
-def doubt_m(jumps: Sequence[Jump], boot_ns: int) -> tuple[float, float]:
-    """How far the positions around an instant contradict that of the instant, metres horizontally and vertically: over
-    jumps up to `AFTER_NS` before it and `BEFORE_NS` after it. A jump there and back is one of them."""
-    before = [one for one in jumps if boot_ns - AFTER_NS < one.boot_ns <= boot_ns]
-    after = [one for one in jumps if boot_ns < one.boot_ns < boot_ns + BEFORE_NS]
-    across_m = upright_m = 0.0
-    for side in (before[::-1], after):
-        north = east = down = 0.0
-        for one in side:
-            north, east, down = north + one.by_m[0], east + one.by_m[1], down + one.by_m[2]
-            across_m, upright_m = max(across_m, math.hypot(north, east)), max(upright_m, abs(down))
-    return across_m, upright_m
-
-
-def _moved_m(a: PositionSample, b: PositionSample) -> Vector3:
-    """From `a` to `b`, north, east and down, metres."""
-    north_m, east_m = metres_per_radian(a.latitude_rad, a.altitude_msl_m)
-    return (
-        (b.latitude_rad - a.latitude_rad) * north_m,
-        math.remainder(b.longitude_rad - a.longitude_rad, 2 * math.pi) * east_m,
-        a.altitude_msl_m - b.altitude_msl_m,
-    )
-
-
 def _unexplained(a: PositionSample, b: PositionSample) -> tuple[Vector3, float]:
     """What the position moved beyond the mean velocity, and how much of that is nothing (metres).
 
     By the time between their own times or by that between their arrivals, whichever explains more: a clock that steps
     is no jump. A vertical speed may count upwards, as old ArduCopters send it.
     """
-    north, east, down = _moved_m(a, b)
+    north, east, down = displacement(a, b)
     vn, ve, vd = (0.5 * (x + y) for x, y in zip(a.velocity_ned_m_s, b.velocity_ned_m_s, strict=True))
     own_s, arrived_s = (b.boot_ns - a.boot_ns) / 1e9, (b.stamp_ns - a.stamp_ns) / 1e9
     across = min(((north - vn * s, east - ve * s) for s in (own_s, arrived_s)), key=lambda by: math.hypot(*by))
@@ -120,32 +84,3 @@ def _steady_m_s(a: PositionSample, b: PositionSample) -> tuple[float, float]:
     """The speed that both samples have, horizontally and vertically."""
     (an, ae, ad), (bn, be, bd) = a.velocity_ned_m_s, b.velocity_ned_m_s
     return min(math.hypot(an, ae), math.hypot(bn, be)), min(abs(ad), abs(bd))
-
-
-def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[PositionSample, float, float]:
-    """The position at `boot_ns` from one or two samples, and its interpolation error (1 σ, metres), horizontal and
-    vertical."""
-    a = samples[0]
-    if len(samples) == 1:
-        return a, 0.0, 0.0
-    b = samples[1]
-    span_s = (b.boot_ns - a.boot_ns) / 1e9
-    share = (boot_ns - a.boot_ns) / (b.boot_ns - a.boot_ns)
-    north_m, east_m = metres_per_radian(a.latitude_rad, a.altitude_msl_m)
-    va, vb = a.velocity_ned_m_s, b.velocity_ned_m_s
-    to_b = _moved_m(a, b)
-    north, east, down = (hermite((0.0, to_b[i]), (va[i], vb[i]), span_s, share) for i in range(3))
-    height = b.height_above_home_m - a.height_above_home_m
-    vn, ve, vd = ((1 - share) * va[i] + share * vb[i] for i in range(3))
-    found = PositionSample(
-        b.number,
-        b.stamp_ns,
-        boot_ns,
-        a.latitude_rad + north / north_m,
-        math.remainder(a.longitude_rad + east / east_m, 2 * math.pi),
-        a.altitude_msl_m - down,
-        a.height_above_home_m + hermite((0.0, height), (-va[2], -vb[2]), span_s, share),
-        (vn, ve, vd),
-    )
-    doubts = [hermite_doubt(to_b[i], (va[i], vb[i]), span_s, share) for i in range(3)]
-    return found, math.hypot(doubts[0], doubts[1]), doubts[2]
