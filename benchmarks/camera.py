@@ -5,8 +5,9 @@
 Trigger: from the shutter's `fire` to libgphoto2's trigger call, while processes that decode keep both cores busy. The
 priorities are the service's own (Nice=-5 in its unit, the camera's process before it), and the body, which stands for
 hardware, goes before all; where this user may not have them, it says so.
-File: a 17.6 MB raw file from the body to safe on disk, against a plain copy of it with fsync, taken in turns; and what
-the driver's process holds in memory at most, above what it holds before. Stall: the longest time for which the daemon
+File: a 17.6 MB raw file from the body to safe on disk, against a plain copy of it with fsync, taken in turns; what share
+of that the transfer is (a body that is itself a program on these cores; USB 2 would take half a second); and what the
+driver's process holds in memory at most, above what it holds before. Stall: the longest time for which the daemon
 side doesn't answer while the body is silent.
 """
 
@@ -111,6 +112,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
     source = place / "source.cr2"
     source.write_bytes(os.urandom(SIZE))
     flight = recording.begin(place / "flights", clock, {})
+    fetched: list[float] = []
     ours: list[float] = []
     plain: list[float] = []
     with (
@@ -124,7 +126,8 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
             arrival = until(camera, lambda event: isinstance(event, Arrival))
             began = time.perf_counter()
             flight.recorder.record(shot, arrival.name, arrival.blob, arrived_utc_ns=clock.utc_ns())
-            ours.append(time.perf_counter() - began + arrival.facts["fetch_ms"] / 1e3)
+            fetched.append(arrival.facts["fetch_ms"] / 1e3)
+            ours.append(time.perf_counter() - began + fetched[-1])
             arrival.blob.close()
             camera.release(arrival)
             peak = max(peak, _memory(camera))
@@ -136,6 +139,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
         "body_to_safe_mb_s": SIZE / move / 1e6,
         "plain_copy_mb_s": SIZE / copy / 1e6,
         "ratio": copy / move,
+        "transfer_share": statistics.median(fetched) / move,
         "memory_per_file_size": max(0, peak - before) / SIZE,
     }
 
