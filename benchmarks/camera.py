@@ -5,9 +5,9 @@
 Trigger: from the shutter's `fire` to libgphoto2's trigger call, while processes that decode keep both cores busy. The
 priorities are the service's own (Nice=-5 in its unit, the camera's process before it), and the body, which stands for
 hardware, goes before all; where this user may not have them, it says so.
-File: a 17.6 MB raw file from the body to safe on disk, against a plain copy of it with fsync, taken in turns; what share
-of that the transfer is (a body that is itself a program on these cores; USB 2 would take half a second); and what the
-driver's process holds in memory at most, above what it holds before. Stall: the longest time for which the daemon
+File: a 17.6 MB raw file from the body to safe on disk, against a plain copy of it with fsync, taken in turns; what
+share of that the transfer is (a body that is itself a program on these cores; USB 2 would take half a second); and what
+the driver's process holds in memory at most, above what it holds before. Stall: the longest time for which the daemon
 side doesn't answer while the body is silent.
 """
 

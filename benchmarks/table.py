@@ -52,8 +52,8 @@ TAIL = """
 would be needed; their transforms alone are 1.52 of one by operations (13 mm). The method was slower with older NumPy.
 
 **A file from the body, 0.6 of a plain copy.** The transfer comes first, then writing, hashing and the same fsync as the
-copy's: with nothing but transfer and copy the ratio would be about 0.5 here. Over USB 2 the transfer takes half a second
-and none of this shows.
+copy's: with nothing but transfer and copy the ratio would be about 0.5 here. Over USB 2 the transfer takes half a
+second, and none of this shows.
 
 ## What is not measured
 
