@@ -62,6 +62,18 @@ def test_the_readme_s_calibrate_command_works_on_a_450d_behind_mask_2(
     assert "only geometric would do" in found.verdict
 
 
+def test_calibrate_tells_which_orders_it_did_not_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Behind Mask 2, told that it were Mask 3: the second harmonic is averaged out, the fourth isn't there."""
+    shot = Shot(MASKS["mask-2"], QUARTER, 50.0, 22.0, turn_deg=0.7, seed=2)
+    frame = str(dng_of(tmp_path / "white.dng", shot, shot.frame()))
+    words = _quarter(tmp_path)
+    words[words.index("mask-2")] = "mask-3"
+    assert main(["calibrate", frame, *words, "-o", str(tmp_path / "c.toml")]) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"^transfer \(1,-1\) 0\.2\d+ \(1,1\) 0\.2\d+ \(2,-2\) unknown \(2,2\) unknown$", told, re.M)
+    assert "not seen: (4,-4) (4,4) (8,-8) (8,8); a mask without them has the same carriers at f/22" in told
+
+
 def test_the_law_that_the_frame_obeys_is_used_and_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0, scene="texture", seed=2)
     frame = str(dng_of(tmp_path / "f.dng", shot, shot.frame()))

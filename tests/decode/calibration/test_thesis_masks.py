@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.errors import DecodeError
 from tests.decode.ray_frames import CANON, FUJI, MASKS, Body, Shot, Stop, orders_above_noise
 from tests.decode.ray_trials import (
@@ -14,13 +15,16 @@ from tests.decode.ray_trials import (
     F_NUMBERS,
     LENGTHS_MM,
     SMALL,
+    STATED_MM,
     attempt,
     bare,
     calibrated,
+    mask_of,
     off_bins,
     photograph,
     reach,
     seeded,
+    sensor_of,
     shows_no_carriers,
 )
 
@@ -85,6 +89,23 @@ def test_a_print_at_another_scale_is_found_with_its_anisotropy(scale: float) -> 
     film = MASKS["mask-2"]
     shot = Shot(replace(film, scale=scale, anisotropy=0.01), SMALL, f_number=22.0, turn_deg=-1.0)
     assert off_bins(shot, calibrated(shot, film=film)) < 0.1
+
+
+def test_a_stop_that_averages_an_order_out_says_nothing_about_its_transfer() -> None:
+    """f/22 leaves a fiftieth of the second harmonic, f/45 two thirds: the mean of both frames is that of f/45."""
+    film = MASKS["mask-2"]
+
+    def of(*f_numbers: float) -> list[float]:
+        frames = [Shot(film, SMALL, 50.0, stop, turn_deg=0.7, scene="white", seed=2) for stop in f_numbers]
+        shown = [CalibrationFrame(one.frame(), one.focal_length_mm, one.f_number) for one in frames]
+        known = calibrate(
+            shown, sensor=sensor_of(SMALL), mask=mask_of(film), law="geometric", mask_distance_mm=STATED_MM
+        )
+        return [known.fits[0].transfer[place] for place in map(known.mask.half_orders().index, [(2, -2), (2, 2)])]
+
+    assert of(22.0) == [0.0, 0.0]
+    assert min(map(abs, of(45.0))) > 0.04
+    assert of(22.0, 45.0) == pytest.approx(of(45.0), rel=1e-6)
 
 
 def test_frames_as_the_fd_law_has_them_are_found_by_that_law() -> None:

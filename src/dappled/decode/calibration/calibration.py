@@ -36,7 +36,8 @@ class LatticeFit:
     """What the frames of one focal length showed.
 
     `lattice` in cycles/pixel. `origin` is x0 in cycles of ky and kx, at the frame's centre. `transfer` holds M_k, real
-    and signed, for each of the mask's half orders (DC first, 1.0), the aperture's own share divided out.
+    and signed, for each of the mask's half orders (DC first, 1.0), the aperture's own share divided out; 0 where that
+    leaves too little to tell.
     `residual_bins` is the rms distance of the measured carriers from the lattice in bins of the padded transform,
     `phase_residual_rad` that of their phases from the origin's, `found` how many carriers of the half plane were seen;
     `seen` are those, without the mean: (ky, kx, fy, fx, strength). `print_scale` is the print's frequency over

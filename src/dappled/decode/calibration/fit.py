@@ -228,11 +228,13 @@ def _distance(
 
 
 def _mean(fits: list[LatticeFit]) -> LatticeFit:
-    """One fit of several at the same focal length; origins are averaged as angles."""
+    """One fit of several at the same focal length; origins are averaged as angles. An order's transfer is the mean of
+    those that know it: the stop of another frame may have averaged it out."""
     if len(fits) == 1:
         return fits[0]
     matrix = np.mean([f.lattice.matrix() for f in fits], axis=0)
     (ay, ax), (by, bx) = matrix
+    transfers = np.array([f.transfer for f in fits])
     turns = np.exp(2j * np.pi * np.array([f.origin for f in fits])).mean(axis=0)
     return replace(
         fits[0],
@@ -241,8 +243,9 @@ def _mean(fits: list[LatticeFit]) -> LatticeFit:
         mask_distance_mm=float(np.mean([f.mask_distance_mm for f in fits])),
         distance_fitted=all(f.distance_fitted for f in fits),
         origin=(float(np.angle(turns[0]) / (2 * np.pi)), float(np.angle(turns[1]) / (2 * np.pi))),
-        transfer=tuple(float(m) for m in np.mean([f.transfer for f in fits], axis=0)),
+        transfer=tuple(float(m) for m in transfers.sum(axis=0) / np.maximum(np.count_nonzero(transfers, axis=0), 1)),
         residual_bins=float(np.sqrt(np.mean([f.residual_bins**2 for f in fits]))),
         phase_residual_rad=float(np.sqrt(np.mean([f.phase_residual_rad**2 for f in fits]))),
         found=min(f.found for f in fits),
+        seen=max((f.seen for f in fits), key=len),
     )

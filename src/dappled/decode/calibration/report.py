@@ -136,7 +136,7 @@ def as_text(found: Calibration, mask_distance_mm: float) -> str:
         lines += [
             f"{length:g} mm, f/{fit.f_number:g}: {2 * fit.found - 1} carriers {turned}{stands}",
             *_table(rows(found, fit, found.law, mask_distance_mm)),
-            "transfer " + " ".join(f"({ky},{kx}) {m:.3f}" for (ky, kx), m in _outer(found, fit)),
+            *_transfers(found, fit),
             "",
         ]
     for law in law_fits(found, mask_distance_mm):
@@ -164,5 +164,16 @@ def _table(table: Sequence[Row]) -> list[str]:
     ]
 
 
-def _outer(found: Calibration, fit: LatticeFit) -> list[tuple[Order, float]]:
-    return list(zip(found.mask.half_orders(), fit.transfer, strict=True))[1:]
+def _transfers(found: Calibration, fit: LatticeFit) -> list[str]:
+    """The transfer of each order that was seen, unknown where the stop leaves too little of it; and those that were not
+    seen: a mask without them has the same carriers."""
+    seen = {(ky, kx) for ky, kx, *_ in fit.seen}
+    outer = list(zip(found.mask.half_orders(), fit.transfer, strict=True))[1:]
+    lines = ["transfer " + " ".join(f"({ky},{kx}) {_told(m)}" for (ky, kx), m in outer if (ky, kx) in seen)]
+    if unseen := [f"({ky},{kx})" for (ky, kx), _ in outer if (ky, kx) not in seen]:
+        lines.append(f"not seen: {' '.join(unseen)}; a mask without them has the same carriers at f/{fit.f_number:g}")
+    return lines
+
+
+def _told(transfer: float) -> str:
+    return f"{transfer:.3g}" if transfer else "unknown"
