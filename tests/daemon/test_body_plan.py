@@ -76,6 +76,28 @@ def tag(index: int, **values: float | None) -> Tag:
     return Tag(index, 0, 0, "trigger", camera="", mask="", frame_sha256="", pose=no_pose(), **given)
 
 
+@pytest.mark.parametrize("word", ["Low", "25%", "0 %", " 10% ", "EMPTY", "critical"])
+def test_a_battery_that_will_not_last_is_told_and_is_a_caution_before_flight(word: str) -> None:
+    rig = Rig(Body())
+    rig.body.now = (*AS_PLANNED, Setting("battery", word))
+    rig.read()
+    assert f"the camera's battery is nearly empty: {word.strip()}" in rig.report().problems()
+    assert rig.check() == ("caution", f"its battery is nearly empty: {word.strip()}")
+
+
+@pytest.mark.parametrize(
+    ("word", "percent"),
+    [("100%", 100), ("50%", 50), ("26%", 26), ("999%", None), ("Unknown value 0x0007", None), ("", None)],
+)
+def test_a_good_one_and_one_that_says_nothing_clear_are_not(word: str, percent: int | None) -> None:
+    rig = Rig(Body())
+    rig.body.now = (*AS_PLANNED, Setting("battery", word))
+    rig.read()
+    assert rig.report().problems() == []
+    assert rig.report().values()["battery_percent"] == percent
+    assert rig.check()[0] == "go"
+
+
 def test_a_body_as_planned_is_left_alone() -> None:
     rig = Rig(Body())
     assert rig.check() == ("go", "as planned, room for 250 frames")

@@ -389,6 +389,7 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
     assert re.search(r"stop\s*f/[\d.]+", told), told
     assert re.search(r"battery\s*\d+ ?%", told), told
     assert re.search(r"GNSS\s*RTK fixed, \d+ sat", told), told
+    assert re.search(r"vehicle's battery\s*9\d %, 2[45]\.\d V", told), told
     assert re.search(r"frames left\s*[1-9]", told), told
     assert re.search(r"[\d.]+\s% clipped", told), told
     small = page.evaluate(

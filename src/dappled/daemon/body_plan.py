@@ -16,7 +16,9 @@ from dappled.flight import Tag
 
 log = logging.getLogger(__name__)
 CARD_FRAMES = 20  # fewer than that, and the pilot is told
+LOW_PERCENT = 25
 _LAPSED_NS = 60 * 10**9
+_LOW_WORDS = ("low", "empty", "exhausted", "critical")
 _OFF = ("off", "0", "disable", "disabled", "never", "none")
 _WORDS: Mapping[tuple[str, str], tuple[str, ...]] = {
     ("exposure_mode", "manual"): ("manual", "m"),
@@ -56,7 +58,9 @@ _UNITS: Mapping[SettingName, str] = {"shutter_speed": " s", "focal_length": " mm
 class BodyReport:
     """How the body stands to the plan. `wrong` are sentences; `unknown` are the titles of planned settings that the
     body doesn't report. `drift` says what the last frames were taken with instead; `card_frames` is the room on its
-    card, None where it reports none or stores elsewhere. `read`: its settings were read; `checked`: they are compared.
+    card, None where it reports none or stores elsewhere. `battery` is its word for what its battery holds, "" where it
+    says nothing, `battery_percent` that as a number, where it is one. `read`: its settings were read; `checked`: they
+    are compared.
     """
 
     read: bool
@@ -65,6 +69,9 @@ class BodyReport:
     unknown: tuple[str, ...]
     drift: str
     card_frames: int | None
+    battery: str
+    battery_percent: int | None
+    battery_low: bool
 
     def problems(self) -> list[str]:
         """What the pilot is told, a sentence each."""
@@ -72,6 +79,8 @@ class BodyReport:
         if self.card_frames is not None and self.card_frames <= CARD_FRAMES:
             room = f"room for {counted(self.card_frames, 'frame')}" if self.card_frames else "it is full"
             found.append(f"the camera's card is nearly full: {room}")
+        if self.battery_low:
+            found.append(f"the camera's battery is nearly empty: {self.battery}")
         return found
 
     def values(self) -> dict[str, Any]:
@@ -83,6 +92,9 @@ class BodyReport:
             "unknown": list(self.unknown),
             "drift": self.drift,
             "card_frames": self.card_frames,
+            "battery": self.battery,
+            "battery_percent": self.battery_percent,
+            "battery_low": self.battery_low,
         }
 
 
@@ -175,6 +187,7 @@ class BodyPlan:
         plan = self._plan() if self._check != "off" else {}
         # A focal length that no body reports is compared by each frame's EXIF.
         unknown = tuple(_TITLES[name] for name in plan if name not in now and name != "focal_length")
+        battery, percent, low = _battery(now.get("battery", ""))
         fresh = self._drift and self._clock.monotonic_ns() - self._drift_ns <= _LAPSED_NS
         return BodyReport(
             read=bool(self._found),
@@ -188,6 +201,9 @@ class BodyPlan:
             unknown=unknown,
             drift=self._drift if fresh else "",
             card_frames=_card_frames(now),
+            battery=battery,
+            battery_percent=percent,
+            battery_low=low,
         )
 
     def _plan(self) -> dict[SettingName, str]:
@@ -282,3 +298,12 @@ def _card_frames(now: Mapping[SettingName, str]) -> int | None:
     """How many more frames the body's card takes, by its own count; None where it stores elsewhere or says nothing."""
     count = now.get("free_shots", "")
     return int(count) if count.isdecimal() and "card" in now.get("capture_target", "").lower() else None
+
+
+def _battery(word: str) -> tuple[str, int | None, bool]:
+    """A body's word for its battery, the percentage where it is one, and whether it is nearly empty. Each body has its
+    own words."""
+    word = word.strip()
+    found = re.fullmatch(r"(\d{1,3})\s*%", word)
+    percent = int(found[1]) if found and int(found[1]) <= 100 else None
+    return word, percent, word.lower() in _LOW_WORDS if percent is None else percent <= LOW_PERCENT

@@ -190,7 +190,7 @@ class Service:
             capacity=settings.camera.max_pending,
             fires=not settings.camera.fired_outside,
         )
-        autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
+        self._autopilot = autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
         survey = LiveSurvey(self._navigation, reported, shots)
@@ -378,7 +378,6 @@ class Service:
             self._component.doubt(),
             navigation.utc.doubt(),
             *navigation.telemetry.doubts(self._clock.utc_ns()),
-            self._events.doubt,
             self._control.shortage,
             None if self._gnss is None else self._gnss.problem(),
         )
@@ -409,6 +408,7 @@ class Service:
             parameters=[asdict(one) for one in self._parameters.all()],
             frame_bytes=self._writer.frame_bytes,
             body=self._body.report(),
+            battery=self._autopilot.battery(),
         )
 
     # what others may look at, and ask for

@@ -7,7 +7,7 @@ from collections import deque
 
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera, captured_shot
 from dappled.daemon.camera_protocol.component import Component
-from dappled.daemon.health.logbook import Logbook, battery_doubt, of_shot
+from dappled.daemon.health.logbook import Logbook, of_shot
 from dappled.daemon.navigation.clocks import UtcLearner
 from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.pipeline.live_depth import LiveDepth
@@ -26,8 +26,8 @@ _OF_BODY = 1000  # the working loop takes them fifty times a second
 class ShotEvents(Observer):
     """Observes a live pipeline. `camera` and `utc` are what is known of the camera and of the time.
 
-    `outside` is called last. `doubt` is a sentence where the camera will soon stop working, `misfit` one where the
-    calibration of `recipe` is not for this camera; "" where it is, or nothing is known of the camera.
+    `outside` is called last. `misfit` is a sentence where the calibration of `recipe` is not for this camera; "" where
+    it is, or nothing is known of the camera.
     `of_body` is what the plan of the body is compared with, in order; the working loop takes it.
     """
 
@@ -48,7 +48,6 @@ class ShotEvents(Observer):
         self._shutter, self._component, self._logbook = shutter, component, logbook
         self._depth, self._recipe, self._outside = depth, recipe, outside
         self.misfit = ""
-        self.doubt: str | None = None
         self.of_body: deque[StateChanged | SettingsChanged | Tag] = deque(maxlen=_OF_BODY)
 
     def settled(self, index: int, ok: bool) -> None:
@@ -95,7 +94,6 @@ class ShotEvents(Observer):
 
     def settings_changed(self, change: SettingsChanged) -> None:
         """See Observer."""
-        self.doubt = battery_doubt(change.settings)
         self.of_body.append(change)
         if change.refused:
             self._logbook.add(f"the camera refused a setting: {change.refused}", "warning")

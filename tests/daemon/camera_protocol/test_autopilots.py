@@ -6,6 +6,7 @@ import struct
 
 import pytest
 
+from dappled.daemon.vehicle_battery import VehicleBattery, battery_of
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink, pack
 from dappled.mocks.autopilot.autopilot import heartbeat
 from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
@@ -432,6 +433,36 @@ def test_a_gimbals_attitude_is_requested_where_the_camera_hangs_on_it_until_it_c
     assert number not in wanted()
     rig.tick(5)
     assert (number in wanted()) == on_gimbal
+
+
+def test_the_vehicles_battery_is_requested_until_it_comes_and_only_the_own_autopilots_counts() -> None:
+    rig = rig_of()
+    number = mavlink.MAVLINK_MSG_ID_SYS_STATUS
+
+    def wanted() -> list[float]:
+        return [
+            m.param2
+            for m in rig.of("COMMAND_LONG")
+            if m.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL and round(m.param1) == number
+        ]
+
+    def status(percent: int) -> MavlinkMessage:
+        return mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 24_000, -1, percent, 0, 0, 0, 0, 0, 0)
+
+    assert wanted() == [1_000_000]  # microseconds
+    assert rig.autopilot.battery() is None
+    for _ in range(5):
+        rig.hear(status(80), (1, 1))
+        rig.hear(status(3), (1, 154))  # a gimbal's
+        rig.hear(status(3), (9, 1))  # another vehicle's
+    assert rig.autopilot.battery() == VehicleBattery(24.0, 80, low=False)
+    rig.tick(5)
+    assert wanted() == []
+    for n in range(5000):
+        rig.hear(status(n % 256 - 128), (1, 1))
+    assert rig.autopilot.battery() == battery_of(status(4999 % 256 - 128))
+    rig.tick(5.1)
+    assert rig.autopilot.battery() is None
 
 
 def test_a_request_for_the_time_is_for_the_autopilot_alone() -> None:

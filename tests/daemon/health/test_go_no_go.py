@@ -31,6 +31,10 @@ WELL: dict[str, Any] = {
 }
 
 
+def battery(voltage_v: float | None, remaining_percent: int | None, *, low: bool | None) -> dict[str, Any]:
+    return {"voltage_v": voltage_v, "remaining_percent": remaining_percent, "low": low}
+
+
 def found(name: str, **changes: Any) -> Check:
     health = copy.deepcopy(WELL) | changes
     (check,) = [one for one in go_no_go.checks(health) if one.name == name]
@@ -88,6 +92,10 @@ def test_all_is_well() -> None:
          {"decode": DECODE | {"failed": 4, "failed_in_a_row": 0, "failure": "dark"}}),
         ("Decoding", "no-go", "the last 3 frames could not be decoded, kept in the record: dark",
          {"decode": DECODE | {"failed": 4, "failed_in_a_row": 3, "failure": "dark"}}),
+        ("Vehicle battery", "go", "24.8 V, 76 % left", {"vehicle_battery": battery(24.83, 76, low=False)}),
+        ("Vehicle battery", "go", "what is left is unknown", {"vehicle_battery": battery(24.83, None, low=None)}),
+        ("Vehicle battery", "caution", "low: 21.6 V, 25 % left", {"vehicle_battery": battery(21.6, 25, low=True)}),
+        ("Vehicle battery", "caution", "low: voltage unknown", {"vehicle_battery": battery(None, None, low=True)}),
         ("Service", "no-go", "capture ended: restart dappled", {"dead": ["capture"]}),
         ("Clock", "caution", "not known yet", {"utc_known": False}),
     ],
@@ -96,6 +104,11 @@ def test_each_thing_says_what_it_is(name: str, state: str, words: str, changes: 
     check = found(name, **changes)
     assert check.state == state
     assert words in check.text
+
+
+@pytest.mark.parametrize("unknown", [None, battery(None, None, low=None)])
+def test_a_battery_of_which_nothing_is_known_is_no_check(unknown: Any) -> None:
+    assert "Vehicle battery" not in [one.name for one in go_no_go.checks(WELL | {"vehicle_battery": unknown})]
 
 
 def test_the_worst_decides() -> None:

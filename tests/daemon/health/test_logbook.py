@@ -5,12 +5,9 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-import pytest
-
 from dappled.clock import RecordedClock
-from dappled.daemon.health.logbook import Logbook, NewProblems, battery_doubt, of_shot
+from dappled.daemon.health.logbook import Logbook, NewProblems, of_shot
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.drivers.camera import Setting
 from dappled.flight import Cause, Frame, Shot
 
 SHOT = Shot(7, Cause("console", "console", 1), 0, 0)
@@ -54,18 +51,6 @@ def test_a_shot_in_words() -> None:
         "warning",
     )
     assert of_shot(PendingShot(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")
-
-
-@pytest.mark.parametrize("word", ["Low", "25%", "0 %", " 10% ", "EMPTY", "critical"])
-def test_a_battery_that_will_not_last_is_told(word: str) -> None:
-    said = battery_doubt((Setting("iso", "100"), Setting("battery", word)))
-    assert said == f"the camera's battery is nearly empty: {word.strip()}"
-
-
-@pytest.mark.parametrize("word", ["100%", "50%", "26%", "Unknown value 0x0007", "", "normal"])
-def test_a_good_one_and_one_that_says_nothing_clear_are_not(word: str) -> None:
-    assert battery_doubt((Setting("battery", word),)) is None
-    assert battery_doubt(()) is None
 
 
 def test_a_problem_is_new_once_though_its_numbers_change() -> None:

@@ -63,6 +63,15 @@ def test_what_is_unknown_has_no_line() -> None:
     assert read(known)["dappled_disk_free_bytes", ""] == 5e9
 
 
+def test_the_batteries_of_vehicle_and_camera_are_gauges() -> None:
+    names = ("vehicle_battery_percent", "vehicle_battery_volts", "camera_battery_percent")
+    unknown = {"vehicle_battery": {"voltage_v": None, "remaining_percent": None, "low": None}, "body": None}
+    assert not any(name == f"dappled_{one}" for name, _ in read(HEALTH | unknown) for one in names)
+    vehicle = {"voltage_v": 24.83, "remaining_percent": 76, "low": False}
+    told = read(HEALTH | {"vehicle_battery": vehicle, "body": {"card_frames": None, "battery_percent": 0}})
+    assert [told[f"dappled_{one}", ""] for one in names] == [76, 24.83, 0]
+
+
 def test_what_is_left_and_the_fix_are_gauges() -> None:
     names = ("frames_left", "card_frames_left", "gnss_fix_type", "gnss_satellites")
     unknown = read({**HEALTH, "gnss": None, "body": None, "frame_bytes": None})

@@ -18,6 +18,7 @@ from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.pipeline.spacing import Spacing, SpacingStatistics
 from dappled.daemon.stream.publisher import PublisherStatistics
+from dappled.daemon.vehicle_battery import VehicleBattery
 from dappled.decode.geometry import Gnss, Pose
 from dappled.drivers.camera import BodyState
 from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
@@ -31,6 +32,7 @@ WELL = Settings(
     record=RecordSettings(warn_free_mb=0, min_free_mb=0),
 )
 S = 10**9
+ENVELOPE = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
 LINK = LinkStatistics("udpin:127.0.0.1:1", 5, 5, 0, 0, 0, 0, 100 * S, None)
 
 
@@ -65,8 +67,7 @@ def record(
 def test_well(tmp_path: Path) -> None:
     found = record(tmp_path)
     assert found["problems"] == []
-    envelope = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
-    jsonschema.validate({**envelope, **found}, schema("health"))
+    jsonschema.validate({**ENVELOPE, **found}, schema("health"))
 
 
 def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: Path) -> None:
@@ -78,6 +79,10 @@ def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: P
     found = record(tmp_path, vehicle=replace(without_a_place, gnss=receiver), frame_bytes=17e6, parameters=[iso])
     assert (found["gnss"], found["vehicle"]) == ({"fix_type": 3, "satellites": 11}, None)
     assert (found["frame_bytes"], found["settings"]) == (17e6, [iso])
+    assert (unknown["vehicle_battery"], found["vehicle_battery"]) == (None, None)
+    powered = record(tmp_path, battery=VehicleBattery(24.83, None, None))
+    assert powered["vehicle_battery"] == {"voltage_v": 24.83, "remaining_percent": None, "low": None}
+    jsonschema.validate({**ENVELOPE, **powered}, schema("health"))
     old = record(tmp_path, vehicle=replace(without_a_place, gnss=replace(receiver, age_ms=9000.0)))
     assert old["gnss"] is None
 

@@ -12,6 +12,7 @@ from typing import Protocol
 from dappled.clock import Clock
 from dappled.daemon.navigation.samples import EPOCH_US, WRAP_US
 from dappled.daemon.pipeline.repeats import AutopilotCommands
+from dappled.daemon.vehicle_battery import BATTERY_STREAM, BatteryReports, VehicleBattery
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
 from dappled.refusals import LostTriggers
 
@@ -30,6 +31,7 @@ STREAMS = (  # message, interval in microseconds
     (mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, 20_000),
     (mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, 200_000),
     (mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, 1_000_000),
+    BATTERY_STREAM,
 )
 GIMBAL_STREAM = (mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, 50_000)
 LISTEN_NS = 3 * 10**9
@@ -369,7 +371,7 @@ class OwnAutopilot:
         self.identity = SystemIdentity(links.system_id, clock.monotonic_ns())
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests((*STREAMS, GIMBAL_STREAM) if on_gimbal else STREAMS)
-        self._now = AutopilotNow()
+        self._now, self._battery = AutopilotNow(), BatteryReports()
         self.numbers = {"CAMERA_FEEDBACK": TriggerNumbers(), "CAMERA_TRIGGER": TriggerNumbers()}
         self.restarts = 0  # of the autopilot, so far: its numbers begin again
 
@@ -377,6 +379,8 @@ class OwnAutopilot:
         """Take a message of its system that can be trusted."""
         self._requests.heard(message.get_msgId())
         since_ns = self._now.heard(message, self._clock.monotonic_ns()) if message.get_srcComponent() == 1 else None
+        if message.get_type() == "SYS_STATUS" and message.get_srcComponent() == 1:
+            self._battery.heard(message, self._clock.monotonic_ns())
         if since_ns is not None:
             self.restarts += 1
             for numbers in self.numbers.values():
@@ -392,6 +396,10 @@ class OwnAutopilot:
         """Whether a time of the autopilot's, in microseconds since boot (perhaps of 32 bits) or of UTC, is not about
         now: more than `STALE_US` ago, or ahead. None where its clock is not known yet."""
         return self._now.is_stale(time_us, self._clock.monotonic_ns())
+
+    def battery(self) -> VehicleBattery | None:
+        """The vehicle's battery; None while the autopilot doesn't report it."""
+        return self._battery.now(self._clock.monotonic_ns())
 
     def ask(self) -> None:
         """Send what is due by now: requests for the time, and for streams that arrive too slowly."""

@@ -52,6 +52,7 @@ def checks(health: Mapping[str, Any]) -> list[Check]:
         *_body(health),
         _disk(health),
         _link(health),
+        *_vehicle_battery(health.get("vehicle_battery")),
         _position(health.get("vehicle"), health.get("gnss")),
         _clock(health),
         _decoding(health),
@@ -81,6 +82,8 @@ def _body(health: Mapping[str, Any]) -> list[Check]:
     doubts = [body["drift"]] if body["drift"] else []
     if room is not None and room < _CARD_FRAMES:
         doubts.append(f"its card has room for {counted(room, 'frame')}")
+    if body.get("battery_low"):
+        doubts.append(f"its battery is nearly empty: {body['battery']}")
     if not body["checked"]:
         doubts.append("its settings are not compared with a plan (body.check)")
     elif not body["read"]:
@@ -137,6 +140,19 @@ def _quiet_links(link: Mapping[str, Any], silent: int) -> list[str]:
     unheard = min(silent, sum(not each["in"] for each in link.get("each", ())))
     counts = [(silent - unheard, "{} of {} links silent"), (unheard, "nobody yet on {} of {} links")]
     return [words.format(count, link["urls"]) for count, words in counts if count]
+
+
+def _vehicle_battery(battery: Mapping[str, Any] | None) -> list[Check]:
+    """The vehicle's battery; none where nothing is known of it."""
+    if battery is None or (battery["voltage_v"], battery["remaining_percent"], battery["low"]) == (None, None, None):
+        return []
+    voltage, left = battery["voltage_v"], battery["remaining_percent"]
+    text = f"{'voltage unknown' if voltage is None else f'{voltage:.1f} V'}, {_left(left)}"
+    return [Check("Vehicle battery", *(("caution", f"low: {text}") if battery["low"] else ("go", text)))]
+
+
+def _left(percent: int | None) -> str:
+    return "what is left is unknown" if percent is None else f"{percent} % left"
 
 
 def _position(vehicle: Mapping[str, Any] | None, gnss: Mapping[str, Any] | None) -> Check:

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import logging
-import re
 import threading
 from collections import deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.drivers.camera import Setting
 from dappled.errors import sentence, without_numbers
 
 Level = Literal["info", "warning"]
-LOW_PERCENT = 25
-_LOW_WORDS = ("low", "empty", "exhausted", "critical")
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,14 +72,6 @@ class NewProblems:
         """The new ones; with `again` all. These are the known ones from now on."""
         known, self._known = self._known, {without_numbers(text) for text in problems}
         return [text for text in problems if again or without_numbers(text) not in known]
-
-
-def battery_doubt(settings: Iterable[Setting]) -> str | None:
-    """A sentence where the camera says that its battery is nearly empty, else None. Each body has its own words."""
-    word = next((one.value.strip() for one in settings if one.name == "battery"), "")
-    percent = re.fullmatch(r"(\d+)\s*%", word)
-    low = int(percent[1]) <= LOW_PERCENT if percent else word.lower() in _LOW_WORDS
-    return f"the camera's battery is nearly empty: {word}" if low else None
 
 
 def of_shot(pending: PendingShot) -> tuple[str, Level]:

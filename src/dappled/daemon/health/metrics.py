@@ -44,11 +44,18 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
     yield _gauge(
         "frames_left", "Frames that fit on the disk, by their sizes so far", {"": go_no_go.frames_left(health)}
     )
-    room = (health.get("body") or {}).get("card_frames")
-    yield _gauge("card_frames_left", "Frames that fit on the camera's card, as the camera says", {"": room})
+    body = health.get("body") or {}
+    yield _gauge(
+        "card_frames_left", "Frames that fit on the camera's card, as the camera says", {"": body.get("card_frames")}
+    )
     fix = health.get("gnss") or {}
     yield _gauge("gnss_fix_type", "GPS_FIX_TYPE of the satellite receiver's last report", {"": fix.get("fix_type")})
     yield _gauge("gnss_satellites", "Satellites in the receiver's last report", {"": fix.get("satellites")})
+    power = health.get("vehicle_battery") or {}
+    left, volts = power.get("remaining_percent"), power.get("voltage_v")
+    yield _gauge("vehicle_battery_percent", "What is left in the vehicle's battery", {"": left})
+    yield _gauge("vehicle_battery_volts", "The vehicle's battery", {"": volts})
+    yield _gauge("camera_battery_percent", "What is left in the camera's battery", {"": body.get("battery_percent")})
     yield _counter("mavlink_packets", "Packets heard and sent", {"": link["packets"]})
     yield _counter("positions", "Positions heard", {"": link["positions"]})
     stages = {stage["name"]: stage for stage in health["stages"] if "waiting" in stage}

@@ -19,6 +19,7 @@ from dappled.daemon.pipeline.spacing import SpacingStatistics
 from dappled.daemon.pipeline.verdicts import STATES, VerdictCounts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
+from dappled.daemon.vehicle_battery import VehicleBattery
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
 from dappled.errors import counted
@@ -91,13 +92,14 @@ def record(
     frame_bytes: float | None = None,
     body: BodyReport | None = None,
     series: SpacingStatistics | None = None,
+    battery: VehicleBattery | None = None,
 ) -> dict[str, Any]:
     """The header of a `health` message. Its `problems` are sentences, none when all is well.
 
     `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to. `parameters`
     are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames, None before the first.
     `body` is how the camera's settings stand to the plan; None where nothing is compared. `series` are photographs by
-    distance, while they run.
+    distance, while they run. `battery` is the vehicle's; None while the autopilot doesn't report it.
     """
     decoding = decoding or DecodingState()
     fresh = vehicle is not None and vehicle.age_ms is not None and vehicle.age_ms * 1e6 < SILENT_NS
@@ -138,6 +140,7 @@ def record(
         "interval": _interval(shutter, series),
         "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
         "gnss": None if vehicle is None else _receiver(vehicle),
+        "vehicle_battery": None if battery is None else asdict(battery),
         "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
         "decode": {
             "mask": settings.mask.profile,

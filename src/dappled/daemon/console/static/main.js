@@ -91,12 +91,13 @@ function showInstruments(health, framesLeft) {
   const body = Object.fromEntries((health.settings ?? []).map((one) => [one.name, one.value]));
   const cell = (name, value, known = true) => element("div", { "data-known": String(known) }, element("dt", {}, name), element("dd", {}, known ? value : "unknown"));
   const of = (name, setting, text = (value) => value) => cell(name, body[setting] ? text(body[setting]) : "", Boolean(body[setting]));
-  const fix = health.gnss;
+  const fix = health.gnss, power = health.vehicle_battery;
   $("instruments").replaceChildren(
     of("ISO", "CAM_ISO"),
     of("shutter", "CAM_SHUTTERSPD", (value) => (/^[\d/.]+$/.test(value) ? `${value} s` : value)),
     of("stop", "CAM_APERTURE", (value) => (/^[\d.]+$/.test(value) ? `f/${value}` : value)),
     of("battery", "CAM_BATTERY"),
+    cell("vehicle's battery", power ? powerWords(power) : "", Boolean(power) && (power.voltage_v ?? power.remaining_percent) !== null),
     cell("GNSS", fix ? fixWords(fix) : "", Boolean(fix)),
     cell("frames left", framesLeft === null ? "" : framesLeft.toLocaleString("en").replaceAll(",", "\u202f"), framesLeft !== null),
     histogramCell(),
@@ -107,6 +108,10 @@ const FIXES = ["no GNSS", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed"
 function fixWords({ fix_type: type, satellites }) {
   const word = FIXES[type] ?? `fix ${type}`;
   return satellites === null ? word : `${word}, ${satellites} sat.`;
+}
+
+function powerWords({ voltage_v: volts, remaining_percent: percent, low }) {
+  return [percent === null ? "" : `${percent} %`, volts === null ? "" : `${fixed(volts, 1)} V`, low ? "low" : ""].filter(Boolean).join(", ");
 }
 
 // The histogram of the frame that is shown, and how much of it is clipped.
