@@ -111,7 +111,7 @@ FAMILIES: Mapping[str, Family] = {
     "terrain": Family("round stop, terrain from the air, SNR 100", 1.3, None, {"stop": "round"}, largest_px=0.1),
     "half": Family("square stop, half the ideal aperture, SNR 100", f_number=2 * F_NUMBER),
     "vignetting": Family("square stop, 40 % lost at the corners, SNR 100", options={"falloff": 0.4}),
-    "clipped": Family("square stop, 5 % clipped", options={"level": 0.58, "full_well_e": SNR_100 * 0.35 / 0.58}),
+    "clipped": Family("square stop, 5 % clipped", options={"level": 0.73, "full_well_e": SNR_100 * 0.35 / 0.73}),
     "moved": Family("square stop, mask moved 16 µm", options={"moved_mm": (0.016, 0.0)}),
     "turned": Family("square stop, mask turned 0.1°", options={"turned_rad": 0.001745}),
 }
