@@ -258,13 +258,19 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         service.stop()
 
 
+def problems(service: Service) -> str:
+    """What the health record says after a turn of the working loop."""
+    service.step()
+    return "; ".join(service.health()["problems"])
+
+
 def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCamera, settings: Settings) -> None:
     service = started(settings, [])
     try:
         camera.say(SettingsChanged((Setting("battery", "Low"),), 1))
-        eventually(lambda: "battery is nearly empty: Low" in "".join(service.health()["problems"]), "the battery")
+        eventually(lambda: "battery is nearly empty: Low" in problems(service), "the battery")
         camera.say(SettingsChanged((Setting("battery", "100%"),), 2))
-        eventually(lambda: "battery" not in "".join(service.health()["problems"]), "another battery")
+        eventually(lambda: "battery" not in problems(service), "another battery")
     finally:
         service.stop()
 
