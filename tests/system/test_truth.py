@@ -18,7 +18,7 @@ from dappled.flight import flight_report
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.simulation import Simulation, World
 
-SEED, FRAMES = 8, 3
+SEED, FRAMES, GROUND_M = 8, 3, 12.5
 
 
 @pytest.mark.alone
@@ -35,7 +35,7 @@ def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Pat
         decode=replace(settings.decode, enabled=False),
     )
     clock = SystemClock()
-    simulation = Simulation(World(seed=SEED, truth=truth), settings, tmp_path)
+    simulation = Simulation(World(seed=SEED, truth=truth, ground_m=GROUND_M), settings, tmp_path)
     with simulation as simulated:
         service = Service(simulated, clock=clock)
         service.start()
@@ -70,6 +70,10 @@ def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Pat
         assert abs(pose.altitude_msl_m - true.altitude_msl_m) < 0.05
         turn = 2 * math.degrees(math.acos(min(1.0, abs(float(np.dot(pose.attitude, true.attitude))))))
         assert turn < 0.2
+        assert pose.ground is not None
+        assert pose.ground.source == "rangefinder"
+        assert pose.height_above_home_m is not None
+        assert pose.ground.metres == pytest.approx(pose.height_above_home_m - GROUND_M, abs=0.3)  # 5 cm, and its age
         at_exposure = path.pose(exposed_t_s)  # what the frame shows; within what the tag says of itself
         moved = math.dist(true.position_ned_m, at_exposure.position_ned_m)
         assert moved < 3 * tag.utc_sigma_ns / 1e9 * path.speed_m_s

@@ -107,7 +107,7 @@ class BodyPlan:
 
     def __init__(self, planned: PlannedBody, capture_target: str, body: BodySettings, clock: Clock) -> None:
         self._check, self._body, self._clock = planned.check, body, clock
-        self._planned = _planned(planned, capture_target)
+        self._planned = plan_of(planned, capture_target)
         self._requested: dict[SettingName, str] = {}
         self._found: tuple[Setting, ...] = ()
         self._may_set, self._ready = True, False
@@ -124,7 +124,7 @@ class BodyPlan:
     def change(self, name: SettingName, value: str) -> None:
         """See BodySettings: a person's request, which is the plan from now on unless the body refuses it."""
         self._body.change(name, value)
-        self._requested[name] = value
+        self._requested = {**self._requested, name: value}
 
     # what the camera reports
 
@@ -160,17 +160,9 @@ class BodyPlan:
         sentence where they differ."""
         if self._check == "off":
             return None
-        plan = self._plan()
-        values = {"iso": tag.iso, "shutter_speed": tag.exposure_s, "aperture": tag.f_number}
-        said = []
-        for name in _NUMBERS:
-            value, wanted = values.get(name, tag.focal_length_mm), plan.get(name)
-            target = None if wanted is None else _number(wanted)
-            if target is not None and value is None:
-                said.append(f"{_TITLES[name]} unknown, not {wanted} as planned")
-            elif target is not None and value is not None and not _near(name, value, target):
-                said.append(f"{_shown(name, value)}, not {wanted} as planned")
-            elif target is None and value is not None and (was := self._changed(name, value, tag.index)):
+        said = [*self.against(tag)]
+        for name, (value, target) in _compared(tag, self._plan()).items():
+            if target is None and value is not None and (was := self._changed(name, value, tag.index)):
                 said.append(was)
         if not said:
             return None
@@ -178,6 +170,10 @@ class BodyPlan:
         return self._drift
 
     # what others ask
+
+    def against(self, tag: Tag) -> tuple[str, ...]:
+        """See `against_plan`; nothing where the plan isn't checked. Any thread may ask."""
+        return () if self._check == "off" else against_plan(tag, self._plan())
 
     def report(self) -> BodyReport | None:
         """The body against the plan, now; None while no camera is ready."""
@@ -238,7 +234,28 @@ class BodyPlan:
         return f"{_shown(name, value)}; frame {before[1]} with {_shown(name, before[0])}"
 
 
-def _planned(planned: PlannedBody, capture_target: str) -> dict[SettingName, str]:
+def against_plan(tag: Tag, plan: Mapping[SettingName, str]) -> tuple[str, ...]:
+    """What a frame was taken with instead of the planned exposure and focal length, in words; nothing of what the plan
+    leaves open."""
+    said = []
+    for name, (value, target) in _compared(tag, plan).items():
+        if target is not None and value is None:
+            said.append(f"{_TITLES[name]} unknown, not {plan[name]} as planned")
+        elif target is not None and value is not None and not _near(name, value, target):
+            said.append(f"{_shown(name, value)}, not {plan[name]} as planned")
+    return tuple(said)
+
+
+def _compared(tag: Tag, plan: Mapping[SettingName, str]) -> dict[SettingName, tuple[float | None, float | None]]:
+    """A frame's numbers, and the planned ones; None for unknown, and for what is not planned."""
+    values = (tag.iso, tag.exposure_s, tag.f_number, tag.focal_length_mm)
+    return {
+        name: (value, _number(plan[name]) if name in plan else None)
+        for name, value in zip(_NUMBERS, values, strict=True)
+    }
+
+
+def plan_of(planned: PlannedBody, capture_target: str = "") -> dict[SettingName, str]:
     """The plan by the names of the driver's settings, without those that may have any value."""
     focal = f"{planned.focal_length_mm:g} mm" if planned.focal_length_mm else ""
     every: dict[SettingName, str] = {

@@ -13,7 +13,8 @@ from dappled.decode.geometry import Pose
 
 
 class LiveSurvey:
-    """The SurveyFacts of a live flight. The height is the rangefinder's, or else that above the take-off place."""
+    """The SurveyFacts of a live flight. The height is the rangefinder's or the terrain's, or else that above the
+    take-off place."""
 
     def __init__(self, navigation: Navigation, camera: ReportedCamera, shots: PendingShots) -> None:
         self._navigation, self._camera, self._shots = navigation, camera, shots
@@ -24,10 +25,10 @@ class LiveSurvey:
 
     def height(self) -> Height | None:
         """See SurveyFacts."""
-        measured = self._navigation.rangefinder.range()
-        if measured is not None:
-            return Height(measured.metres, "rangefinder")
-        above_m = self._navigation.pose_now().height_above_home_m
+        pose = self._navigation.pose_now()
+        if pose.ground is not None:
+            return Height(pose.ground.metres, pose.ground.source)
+        above_m = pose.height_above_home_m
         return None if above_m is None else Height(above_m, "above the take-off place")
 
     def field(self) -> tuple[float, float] | None:

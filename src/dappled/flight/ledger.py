@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
 from dappled.clock import Clock
-from dappled.decode.geometry import Gnss, Pose
+from dappled.decode.geometry import Gnss, GroundHeight, Pose
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column, canonical, digest
 from dappled.flight.errors import FlightError, ledger_error
@@ -484,8 +484,9 @@ def _anything(value: Any) -> Any:
 def _pose(value: dict[str, Any]) -> Pose:
     """A record of `poses`. Raises TypeError for anything else."""
     made: dict[str, Any] = {key: tuple(item) for key, item in value.items() if isinstance(item, list)}
-    if value.get("gnss") is not None:
-        made["gnss"] = Gnss(**value["gnss"])
+    for name, kind in (("gnss", Gnss), ("ground", GroundHeight)):
+        if value.get(name) is not None:
+            made[name] = kind(**value[name])
     return Pose(**{**value, **made})
 
 

@@ -25,7 +25,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.errors import DappledError
-from dappled.mocks.autopilot.autopilot import Autopilot
+from dappled.mocks.autopilot.autopilot import Autopilot, BootTime
 from dappled.mocks.autopilot.ground_station import GroundStation
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.scene.masked_camera import MaskedCamera, eos450d_camera, eos450d_f_number, reference_camera
@@ -38,7 +38,8 @@ class World:
     """What is simulated. `scale` is the sensor's side as a share of the reference camera's 2776 × 3688 px; `f_number`
     0 opens the lens, None stops it down until carriers show; `truth`, for tests, is a folder for the true values.
     `real`: with a round stop, a film printed 0.3 % too fine, and ground whose detail does not end with a slice's band.
-    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in software in the loop."""
+    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in software in the loop.
+    `ground_m`: the vehicle has a rangefinder, over ground so high above the take-off place."""
 
     seed: int = 1
     scale: float = 0.5
@@ -46,6 +47,7 @@ class World:
     truth: Path | None = None
     autopilot: bool = True
     real: bool = False
+    ground_m: float | None = None
 
 
 class SimulationError(DappledError):
@@ -122,9 +124,7 @@ class Simulation:
             )
             stack.callback(body.stop)
             if world.autopilot:
-                self._autopilot = Autopilot.start(
-                    self.autopilot_url, seed=world.seed, start_monotonic_ns=self.start_monotonic_ns
-                )
+                self._autopilot = self._start_autopilot()
                 stack.callback(self._stop_autopilot)
             self._stack = stack.pop_all()
         given = self._settings
@@ -168,11 +168,16 @@ class Simulation:
     def reboot_autopilot(self) -> None:
         """Restart the autopilot: its time since boot starts again, and the flight goes on."""
         self._autopilot.stop()
-        self._autopilot = Autopilot.start(
+        self._autopilot = self._start_autopilot(-(time.monotonic_ns() - self.start_monotonic_ns) / 1e9)
+
+    def _start_autopilot(self, booted_s: float = BootTime().offset_s) -> Autopilot:
+        ground = () if self.world.ground_m is None else (f"--ground={self.world.ground_m}",)
+        return Autopilot.start(
             self.autopilot_url,
             seed=self.world.seed,
             start_monotonic_ns=self.start_monotonic_ns,
-            booted_s=-(time.monotonic_ns() - self.start_monotonic_ns) / 1e9,
+            booted_s=booted_s,
+            more=ground,
         )
 
     def _stop_autopilot(self) -> None:

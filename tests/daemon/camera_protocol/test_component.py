@@ -329,7 +329,7 @@ def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulte
     rig.hear(mavlink.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3), AUTOPILOT)
     first = rig.tick(1.3)
     assert first.count("HEARTBEAT") == 1
-    assert first.count("COMMAND_LONG") == 5
+    assert first.count("COMMAND_LONG") == 7
     seen = [kind for _ in range(100) for kind in rig.tick(0.02)]
     assert seen.count("HEARTBEAT") == 2
     assert seen.count("TIMESYNC") == 10

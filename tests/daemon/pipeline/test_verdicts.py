@@ -12,6 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 from dappled.config.profiles import VerdictBounds
+from dappled.config.settings import PlannedBody
+from dappled.daemon.body_plan import against_plan, plan_of
 from dappled.daemon.health.record import DecodingState
 from dappled.daemon.pipeline.verdicts import (
     FrameFacts,
@@ -24,13 +26,31 @@ from dappled.daemon.pipeline.verdicts import (
     noise_of,
     verdict,
 )
-from dappled.decode.geometry import FrameGeometry, Gnss, Pose, from_euler, image_motion, turned
+from dappled.decode.geometry import FrameGeometry, Gnss, GroundHeight, Pose, from_euler, image_motion, turned
 from dappled.flight import Tag
 from tests.daemon.fakes import no_pose
 
 NADIR = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 BOUNDS = VerdictBounds()
-GOOD = FrameFacts(1.5, 0.2, "", 60.0, 0.0, 0.0, 0.2, 0.1, "", 24, 24, (), "interpolated", 1.0, 3)
+GOOD = FrameFacts(
+    blur_px=1.5,
+    blur_view_px=0.2,
+    blur_unknown="",
+    height_m=60.0,
+    height_source="above the take-off place",
+    clipped_share=0.0,
+    black_share=0.0,
+    mean_share=0.2,
+    defocus_view_px=0.1,
+    focus_unknown="",
+    carriers_found=24,
+    carriers_predicted=24,
+    doubts=(),
+    off_plan=(),
+    pose_source="interpolated",
+    position_sigma_m=1.0,
+    gnss_fix=3,
+)
 SHARP = (0.59, 1.0, 1.7)  # power that falls as f^-2, over 1, 2 and 4 pixels
 SEEN = PictureFacts(0.0, 0.0, 0.2, (SHARP, SHARP), 0.0, (20.0, 30.0), (0.05, 0.05), (0.01, 0.01))
 GNSS = Gnss(3, 12, 0.8, 1.2, 1.0, 1.5, 0.2, 100.0)
@@ -75,6 +95,7 @@ def judged(pose: Pose, *, exposure_s: float | None = 1e-3, rates: tuple[float, f
         (replace(GOOD, defocus_view_px=2.0), "bad", "out of focus by 2.0"),
         (replace(GOOD, defocus_view_px=None), "unknown", "focus unknown"),
         (replace(GOOD, doubts=("no carriers seen",)), "usable", "no carriers seen"),
+        (replace(GOOD, off_plan=("ISO 400, not 100 as planned",)), "usable", "taken with ISO 400, not 100 as planned"),
         (replace(GOOD, carriers_found=8), "usable", "8 of 24 carriers seen where they are predicted"),
         (replace(GOOD, carriers_found=0), "usable", "0 of 24"),
         (replace(GOOD, carriers_found=None), "good", ""),
@@ -110,7 +131,7 @@ def test_bad_goes_before_unknown_and_unknown_before_usable() -> None:
         (flown(velocity_ned_m_s=None), 1e-3, (0, 0, 0), "no velocity"),
         (flown(attitude=None), 1e-3, (0, 0, 0), "no attitude"),
         (flown(height_above_home_m=None), 1e-3, (0, 0, 0), "no height"),
-        (flown(height_above_home_m=-2.0), 1e-3, (0, 0, 0), "height above the take-off place is -2.0 m"),
+        (flown(height_above_home_m=-2.0), 1e-3, (0, 0, 0), "the height is -2.0 m (above the take-off place)"),
         (flown(), 1e-3, None, "no turn rates"),
         (flown(source="nearest", age_ms=8500.0), 1e-3, (0, 0, 0), "8.5 s old"),
         (flown(), 1e-3, (math.nan, 0, 0), "not finite"),
@@ -130,6 +151,30 @@ def test_blur_is_speed_over_height_times_focal_length() -> None:
     assert facts is not None
     assert facts.blur_px == pytest.approx(10 * 0.01 / 100 * 50 / 0.01)  # 0.1 m on the ground, 0.05 mm on the chip
     assert facts.blur_view_px == pytest.approx(1.0)
+
+
+def test_the_height_above_the_ground_goes_before_that_above_the_take_off_place() -> None:
+    """Over a hill, and where the take-off place is higher than the ground that is looked at."""
+    for source in ("rangefinder", "terrain"):
+        over_a_hill = flown(ground=GroundHeight(25.0, 0.1, source, 20.0), height_above_home_m=-3.0)
+        found = judged(over_a_hill, exposure_s=0.01)
+        assert found.facts.blur_view_px == pytest.approx(4.0)
+        assert found.state == "bad"
+        assert f"over flat ground 25.0 m below (by {source})" in found.reasons[0]
+
+
+def test_a_frame_that_is_not_as_planned_is_only_usable() -> None:
+    plan = plan_of(PlannedBody(iso="100", shutter_speed="1/1000", focal_length_mm=35.0))
+    judge = Judge(NADIR, on_gimbal=False, off_plan=lambda frame: against_plan(frame, plan))
+    for _ in range(5):
+        found = judge.judge(tag(flown()), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
+    assert found.state == "usable"
+    assert found.reasons == ("taken with focal length 50 mm, not 35 mm as planned",)
+    late = judge.judge(tag(flown(), 1 / 60), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
+    assert any("shutter speed 1/60 s, not 1/1000 as planned" in one for one in late.reasons)
+    unread = judge.judge(tag(flown(), None), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
+    assert unread.state == "unknown"
+    assert any("shutter speed unknown, not 1/1000 as planned" in one for one in unread.reasons)
 
 
 def test_the_turn_that_keeps_the_axis_on_the_ground_is_nose_down_behind_and_has_a_sign() -> None:

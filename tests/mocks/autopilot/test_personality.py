@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+
 import pytest
 
 from dappled.daemon.camera_protocol.own_autopilot import TargetedTimesync
 from dappled.drivers.mavlink import MavlinkMessage, Packet, PacketParser, mavlink, pack
 from dappled.mocks.autopilot.autopilot import BootTime, Flyer
+from dappled.mocks.autopilot.on_request import OnRequest, distance
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 
@@ -70,8 +74,8 @@ def test_a_request_for_one_camera_of_two_triggers_that_one() -> None:
         assert targets == ([99 + camera] if camera else [100, 101])
 
 
-def flyer(sent: list[MavlinkMessage], **options: bool) -> Flyer:
-    return Flyer(FlightPath(1), 0, BootTime(), sent.append, **options)  # type: ignore[arg-type]  # its own options
+def flyer(sent: list[MavlinkMessage], has: OnRequest | None = None) -> Flyer:
+    return Flyer(FlightPath(1), 0, BootTime(), sent.append, has=has or OnRequest())
 
 
 def heard(message: MavlinkMessage) -> Packet:
@@ -81,18 +85,37 @@ def heard(message: MavlinkMessage) -> Packet:
     return Packet(0, 0, 0, received, raw)
 
 
-@pytest.mark.parametrize("gimbal", [True, False])
-def test_a_gimbals_attitude_is_sent_on_request_alone(gimbal: bool) -> None:
+@pytest.mark.parametrize(
+    ("has", "kind", "sends"),
+    [
+        (OnRequest(gimbal=True), "GIMBAL_DEVICE_ATTITUDE_STATUS", True),
+        (OnRequest(), "GIMBAL_DEVICE_ATTITUDE_STATUS", False),
+        (OnRequest(), "SYS_STATUS", True),
+        (OnRequest(ground_m=5.0), "DISTANCE_SENSOR", True),
+        (OnRequest(ground_m=5.0), "TERRAIN_REPORT", True),
+        (OnRequest(), "DISTANCE_SENSOR", False),
+        (OnRequest(), "TERRAIN_REPORT", False),
+    ],
+)
+def test_what_a_vehicle_has_is_sent_on_request_alone(has: OnRequest, kind: str, sends: bool) -> None:
     sent: list[MavlinkMessage] = []
-    vehicle = flyer(sent, gimbal=gimbal)
-    kind, number = "GIMBAL_DEVICE_ATTITUDE_STATUS", mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
+    vehicle = flyer(sent, has)
+    number = getattr(mavlink, f"MAVLINK_MSG_ID_{kind}")
     vehicle.step(10**9)
     assert kind not in {m.get_type() for m in sent}
     vehicle.on_packet(heard(mavlink.MAVLink_command_long_message(1, 1, 511, 0, number, 50_000, 0, 0, 0, 0, 0)))
     vehicle.step(2 * 10**9)
-    assert (kind in {m.get_type() for m in sent}) == gimbal
-    accepted = mavlink.MAV_RESULT_ACCEPTED if gimbal else mavlink.MAV_RESULT_UNSUPPORTED
+    assert (kind in {m.get_type() for m in sent}) == sends
+    accepted = mavlink.MAV_RESULT_ACCEPTED if sends else mavlink.MAV_RESULT_UNSUPPORTED
     assert [m.result for m in sent if m.get_type() == "COMMAND_ACK"] == [accepted]
+
+
+def test_a_rangefinder_measures_along_its_beam_and_ends_at_its_reach() -> None:
+    level = FlightPath(1).pose(10.0)
+    turn = math.radians(25)
+    tilted = replace(level, attitude=(math.cos(turn / 2), math.sin(turn / 2), 0.0, 0.0))
+    assert distance(20.0, tilted, 10**9).current_distance == round(2000 / math.cos(turn))
+    assert distance(80.0, tilted, 10**9).current_distance == distance(80.0, tilted, 10**9).max_distance
 
 
 @pytest.mark.parametrize(("system", "answered"), [(1, True), (0, True), (2, False)])

@@ -30,7 +30,7 @@ from dappled.daemon.navigation.clocks import (
     unseen,
 )
 from dappled.daemon.navigation.doubts import doubts
-from dappled.daemon.navigation.rangefinder import Rangefinder
+from dappled.daemon.navigation.ground_height import ground_height
 from dappled.daemon.navigation.samples import (
     HALF_MS_NS,
     Around,
@@ -40,7 +40,7 @@ from dappled.daemon.navigation.samples import (
     TelemetryStatistics,
     UtcCorrection,
 )
-from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
+from dappled.daemon.navigation.vehicle_history import SINCE_RULES, TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
     Pose,
@@ -109,7 +109,7 @@ class Telemetry:
                     )
             self._packets = number + 1
             kind = message.get_type()
-            if kind not in USED_MESSAGES or (kind == "ODOMETRY" and self._rules < 3):
+            if kind not in USED_MESSAGES or self._rules < SINCE_RULES.get(kind, 1):
                 return
             self._history.feed(number, stamp_us * 1000, message)
             if number >= self._prune_at:  # by packets that the flight used as well
@@ -274,7 +274,7 @@ class Navigation:
     def __init__(self, settings: LiveSettings, clock: Clock, recording: Recording, *, utc_known: bool) -> None:
         now = settings.now
         self._settings, self._clock, self._recording = settings, clock, recording
-        self._never, self.rangefinder = threading.Event(), Rangefinder(clock)
+        self._never = threading.Event()
         self.telemetry = Telemetry(
             component_id=now.mavlink.component_id,
             cam_idx=now.mavlink.cam_idx,
@@ -291,8 +291,6 @@ class Navigation:
         """Take a packet, received or sent. One outside the telemetry log is ignored: a replay wouldn't have it."""
         if packet.number is not None:
             self.telemetry.feed(packet.number, packet.stamp_us, packet.message)
-            if packet.message.get_type() == "DISTANCE_SENSOR":
-                self.rangefinder.heard(packet, self._vehicles[-1][1] if self._vehicles else None)
 
     def belongs_to(self, system_id: int | None) -> None:
         """Follow the system that the camera belongs to now; None while that is undecided.
@@ -353,6 +351,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         gimbal_attitude=gimbal,
         gimbal_source=gimbal_source,
         attitude_covariance_rad2=attitude_covariance,
+        ground=ground_height(at.ground, at.utc_ns, attitude, None) if at.ground else None,
     )
     if not at.positions:
         return made
@@ -382,6 +381,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
         vertical_sigma_m=None if upright_m is None else math.hypot(upright_m, down * blur_s, upright_doubt_m),
         position_covariance_m2=covariance,
         age_ms=age_s * 1e3,
+        ground=ground_height(at.ground, at.utc_ns, attitude, down) if at.ground else None,
     )
 
 

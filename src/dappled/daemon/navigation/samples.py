@@ -98,6 +98,17 @@ class GnssSample:
 
 
 @dataclass(frozen=True, slots=True)
+class GroundSample:
+    """One DISTANCE_SENSOR (along the beam) or TERRAIN_REPORT; the height is None where the sensor doesn't know it."""
+
+    number: int
+    stamp_ns: int
+    source: str
+    height_m: float | None
+    sigma_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class GimbalSample:
     """One GIMBAL_DEVICE_ATTITUDE_STATUS or MOUNT_ORIENTATION: the head against the horizon.
 
@@ -215,7 +226,7 @@ class Epoch:
 @dataclass(frozen=True, slots=True)
 class Around:
     """The samples around an instant: of position, attitude and gimbal two, the nearest one, or none; of the receiver
-    the nearest one.
+    the nearest one; of the height above ground all.
 
     `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
     `placed`: False where the clock stepped so near to it that the samples may be from before or after it. `jumps`: all
@@ -232,6 +243,7 @@ class Around:
     gimbal_boot_ns: int = 0
     placed: bool = True
     jumps: Sequence[Jump] = ()
+    ground: Sequence[GroundSample] = ()
 
 
 def boot_ns(message: MavlinkMessage) -> int:
@@ -349,10 +361,13 @@ def gimbal(number: int, stamp_ns: int, message: MavlinkMessage, epoch: int = 0) 
 def next_gimbal(
     before: GimbalSample | None, number: int, stamp_ns: int, message: MavlinkMessage
 ) -> GimbalSample | None:
-    """A gimbal's attitude that follows `before`; None for one that isn't valid, another gimbal's or a late copy.
+    """A gimbal's attitude that follows `before`; None for one that isn't valid, isn't a gimbal's, another's or a late
+    copy.
 
     MOUNT_ORIENTATION counts until the gimbal sends the modern message; an older time is that of one that restarted.
     """
+    if message.get_srcComponent() not in GIMBAL_COMPONENTS:
+        return None
     sample = gimbal(number, stamp_ns, message, before.epoch if before else 0)
     if sample is None or before is None:
         return sample

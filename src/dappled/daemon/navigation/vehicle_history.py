@@ -9,6 +9,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Any
 
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.clocks import (
@@ -20,6 +21,7 @@ from dappled.daemon.navigation.clocks import (
     from_timesync,
     step_ns,
 )
+from dappled.daemon.navigation.ground_height import ground_sample
 from dappled.daemon.navigation.jumps import JumpFinder
 from dappled.daemon.navigation.samples import (
     NEAREST_NS,
@@ -30,6 +32,7 @@ from dappled.daemon.navigation.samples import (
     Feedback,
     GimbalSample,
     GnssSample,
+    GroundSample,
     Jump,
     N,
     PositionSample,
@@ -44,16 +47,13 @@ from dappled.drivers.mavlink import MavlinkMessage
 POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
 TIMESYNC_WINDOW_NS, ARRIVAL_WINDOW_NS = 120 * 10**9, 60 * 10**9
 REBOOT_BACK_NS, REBOOT_CONFIRM_NS = 2 * 10**9, 500_000_000
-_ALIVE_NS = 5 * 10**9
-_REQUESTS_KEPT = 64
+_REQUESTS_KEPT = _REPEATS = 64
 _UNSTEADY_NS = 10 * 10**9  # two steps within this time: the clock does not run steadily
-_FEW = 3
-_ANSWERS_COME_NS = 10**9
+_ALIVE_NS, _ANSWERS_COME_NS = 5 * 10**9, 10**9
 _SILENT_NS = 10 * 10**9  # an autopilot that has answered within this time shows its steps by its answers
 _LOOKED_AT = 64  # answers: more than come in the ten seconds that `step_ns` looks back
-_REPEATS = 64
 _MOST_BOOT_NS = 2**62  # differences of such times fit 64 bits
-_AUTOPILOT = 1
+_FEW, _AUTOPILOT = 3, 1
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the epoch's first packet, the last packets
 
 
@@ -83,9 +83,7 @@ def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[
     if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
         return sides
     nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS:
-        return ()
-    return (nearest,)
+    return () if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS else (nearest,)
 
 
 class AutopilotTime:
@@ -282,8 +280,6 @@ class Gimbals:
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """Take a packet of the vehicle's system."""
-        if message.get_srcComponent() not in telemetry_samples.GIMBAL_COMPONENTS:
-            return
         sample = telemetry_samples.next_gimbal(self._samples[-1] if self._samples else None, number, stamp_ns, message)
         if sample is not None:
             self.seen += 1
@@ -336,7 +332,10 @@ class VehicleHistory:
         self._finder, self._jumps = JumpFinder(), list[Jump]()
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
+        self._ground: list[GroundSample] = []
         self._feedbacks: list[Feedback] = []
+        self._histories: tuple[list[Any], ...] = (self._positions, self._jumps, self._attitudes, self._receiver,
+                                                  self._ground, self._feedbacks)  # fmt: skip
         self._attitude_sigma: tuple[float | None, int] = (None, 0)  # as the autopilot told it, and when
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
@@ -345,11 +344,8 @@ class VehicleHistory:
 
     def prune(self, before_ns: int) -> None:
         """Forget what came before."""
-        prune(self._positions, before_ns)
-        prune(self._jumps, before_ns)
-        prune(self._attitudes, before_ns)
-        prune(self._receiver, before_ns)
-        prune(self._feedbacks, before_ns)
+        for history in self._histories:
+            prune(history, before_ns)
         self.gimbals.prune(before_ns)
         self.time.prune(before_ns)
 
@@ -373,10 +369,7 @@ class VehicleHistory:
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
         first, limit = self.time.span(limit, utc_ns)
-        receiver = between(self._receiver, first, limit)
-        nearest = min(receiver, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None)
-        if nearest is not None and abs(nearest.stamp_ns - utc_ns) > NEAREST_NS:
-            nearest = None
+        heard = [one for one in between(self._receiver, first, limit) if abs(one.stamp_ns - utc_ns) <= NEAREST_NS]
         gimbals, gimbal_boot_ns = self.gimbals.around(utc_ns, boot_ns, first, limit)
         return Around(
             utc_ns,
@@ -384,11 +377,12 @@ class VehicleHistory:
             sigma_ns,
             around_instant(between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
             around_instant(between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
-            nearest,
+            min(heard, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None),
             gimbals,
             gimbal_boot_ns,
             placed,
             between(self._jumps, first, limit),
+            between(self._ground, first, limit),
         )
 
     def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
@@ -413,12 +407,16 @@ class VehicleHistory:
             keep(self._attitudes, sample)
 
     def _odometry(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        if self._rules > 2 and self._ours(message):
+        if self._ours(message):
             self._attitude_sigma = telemetry_samples.attitude_sigma_rad(message), stamp_ns
 
     def _gnss(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
             keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
+
+    def _height(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
+        if self._ours(message) and (sample := ground_sample(number, stamp_ns, message)):
+            keep(self._ground, sample)
 
     def _gimbal(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if message.get_srcSystem() == self.system_id:
@@ -489,6 +487,8 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "ATTITUDE": VehicleHistory._attitude,
     "ODOMETRY": VehicleHistory._odometry,
     "GPS_RAW_INT": VehicleHistory._gnss,
+    "DISTANCE_SENSOR": VehicleHistory._height,
+    "TERRAIN_REPORT": VehicleHistory._height,
     "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleHistory._gimbal,
     "MOUNT_ORIENTATION": VehicleHistory._gimbal,
     "TIMESYNC": VehicleHistory._timesync,
@@ -497,3 +497,4 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)
+SINCE_RULES = {"ODOMETRY": 3, "DISTANCE_SENSOR": 6, "TERRAIN_REPORT": 6}  # others: since the first

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from typing import Any, Literal
@@ -68,15 +68,16 @@ class FrameFacts:
     """What a verdict is given by; None is unknown.
 
     Blur is how far still ground moved over the sensor during the exposure where it moved most, in pixels of the frame
-    and of a view; the ground counts as flat, `height_m` below: at the take-off's height. `blur_unknown` says why it
+    and of a view; the ground counts as flat, `height_m` below, as `height_source` has it. `blur_unknown` says why it
     isn't known, `focus_unknown` why `defocus_view_px` isn't: the diameter of the circle that a point is drawn as,
-    beyond that of the flight's sharpest frames.
+    beyond that of the flight's sharpest frames. `off_plan` is what exposure and lens are instead of the planned ones.
     """
 
     blur_px: float | None
     blur_view_px: float | None
     blur_unknown: str
     height_m: float | None
+    height_source: str
     clipped_share: float
     black_share: float
     mean_share: float
@@ -85,6 +86,7 @@ class FrameFacts:
     carriers_found: int | None
     carriers_predicted: int
     doubts: tuple[str, ...]
+    off_plan: tuple[str, ...]
     pose_source: str
     position_sigma_m: float | None
     gnss_fix: int | None
@@ -130,7 +132,7 @@ def _motion(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
     if blur is None or sensor is None:
         return [("unknown", f"motion blur unknown: {facts.blur_unknown}")]
     state = _worse(blur, bounds.blur_usable_px, bounds.blur_bad_px)
-    over = "over flat ground at the take-off's height"
+    over = f"over flat ground {facts.height_m or 0:.1f} m below ({facts.height_source})"
     return [(state, f"motion blur {blur:.1f} view pixels ({sensor:.1f} on the sensor) {over}")] if state else []
 
 
@@ -140,6 +142,8 @@ def _exposure(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
         found.append((state, f"{facts.clipped_share:.1%} of the pixels are clipped"))
     if not facts.mean_share >= bounds.mean_least:
         found.append(("bad", f"too dark: {facts.mean_share:.1%} of white on average"))
+    if facts.off_plan:
+        found.append(("usable", f"taken with {'; '.join(facts.off_plan)}"))
     if facts.black_share > bounds.black_usable:
         found.append(("usable", f"{facts.black_share:.0%} of the pixels are black"))
     return found
@@ -208,10 +212,13 @@ class Judge:
     """Judges the frames of one flight, in the order of their decoding, and keeps what later ones are compared with.
 
     `mount` leads from camera axes to body axes; with `on_gimbal` it leads to the gimbal's, whose turn no message gives.
+    `off_plan` says what a frame was taken with instead of what was planned.
     """
 
-    def __init__(self, mount: Sequence[float], *, on_gimbal: bool) -> None:
-        self._mount, self._on_gimbal = tuple(mount), on_gimbal
+    def __init__(
+        self, mount: Sequence[float], *, on_gimbal: bool, off_plan: Callable[[Tag], Sequence[str]] = lambda _: ()
+    ) -> None:
+        self._mount, self._on_gimbal, self._off_plan = tuple(mount), on_gimbal, off_plan
         self._sharpest: dict[LensSettings, deque[float]] = {}
         self._states: Counter[VerdictState] = Counter()
         self._newest = -1
@@ -233,13 +240,15 @@ class Judge:
             return Verdict("unknown", ("the decoder said nothing about its pixels",))
         blur, blur_unknown = self._blur(tag, rates, seen)
         circle, focus_unknown = self._defocus((tag.focal_length_mm, tag.f_number), seen)
+        height_m, height_source = _height(tag.pose)
         gnss = tag.pose.gnss
         fresh = gnss is not None and gnss.age_ms <= _SILENT_MS
         facts = FrameFacts(
             blur_px=blur and _pixels(blur, seen.pixel_mm),
             blur_view_px=blur and _pixels(blur, seen.view_mm),
             blur_unknown=blur_unknown,
-            height_m=tag.pose.height_above_home_m,
+            height_m=height_m,
+            height_source=height_source,
             clipped_share=seen.clipped_share,
             black_share=seen.black_share,
             mean_share=seen.mean_share,
@@ -248,6 +257,7 @@ class Judge:
             carriers_found=carriers[0],
             carriers_predicted=carriers[1],
             doubts=tuple(doubts),
+            off_plan=tuple(self._off_plan(tag)),
             pose_source=tag.pose.source,
             position_sigma_m=tag.pose.position_sigma_m,
             gnss_fix=gnss.fix_type if gnss is not None and fresh else None,
@@ -307,16 +317,14 @@ class Judge:
             (pose.source != "interpolated", f"the telemetry is {(pose.age_ms or 0) / 1e3:.1f} s old"),
             (self._on_gimbal, "the camera is on a gimbal, whose turn rate is not reported"),
             (rates is None, "the telemetry has no turn rates, or too few (10 a second are needed)"),
-            (pose.height_above_home_m is None, "the telemetry has no height"),
+            (_height(pose)[0] is None, "the telemetry has no height"),
         ]
         if why := next((text for is_so, text in missing if is_so), None):
             return None, why
-        assert pose.height_above_home_m is not None
-        if not pose.height_above_home_m >= _LOW_M:
-            return (
-                None,
-                f"the height above the take-off place is {pose.height_above_home_m:.1f} m, too little to be known",
-            )
+        height_m, source = _height(pose)
+        assert height_m is not None
+        if not height_m >= (_LOW_M if pose.ground is None else 0.0):
+            return None, f"the height is {height_m:.1f} m ({source}), too little to be known"
         assert tag.exposure_s is not None
         assert tag.focal_length_mm is not None
         assert seen.side_mm is not None
@@ -324,13 +332,20 @@ class Judge:
         assert pose.attitude is not None
         assert pose.velocity_ned_m_s is not None
         assert rates is not None
-        camera = FrameGeometry(self._mount, tag.focal_length_mm, seen.side_mm, seen.view_mm, pose.height_above_home_m)
+        camera = FrameGeometry(self._mount, tag.focal_length_mm, seen.side_mm, seen.view_mm, height_m)
         moving = image_motion(camera, pose.attitude, pose.velocity_ned_m_s, rates)
         if moving is None:
             return None, "the camera sees no ground"
         if not all(map(math.isfinite, (*pose.velocity_ned_m_s, *rates, *moving))):
             return None, "the telemetry's numbers are not finite"
         return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), ""
+
+
+def _height(pose: Pose) -> tuple[float | None, str]:
+    """Above the ground, in metres, and by what."""
+    if pose.ground is not None:
+        return pose.ground.metres, f"by {pose.ground.source}"
+    return pose.height_above_home_m, "above the take-off place"
 
 
 def _moved(before: LensSettings, now: LensSettings) -> str:

@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from dappled.config.settings import PublishSettings, Settings
+from dappled.daemon.body_plan import against_plan, plan_of
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.decode_process import DecodeProcess
@@ -53,6 +54,7 @@ def run(
     without `publish` nothing is published. Raises ReplayError, DecodeError, WireError, KeyFileError.
     """
     time = replay.clock(recording)
+    plan = {} if flown.settings.body.check == "off" else plan_of(flown.settings.body)
     with ExitStack() as stack:
         decoder = None
         if recipe is not None:
@@ -85,7 +87,11 @@ def run(
             names=flown.names,
             observer=progress,
             decode_queue=_DECODE_QUEUE,
-            judge=Judge(flown.settings.pose.mount, on_gimbal=flown.settings.pose.on_gimbal),
+            judge=Judge(
+                flown.settings.pose.mount,
+                on_gimbal=flown.settings.pose.on_gimbal,
+                off_plan=lambda tag: against_plan(tag, plan),
+            ),
         )
         pipeline.start()
         stack.callback(pipeline.stop, _STOP_S)

@@ -6,6 +6,7 @@
 from dappled.decode.geometry.pose import (
     FrameGeometry,
     Gnss,
+    GroundHeight,
     Pose,
     Quaternion,
     Symmetric,
@@ -30,7 +31,7 @@ from dappled.decode.geometry.pose import (
 )
 
 __all__ = [
-    "FrameGeometry", "Gnss", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "displacement", "from_euler",
-    "hermite", "hermite_doubt", "image_motion", "metres_per_radian", "multiply", "norm", "normalised",
+    "FrameGeometry", "Gnss", "GroundHeight", "Pose", "Quaternion", "Symmetric", "Vector3", "conjugate", "displacement",
+    "from_euler", "hermite", "hermite_doubt", "image_motion", "metres_per_radian", "multiply", "norm", "normalised",
     "rotation_vector", "slerp", "slerp_doubt", "turn_rad", "turn_rates", "turned", "turned_by_heading",
 ]  # fmt: skip

@@ -34,6 +34,20 @@ class Gnss:
 
 
 @dataclass(frozen=True, slots=True)
+class GroundHeight:
+    """The vehicle's height above the ground straight below it, as it was reported `age_ms` before or after the pose.
+
+    `source`: "rangefinder" (its distance along the beam, by the cosine of the vehicle's tilt) or "terrain" (the
+    autopilot's, above terrain that it knows). `sigma_m` is None where the sensor doesn't tell its accuracy.
+    """
+
+    metres: float
+    sigma_m: float | None
+    source: str
+    age_ms: float
+
+
+@dataclass(frozen=True, slots=True)
 class Pose:
     """Position and attitude of the vehicle at mid-exposure, and how well each is known.
 
@@ -43,8 +57,9 @@ class Pose:
     that of a GNSS mark after PPK). `age_ms` is the time from mid-exposure to the nearest position sample.
     `telemetry_packets` is how many packets of telemetry.tlog were used: a replay stops there too. `gimbal_attitude` is
     that of a gimbal's head (forward, right, down) to north-east-down, where one reports it; `gimbal_source` names its
-    message. Covariances: the position's in north-east-down, the attitude's in body axes (forward, right, down); an
-    uncertain time adds to them along the motion.
+    message. `ground` is the height above the ground below, where something measures it. Covariances: the position's in
+    north-east-down, the attitude's in body axes (forward, right, down); an uncertain time adds to them along the
+    motion.
     """
 
     source: Literal["interpolated", "nearest", "none", "mark"]
@@ -66,6 +81,7 @@ class Pose:
     gimbal_source: str | None = None
     position_covariance_m2: Symmetric | None = None
     attitude_covariance_rad2: Symmetric | None = None
+    ground: GroundHeight | None = None
 
     @classmethod
     def unknown(cls, utc_ns: int, packets: int) -> Pose:

@@ -22,6 +22,7 @@ from pathlib import Path
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
+from dappled.mocks.autopilot.on_request import OnRequest
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.autopilot.personality import PERSONALITIES, CameraPort, CameraTriggers
 from dappled.workers import Loop
@@ -34,9 +35,6 @@ RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
-_GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
-_BATTERY = mavlink.MAVLINK_MSG_ID_SYS_STATUS
-_CELLS, _DRAIN_S = 6, 20.0  # of a lithium polymer battery; a percent each so many seconds
 _FASTEST_HZ = 100.0
 _LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
 
@@ -101,24 +99,6 @@ def heartbeat(*, armed: bool, personality: str = "ardupilot") -> MavlinkMessage:
     return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, make, mode, 3, state, 3)
 
 
-def _gimbal_ahead(boot_ns: int) -> MavlinkMessage:
-    """A gimbal's attitude: level, looking ahead, turning with the vehicle."""
-    flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
-    level = [1.0, 0.0, 0.0, 0.0]
-    return mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, boot_ns // 10**6, flags, level, 0, 0, 0, 0)
-
-
-def battery_status(percent: int) -> MavlinkMessage:
-    """SYS_STATUS: what is left in the battery. Below a tenth the autopilot calls it not healthy, as ArduPilot
-    does by its failsafe."""
-    watched = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-    voltage_mv = _CELLS * (3300 + 9 * percent)
-    health = watched if percent >= 10 else 0
-    return mavlink.MAVLink_sys_status_message(
-        watched, watched, health, 300, voltage_mv, 1800, percent, 0, 0, 0, 0, 0, 0
-    )
-
-
 def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, MavlinkMessage]]:
     """All telemetry of a stretch of flight, (simulation time, message) in order, without a link."""
     events = sorted(
@@ -172,9 +152,8 @@ class Flyer:
     """The running autopilot: sends what is due, answers TIMESYNC and message interval requests, delays telemetry.
 
     `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras. `relay` sends
-    what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `gimbal`: it has one, and
-    sends its attitude on request alone; so it does with its battery, which has `battery_percent` at the flight's
-    beginning. It is armed from `arms_s` after the flight's beginning on.
+    what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `has` is what it sends
+    on request alone. It is armed from `arms_s` after the flight's beginning on.
     """
 
     path: FlightPath
@@ -185,9 +164,8 @@ class Flyer:
     system_id: int = 1
     cameras: CameraTriggers | None = None
     relay: Callable[[Forwarded, int], object] | None = None
-    gimbal: bool = False
+    has: OnRequest = field(default_factory=OnRequest)
     arms_s: float = 0.0
-    battery_percent: float = 96.0
     due_ns: dict[int, int] = field(default_factory=dict)
     interval_ns: dict[int, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -216,13 +194,11 @@ class Flyer:
             if pose is None:
                 pose = self.path.pose((now_ns - self.start_monotonic_ns) / 1e9)
             boot_ns = self.boot_ns(now_ns)
-            if number == _GIMBAL:
-                message = _gimbal_ahead(boot_ns)
-            elif number == _BATTERY:
-                used = (now_ns - self.start_monotonic_ns) / 1e9 / _DRAIN_S
-                message = battery_status(max(0, round(self.battery_percent - used)))
+            flown_s = (now_ns - self.start_monotonic_ns) / 1e9
+            if self.has.has(number):
+                message = self.has.message(number, pose, boot_ns, flown_s)
             elif number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-                armed = now_ns - self.start_monotonic_ns >= self.arms_s * 1e9
+                armed = flown_s >= self.arms_s
                 message = heartbeat(
                     armed=armed, personality="ardupilot" if self.cameras is None else self.cameras.personality
                 )
@@ -278,7 +254,7 @@ class Flyer:
         return system in (0, self.system_id) and component in (0, 1)
 
     def _set_interval(self, number: float, interval_us: float) -> int:
-        if number not in RATES_HZ and number != _BATTERY and not (self.gimbal and number == _GIMBAL):
+        if number not in RATES_HZ and not self.has.has(number):
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
         if not (math.isfinite(interval_us) and interval_us > 0):
             return int(mavlink.MAV_RESULT_DENIED)
@@ -383,6 +359,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--arms", type=float, default=0.0, help="seconds from the flight's beginning until it is armed")
     parser.add_argument("--battery", type=float, default=96.0, help="percent left at the flight's beginning")
     parser.add_argument("--gimbal", action="store_true", help="it has a gimbal, and sends its attitude on request")
+    parser.add_argument("--ground", type=float, help="ground above the take-off place, m, for a rangefinder")
     parser.add_argument("--forward", action="store_true", help="forward between its ports, as ArduPilot does")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
@@ -391,7 +368,7 @@ def main(arguments: list[str] | None = None) -> int:
     boot = BootTime(wanted.booted, wanted.drift, tuple(wanted.jump))
     cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
     flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
-    flyer.gimbal, flyer.arms_s, flyer.battery_percent = wanted.gimbal, wanted.arms, wanted.battery
+    flyer.has, flyer.arms_s = OnRequest(wanted.gimbal, wanted.battery, wanted.ground), wanted.arms
     if wanted.forward:
         flyer.relay = PortRelay(len(wanted.url), links.sender.send)
     try:
