@@ -10,7 +10,16 @@ from typing import Any
 
 from dappled.clock import Clock
 from dappled.config.settings import PlannedBody
-from dappled.drivers.camera import BodySettings, CameraError, Setting, SettingName, SettingsChanged, StateChanged
+from dappled.daemon.pipeline.verdicts import ExposurePlan, off_plan, taken_with
+from dappled.drivers.camera import (
+    EXPOSURES,
+    BodySettings,
+    CameraError,
+    Setting,
+    SettingName,
+    SettingsChanged,
+    StateChanged,
+)
 from dappled.errors import counted
 from dappled.flight import Tag
 
@@ -48,10 +57,6 @@ _BY_HAND: Mapping[SettingName, str] = {
     "mirror_lockup": "set it in the body's menu (custom functions)",
     "focal_length": "turn the zoom ring",
 }
-_NUMBERS: tuple[SettingName, ...] = ("iso", "shutter_speed", "aperture", "focal_length")
-_SAME: Mapping[SettingName, float] = {"iso": 0.12, "shutter_speed": 0.12, "aperture": 0.06, "focal_length": 0.01}
-"""Relative difference up to which numbers are equal: less than a third of a stop, and more than files round by."""
-_UNITS: Mapping[SettingName, str] = {"shutter_speed": " s", "focal_length": " mm"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,12 +108,15 @@ class BodyPlan:
     and the camera: what a person sets there is the plan from then on.
 
     A body is set once each time it is opened, never between shots: what a hand turns later is reported, not set back.
+    `exposure` is what frames are compared with now, nothing where the plan isn't checked; any thread may read it.
     """
 
     def __init__(self, planned: PlannedBody, capture_target: str, body: BodySettings, clock: Clock) -> None:
         self._check, self._body, self._clock = planned.check, body, clock
         self._planned = plan_of(planned, capture_target)
         self._requested: dict[SettingName, str] = {}
+        self.exposure: ExposurePlan = {}
+        self._replan()
         self._found: tuple[Setting, ...] = ()
         self._may_set, self._ready = True, False
         self._manual = planned.exposure_mode == "manual"
@@ -125,6 +133,7 @@ class BodyPlan:
         """See BodySettings: a person's request, which is the plan from now on unless the body refuses it."""
         self._body.change(name, value)
         self._requested = {**self._requested, name: value}
+        self._replan()
 
     # what the camera reports
 
@@ -151,6 +160,7 @@ class BodyPlan:
         if change.refused:
             now = {one.name: one.value for one in change.settings}
             self._requested = {k: v for k, v in self._requested.items() if k not in now or _is(k, v, now[k])}
+            self._replan()
         if self._check == "set" and self._may_set and self._found:
             self._may_set = False
             self._set()
@@ -160,9 +170,9 @@ class BodyPlan:
         sentence where they differ."""
         if self._check == "off":
             return None
-        said = [*self.against(tag)]
-        for name, (value, target) in _compared(tag, self._plan()).items():
-            if target is None and value is not None and (was := self._changed(name, value, tag.index)):
+        said = [*off_plan(tag, self.exposure)]
+        for name, value in taken_with(tag).items():
+            if name not in self.exposure and value is not None and (was := self._changed(name, value, tag.index)):
                 said.append(was)
         if not said:
             return None
@@ -170,10 +180,6 @@ class BodyPlan:
         return self._drift
 
     # what others ask
-
-    def against(self, tag: Tag) -> tuple[str, ...]:
-        """See `against_plan`; nothing where the plan isn't checked. Any thread may ask."""
-        return () if self._check == "off" else against_plan(tag, self._plan())
 
     def report(self) -> BodyReport | None:
         """The body against the plan, now; None while no camera is ready."""
@@ -202,6 +208,9 @@ class BodyPlan:
             battery_low=low,
         )
 
+    def _replan(self) -> None:
+        self.exposure = {} if self._check == "off" else exposure_of(self._plan())
+
     def _plan(self) -> dict[SettingName, str]:
         return self._planned | {name: value for name, value in self._requested.items() if name in _TITLES}
 
@@ -229,30 +238,15 @@ class BodyPlan:
         if before is not None and index < before[1]:
             return ""  # a file that comes late
         self._last[name] = value, index
-        if before is None or _near(name, value, before[0]):
+        if before is None or EXPOSURES[name].is_same(value, before[0]):
             return ""
-        return f"{_shown(name, value)}; frame {before[1]} with {_shown(name, before[0])}"
+        return f"{EXPOSURES[name].words(value)}; frame {before[1]} with {EXPOSURES[name].words(before[0])}"
 
 
-def against_plan(tag: Tag, plan: Mapping[SettingName, str]) -> tuple[str, ...]:
-    """What a frame was taken with instead of the planned exposure and focal length, in words; nothing of what the plan
-    leaves open."""
-    said = []
-    for name, (value, target) in _compared(tag, plan).items():
-        if target is not None and value is None:
-            said.append(f"{_TITLES[name]} unknown, not {plan[name]} as planned")
-        elif target is not None and value is not None and not _near(name, value, target):
-            said.append(f"{_shown(name, value)}, not {plan[name]} as planned")
-    return tuple(said)
-
-
-def _compared(tag: Tag, plan: Mapping[SettingName, str]) -> dict[SettingName, tuple[float | None, float | None]]:
-    """A frame's numbers, and the planned ones; None for unknown, and for what is not planned."""
-    values = (tag.iso, tag.exposure_s, tag.f_number, tag.focal_length_mm)
-    return {
-        name: (value, _number(plan[name]) if name in plan else None)
-        for name, value in zip(_NUMBERS, values, strict=True)
-    }
+def exposure_of(plan: Mapping[SettingName, str]) -> ExposurePlan:
+    """The numbers of a plan that a frame's EXIF is compared with."""
+    numbers = {name: (plan[name], _number(plan[name])) for name in EXPOSURES if name in plan}
+    return {name: (wanted, number) for name, (wanted, number) in numbers.items() if number is not None}
 
 
 def plan_of(planned: PlannedBody, capture_target: str = "") -> dict[SettingName, str]:
@@ -282,9 +276,9 @@ def _is(name: SettingName, wanted: str, value: str) -> bool:
         return re.search(r"\b(c?raw|nef|raf|dng|arw|orf)\b", other) is not None
     if name == "capture_target" and one in ("card", "ram"):
         return one in other
-    numbers = (_number(one), _number(other)) if name in _NUMBERS else (None, None)
+    numbers = (_number(one), _number(other)) if name in EXPOSURES else (None, None)
     if numbers[0] is not None and numbers[1] is not None:
-        return _near(name, numbers[1], numbers[0])
+        return EXPOSURES[name].is_same(numbers[1], numbers[0])
     return other in _WORDS.get((name, one), (one,))
 
 
@@ -300,15 +294,6 @@ def _number(text: str) -> float | None:
         return None
     below = float(found[2] or 1)
     return float(found[1]) / below if below else None
-
-
-def _near(name: SettingName, value: float, target: float) -> bool:
-    return abs(value - target) <= _SAME[name] * target
-
-
-def _shown(name: SettingName, value: float) -> str:
-    short = f"1/{1 / value:.0f}" if name == "shutter_speed" and 0 < value < 0.4 else f"{value:g}"
-    return f"{_TITLES[name]} {short}{_UNITS.get(name, '')}"
 
 
 def _card_frames(now: Mapping[SettingName, str]) -> int | None:

@@ -244,7 +244,7 @@ class Service:
             names=names,
             observer=self._events,
             decode_queue=settings.decode.queue,
-            judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal, off_plan=self._body.against),
+            judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal, plan=self._body),
             preview_interval_s=settings.publish.preview_interval_s,
         )
         self._answers = Answers(writer, self._decoder, shots)

@@ -157,6 +157,33 @@ class Setting:
 
 
 @dataclass(frozen=True, slots=True)
+class ExposureNumber:
+    """A setting that is a number: what people call it, its unit, and the relative difference up to which two are the
+    same: less than a third of a stop, and more than files round by."""
+
+    title: str
+    unit: str
+    same: float
+
+    def is_same(self, value: float, target: float) -> bool:
+        """Whether two are equal, but for rounding."""
+        return abs(value - target) <= self.same * target
+
+    def words(self, value: float) -> str:
+        """With title and unit."""
+        short = f"1/{1 / value:.0f}" if self.unit == "s" and 0 < value < 0.4 else f"{value:g}"
+        return f"{self.title} {short} {self.unit}".rstrip()
+
+
+EXPOSURES: Mapping[SettingName, ExposureNumber] = {
+    "iso": ExposureNumber("ISO", "", 0.12),
+    "shutter_speed": ExposureNumber("shutter speed", "s", 0.12),
+    "aperture": ExposureNumber("aperture", "", 0.06),
+    "focal_length": ExposureNumber("focal length", "mm", 0.01),
+}
+
+
+@dataclass(frozen=True, slots=True)
 class SettingsChanged:
     """All settings of the camera that can be read, as they are now. `refused` is a sentence where a change was
     requested and the camera refused it."""

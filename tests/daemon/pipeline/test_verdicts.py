@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from dappled.config.profiles import VerdictBounds
 from dappled.config.settings import PlannedBody
-from dappled.daemon.body_plan import against_plan, plan_of
+from dappled.daemon.body_plan import exposure_of, plan_of
 from dappled.daemon.health.record import DecodingState
 from dappled.daemon.pipeline.verdicts import (
+    FixedPlan,
     FrameFacts,
     Judge,
     PictureFacts,
@@ -164,8 +165,8 @@ def test_the_height_above_the_ground_goes_before_that_above_the_take_off_place()
 
 
 def test_a_frame_that_is_not_as_planned_is_only_usable() -> None:
-    plan = plan_of(PlannedBody(iso="100", shutter_speed="1/1000", focal_length_mm=35.0))
-    judge = Judge(NADIR, on_gimbal=False, off_plan=lambda frame: against_plan(frame, plan))
+    plan = exposure_of(plan_of(PlannedBody(iso="100", shutter_speed="1/1000", focal_length_mm=35.0)))
+    judge = Judge(NADIR, on_gimbal=False, plan=FixedPlan(plan))
     for _ in range(5):
         found = judge.judge(tag(flown()), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
     assert found.state == "usable"

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
+from dappled.drivers.camera import EXPOSURES, SettingName
 from dappled.errors import counted
 from dappled.flight import Tag
 
@@ -32,6 +33,22 @@ _LAPSED_NS = 60 * 10**9
 _SAME = 0.01  # lens settings that differ by less are equal, but for rounding
 _STEPS = (1, 2, 4)  # pixels
 DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}
+
+
+ExposurePlan = Mapping[SettingName, tuple[str, float]]  # what is planned, as it is written, and as a number
+
+
+class HasExposurePlan(Protocol):
+    """What frames are to be taken with; it may change from frame to frame."""
+
+    exposure: ExposurePlan
+
+
+@dataclass(slots=True)
+class FixedPlan:
+    """One that does not change."""
+
+    exposure: ExposurePlan = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,13 +229,11 @@ class Judge:
     """Judges the frames of one flight, in the order of their decoding, and keeps what later ones are compared with.
 
     `mount` leads from camera axes to body axes; with `on_gimbal` it leads to the gimbal's, whose turn no message gives.
-    `off_plan` says what a frame was taken with instead of what was planned.
+    `plan` is what exposure and lens are compared with.
     """
 
-    def __init__(
-        self, mount: Sequence[float], *, on_gimbal: bool, off_plan: Callable[[Tag], Sequence[str]] = lambda _: ()
-    ) -> None:
-        self._mount, self._on_gimbal, self._off_plan = tuple(mount), on_gimbal, off_plan
+    def __init__(self, mount: Sequence[float], *, on_gimbal: bool, plan: HasExposurePlan | None = None) -> None:
+        self._mount, self._on_gimbal, self._plan = tuple(mount), on_gimbal, plan or FixedPlan()
         self._sharpest: dict[LensSettings, deque[float]] = {}
         self._states: Counter[VerdictState] = Counter()
         self._newest = -1
@@ -257,7 +272,7 @@ class Judge:
             carriers_found=carriers[0],
             carriers_predicted=carriers[1],
             doubts=tuple(doubts),
-            off_plan=tuple(self._off_plan(tag)),
+            off_plan=off_plan(tag, self._plan.exposure),
             pose_source=tag.pose.source,
             position_sigma_m=tag.pose.position_sigma_m,
             gnss_fix=gnss.fix_type if gnss is not None and fresh else None,
@@ -339,6 +354,29 @@ class Judge:
         if not all(map(math.isfinite, (*pose.velocity_ned_m_s, *rates, *moving))):
             return None, "the telemetry's numbers are not finite"
         return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), ""
+
+
+def taken_with(tag: Tag) -> dict[SettingName, float | None]:
+    """The numbers of a frame's exposure; None for unknown."""
+    return {
+        "iso": tag.iso,
+        "shutter_speed": tag.exposure_s,
+        "aperture": tag.f_number,
+        "focal_length": tag.focal_length_mm,
+    }
+
+
+def off_plan(tag: Tag, plan: ExposurePlan) -> tuple[str, ...]:
+    """What a frame was taken with instead of the planned exposure and focal length, in words; nothing of what the plan
+    leaves open."""
+    said = []
+    values = taken_with(tag)
+    for name, (wanted, target) in plan.items():
+        one, value = EXPOSURES[name], values[name]
+        if value is None or not one.is_same(value, target):
+            taken = f"{one.title} unknown" if value is None else one.words(value)
+            said.append(f"{taken}, not {wanted} as planned")
+    return tuple(said)
 
 
 def _height(pose: Pose) -> tuple[float | None, str]:

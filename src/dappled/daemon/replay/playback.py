@@ -7,13 +7,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 from dappled.config.settings import PublishSettings, Settings
-from dappled.daemon.body_plan import against_plan, plan_of
+from dappled.daemon.body_plan import exposure_of, plan_of
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.pipeline.verdicts import Judge
+from dappled.daemon.pipeline.verdicts import FixedPlan, Judge
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import Pace, RecordedFlight, RecordedTelemetry, ReplayProgress
 from dappled.daemon.replay.verifier import ReplayVerifier
@@ -54,7 +54,8 @@ def run(
     without `publish` nothing is published. Raises ReplayError, DecodeError, WireError, KeyFileError.
     """
     time = replay.clock(recording)
-    plan = {} if flown.settings.body.check == "off" else plan_of(flown.settings.body)
+    body = flown.settings.body
+    plan = FixedPlan({} if body.check == "off" else exposure_of(plan_of(body)))
     with ExitStack() as stack:
         decoder = None
         if recipe is not None:
@@ -90,7 +91,7 @@ def run(
             judge=Judge(
                 flown.settings.pose.mount,
                 on_gimbal=flown.settings.pose.on_gimbal,
-                off_plan=lambda tag: against_plan(tag, plan),
+                plan=plan,
             ),
         )
         pipeline.start()
