@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import sys
+import threading
 from pathlib import Path
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; before NumPy is loaded
@@ -32,3 +34,21 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no test data at {folder} (set DAPPLED_DATA)")
     return folder
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """End the process although a test that failed has left a thread behind: the interpreter would wait for it for ever,
+    and so would whoever waits for the tests."""
+    left = [one.name for one in threading.enumerate() if one is not threading.main_thread() and not one.daemon]
+    if left and not hasattr(config, "workerinput"):
+        print(f"left behind by tests: the threads {', '.join(left)}", file=sys.stderr, flush=True)  # noqa: T201
+        sys.stdout.flush()
+        os._exit(_ended.get("status", 1) or 1)
+
+
+_ended: dict[str, int] = {}
+
+
+def pytest_sessionfinish(exitstatus: int) -> None:
+    """Keep how the tests ended, for `pytest_unconfigure`."""
+    _ended["status"] = int(exitstatus)

@@ -81,9 +81,9 @@ def flown(
         pytest.fail("".join(said))
     reader = threading.Thread(target=said.extend, args=[process.stderr])
     reader.start()
-    yield Daemon(said[-1].split()[1], folder / "flights", process, said)
-    process.send_signal(signal.SIGTERM)
     try:
+        yield Daemon(said[-1].split()[1], folder / "flights", process, said)
+        process.send_signal(signal.SIGTERM)
         assert process.wait(20) in (code, -signal.SIGKILL), "".join(said)
     finally:
         process.kill()

@@ -18,11 +18,11 @@ from dappled.cli import main
 from dappled.clock import SystemClock
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.decode.geometry import Gnss, from_euler
+from dappled.decode.geometry import area as areas
+from dappled.decode.geometry.area import AreaError, PlannedArea
 from dappled.drivers.camera import Blob
 from dappled.flight import Cause, Frame, Result, Shot, Tag, recording
-from dappled.products.maps import area as areas
 from dappled.products.maps import coverage, refly
-from dappled.products.maps.area import AreaError, PlannedArea
 from dappled.products.maps.coverage import Coverage, FramesSeen
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.ground import Flat, Raster
