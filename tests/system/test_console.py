@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import json
 import os
 import re
 import shutil
@@ -412,6 +413,30 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
     page.screenshot(path=SCREENSHOTS / f"long-reason-{width}x{height}.png")
     assert after == before, "a reason of many words moves a button from under a finger"
     assert watched.wrong == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
+def test_the_map_shows_the_planned_area_and_what_of_it_was_not_seen(
+    chromium: Browser, tmp_path: Path, sockets: Path, width: int, height: int
+) -> None:
+    metre = 1 / 111_319.49
+    ring = [[-91.5417 + 1.34 * metre * x, 41.6361 + metre * y] for x, y in ((-40, -40), (40, -40), (40, 40), (-40, 40))]
+    area = {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
+    (tmp_path / "field.geojson").write_text(json.dumps(area))
+    phone = width < 500
+    with flown(tmp_path, sockets, settings='area = "field.geojson"\n', simulate=True) as daemon:
+        watched = opened(chromium, daemon, {"width": width, "height": height}, is_mobile=phone, has_touch=phone)
+        page = watched.page
+        assert re.search(r"area seen\s*0 % by 0 frames", page.inner_text("#instruments"))
+        frame = shoot(page)
+        until(page, f"document.querySelector('#which').textContent === 'frame {frame}'")
+        until(page, r"/[1-9][0-9.]* % by 1 frame/.test(document.querySelector('#instruments').innerText)")
+        page.locator("#map").scroll_into_view_if_needed()
+        page.wait_for_timeout(500)  # the picture of the holes
+        SCREENSHOTS.mkdir(parents=True, exist_ok=True)
+        page.screenshot(path=SCREENSHOTS / f"area-{width}x{height}.png")
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert watched.wrong == []
 
 
 def test_live_view_before_a_shot_and_off_while_shooting(chromium: Browser, tmp_path: Path, sockets: Path) -> None:

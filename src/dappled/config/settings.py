@@ -252,6 +252,7 @@ class ConsoleSettings:
     token: str = setting("", "File with the token that a console off loopback requires, made by dappled keys token")
     hosts: tuple[str, ...] = setting((), "Further host names under which browsers may open the console")
     map: str = setting("", "Map behind the track: PNG or JPEG with a world file in degrees beside it; empty: a grid")
+    area: str = setting("", "Planned area: GeoJSON, KML or a QGroundControl .plan; the map then shows its holes")
 
 
 @dataclass(frozen=True, slots=True)
@@ -368,7 +369,10 @@ def resolve(settings: Settings, beside: Path | None = None) -> Settings:
             publish, slices=slices, ask=ask, keys=path(publish.keys), clients=path(publish.clients)
         ),
         console=dataclasses.replace(
-            settings.console, token=path(settings.console.token), map=path(settings.console.map)
+            settings.console,
+            token=path(settings.console.token),
+            map=path(settings.console.map),
+            area=path(settings.console.area),
         ),
     )
 

@@ -10,15 +10,17 @@ from typing import Any
 
 from dappled.clock import Clock
 from dappled.config.settings import PlannedBody
-from dappled.daemon.pipeline.verdicts import ExposurePlan, off_plan, taken_with
 from dappled.drivers.camera import (
     EXPOSURES,
     BodySettings,
     CameraError,
+    ExposurePlan,
     Setting,
     SettingName,
     SettingsChanged,
     StateChanged,
+    off_plan,
+    taken_with,
 )
 from dappled.errors import counted
 from dappled.flight import Tag

@@ -18,6 +18,7 @@ from dappled.config.settings import TABLES, Settings, SettingsFile
 from dappled.daemon.console import placement
 from dappled.daemon.console import process as console_process
 from dappled.daemon.stream import curve, sockets
+from dappled.decode.geometry import area
 from dappled.drivers.gnss.port import address as gnss_address
 from dappled.drivers.mavlink import LinkError, parse, read_key
 from dappled.drivers.raw import calibration_files, reading
@@ -222,6 +223,11 @@ def _map(settings: Settings) -> None:
         placement.load_background(Path(settings.console.map))
 
 
+def _area(settings: Settings) -> None:
+    if settings.console.area:
+        area.read(Path(settings.console.area))
+
+
 RULES: tuple[SettingsRule, ...] = (
     SettingsRule(
         "camera.driver",
@@ -249,4 +255,5 @@ RULES: tuple[SettingsRule, ...] = (
     ),
     SettingsRule("console.bind", _console, ("console.token",), secrets=lambda settings: (settings.console.token,)),
     SettingsRule("console.map", _map, may_come=True),
+    SettingsRule("console.area", _area, may_come=True),
 )

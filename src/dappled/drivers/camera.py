@@ -183,6 +183,47 @@ EXPOSURES: Mapping[SettingName, ExposureNumber] = {
 }
 
 
+ExposurePlan = Mapping[SettingName, tuple[str, float]]  # what is planned, as it is written, and as a number
+
+
+class Exposed(Protocol):
+    """A frame, by its file."""
+
+    @property
+    def iso(self) -> float | None: ...
+
+    @property
+    def exposure_s(self) -> float | None: ...
+
+    @property
+    def f_number(self) -> float | None: ...
+
+    @property
+    def focal_length_mm(self) -> float | None: ...
+
+
+def taken_with(frame: Exposed) -> dict[SettingName, float | None]:
+    """The numbers of a frame's exposure; None for unknown."""
+    return {
+        "iso": frame.iso,
+        "shutter_speed": frame.exposure_s,
+        "aperture": frame.f_number,
+        "focal_length": frame.focal_length_mm,
+    }
+
+
+def off_plan(frame: Exposed, plan: ExposurePlan) -> tuple[str, ...]:
+    """What a frame was taken with instead of the planned exposure and focal length, in words; nothing of what the plan
+    leaves open."""
+    said, values = [], taken_with(frame)
+    for name, (wanted, target) in plan.items():
+        one, value = EXPOSURES[name], values[name]
+        if value is None or not one.is_same(value, target):
+            taken = f"{one.title} unknown" if value is None else one.words(value)
+            said.append(f"{taken}, not {wanted} as planned")
+    return tuple(said)
+
+
 @dataclass(frozen=True, slots=True)
 class SettingsChanged:
     """All settings of the camera that can be read, as they are now. `refused` is a sentence where a change was

@@ -23,11 +23,13 @@ from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
 from dappled.daemon.console.feed import Feed, Hub
 from dappled.daemon.console.process import DaemonChannel
+from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher, Reply
 from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
+from dappled.decode.geometry.area import PlannedArea
 from dappled.drivers.child_process import ChannelError, ProcessChannel
 from tests import globe
 
@@ -193,6 +195,31 @@ def test_a_wish_goes_to_the_daemon_with_its_number(rig: Rig) -> None:
         {"do": "stop interval", **clock},
         {"do": "set", "sequence": 9, "name": "CAM_ISO", "value": "200", **clock},
     ]
+
+
+def test_frames_close_the_holes_of_the_planned_area_and_a_bad_one_opens_them_again(rig: Rig) -> None:
+    half = 2 / 111_000  # degrees; the frame sees some ten metres
+    square = tuple((41.6 + half * y, -91.5 + half * x) for y, x in ((-1, -1), (-1, 1), (1, 1), (1, -1)))
+    rig.feed.hub.globe_asked()  # a viewer
+    with rig.client() as client:
+        assert client.get("/api/holes.png").status_code == 404
+        rig.feed.area = ground = SeenGround(PlannedArea("field", ((square,),)))
+        before = client.get("/api/holes.png").content
+        seen(rig, 0)
+
+        def decoded() -> bool:
+            rig.publisher.publish("slices", *slices(0))
+            threading.Event().wait(0.02)
+            return ground.share == 1.0
+
+        eventually(decoded, "the area is seen")
+        judged = {"last": [{"frame": 0, "state": "bad", "reasons": ["motion blur"]}]}
+        decode = {"mask": "m", "calibration": "c", "running": True, "judged": judged}
+        rig.publisher.publish("health", {**HEALTH, "decode": decode})
+        eventually(lambda: rig.feed.frames[0].verdict is not None, "the verdict")
+        assert client.get("/api/state").json()["area"] == {"share": 0.0, "frames": 0, "version": 2}
+        assert client.get("/api/holes.png").content == before
+        assert rig.feed.frames[0].corners is not None
 
 
 def test_a_refusal_comes_with_its_sentence(rig: Rig) -> None:

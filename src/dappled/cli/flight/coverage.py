@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from dappled.cli.arguments import refuse_existing
+from dappled.decode.geometry import area as areas
 from dappled.errors import DappledError, counted, printable
-from dappled.products.maps import area as areas
 from dappled.products.maps import coverage, coverage_files, refly
 
 

@@ -22,9 +22,11 @@ from dappled.daemon.console.app import ConsoleApp
 from dappled.daemon.console.connection import BACKLOG, CONNECTIONS, Connection
 from dappled.daemon.console.feed import Feed, Hub
 from dappled.daemon.console.process import DaemonChannel
+from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import systemd
 from dappled.daemon.stream.subscriber import reuse_large_blocks
+from dappled.decode.geometry import area
 from dappled.drivers.child_process import CONSOLE_GOES, ProcessChannel, goes_first
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
@@ -53,7 +55,7 @@ def main() -> int:
 async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
     recipe = setup["recipe"]
     studio = Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
-    feed = Feed(setup["endpoint"], setup["ask"], Hub(), studio, run=setup["run"])
+    feed = Feed(setup["endpoint"], setup["ask"], Hub(), studio, run=setup["run"], area=_area(setup["area"]))
     daemon = DaemonChannel(channel)
     rules = Access(setup["token"], setup["hosts"])
     app = ConsoleApp(feed, studio, daemon, rules, _background(setup["map"]))
@@ -122,6 +124,16 @@ def _background(file: str) -> placement.Background | None:
         return None
     try:
         return placement.load_background(Path(file))
+    except DappledError as error:
+        log.warning("%s", error)
+        return None
+
+
+def _area(file: str) -> SeenGround | None:
+    if not file:
+        return None
+    try:
+        return SeenGround(area.read(Path(file)))
     except DappledError as error:
         log.warning("%s", error)
         return None

@@ -67,6 +67,7 @@ class ConsoleApp:
             Route("/api/live", self._live, methods=["POST"]),
             Route("/api/frames/{frame}/{name}", self._frame_picture),
             Route("/api/map", self._map),
+            Route("/api/holes.png", self._holes),
             Route("/metrics", self._metrics),
             Route("/kml", self._kml_link),
             Route("/kml/latest.kml", self._kml_latest),
@@ -134,6 +135,7 @@ class ConsoleApp:
             "start": self._feed.start,
             "recording": self._feed.recording,
             "map": None if self._background is None else self._background.bounds(),
+            "area": None if self._feed.area is None else self._feed.area.outline(),
             "path": list(self._feed.path),
         }
 
@@ -220,6 +222,11 @@ class ConsoleApp:
         if self._background is None:
             raise FeedError("no map is configured in console.map")
         return FileResponse(self._background.file, headers={"cache-control": "private, max-age=3600"})
+
+    async def _holes(self, _: Request) -> Response:
+        if self._feed.area is None:
+            raise FeedError("no area is configured in console.area")
+        return Response(self._feed.area.holes_png(), media_type="image/png", headers={"cache-control": "no-store"})
 
     async def _make(self, function: Callable[..., Any], *arguments: Any) -> Any:
         return await asyncio.get_running_loop().run_in_executor(self._pictures, function, *arguments)

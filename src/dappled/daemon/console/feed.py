@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.daemon.console.requests import token
+from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import go_no_go
 from dappled.daemon.stream import wire
@@ -122,7 +123,7 @@ class Hub:
 
 class Feed:
     """Keeps the stream's messages, and tells `hub` of each. `studio` makes small pictures and footprints for the map;
-    `run` names the daemon that requests are for, see `requests.token`.
+    `run` names the daemon that requests are for, see `requests.token`; `area` is the planned one, if any.
 
     All calls on one event loop.
     """
@@ -137,9 +138,10 @@ class Feed:
         studio: Studio,
         *,
         run: str = "",
+        area: SeenGround | None = None,
     ) -> None:
         self.hub = hub
-        self._endpoints, self._studio, self._run = (endpoint, ask), studio, run
+        self._endpoints, self._studio, self._run, self.area = (endpoint, ask), studio, run, area
         self.health: dict[str, Any] | None = None
         self.start: dict[str, Any] | None = None
         self.frames: OrderedDict[int, FeedState] = OrderedDict()
@@ -203,6 +205,7 @@ class Feed:
             "checks": [{"name": one.name, "state": one.state, "text": one.text} for one in checks],
             "verdict": go_no_go.verdict(checks),
             "frames_left": go_no_go.frames_left(health),
+            "area": None if self.area is None else self.area.facts(),
             "token": self._token(),
         }
 
@@ -260,6 +263,7 @@ class Feed:
             seen = self.frames.get(one["frame"])
             if seen is not None and seen.verdict is None:
                 seen.verdict = {"state": one["state"], "reasons": one["reasons"]}
+                self._count(one["frame"], seen)
                 self.hub.send(self.frame_event(one["frame"]))
 
     def _add_to_path(self, vehicle: dict[str, Any] | None) -> None:
@@ -274,10 +278,17 @@ class Feed:
 
     def _frame(self, header: dict[str, Any]) -> None:
         index = header["frame"]
-        self.frames[index] = FeedState(header, corners=self._studio.corners(header))
+        seen = self.frames[index] = FeedState(header, corners=self._studio.corners(header))
+        self._count(index, seen)
         while len(self.frames) > FRAMES:
             self.frames.popitem(last=False)
         self.hub.send(self.frame_event(index))
+
+    def _count(self, index: int, seen: FeedState) -> None:
+        """What a frame saw of the area, unless it is bad: as `flight coverage` counts."""
+        if self.area is not None:
+            is_bad = seen.verdict is not None and seen.verdict["state"] == "bad"
+            self.area.put(index, None if is_bad else seen.corners)
 
     def _slices(self, message: Message) -> None:
         index = message.header["frame"]
@@ -294,6 +305,7 @@ class Feed:
             seen.slices = _facts(message)
             seen.shape = message.header.get("frame_shape")
             seen.corners = self._studio.corners({**seen.tag, "frame_shape": seen.shape})
+            self._count(index, seen)
         self.hub.send(self.frame_event(index))
 
     def _depth(self, message: Message) -> None:

@@ -76,11 +76,14 @@ def load_background(file: Path) -> Background:
 def oriented_frame(
     pose: Mapping[str, Any], size_mm: tuple[float, float] | None, focal_length_mm: float | None, mount: Sequence[float]
 ) -> OrientedFrame | None:
-    """From the `pose` of a header; None where something is unknown. The ground is at the take-off point's height."""
-    needed = (pose["latitude_deg"], pose["longitude_deg"], pose.get("height_above_home_m"), pose["attitude"])
+    """From the `pose` of a header; None where something is unknown. The ground is level, as high as straight below
+    where that was measured, else as the take-off point."""
+    above_m = pose.get("height_above_ground_m")
+    above_m = pose.get("height_above_home_m") if above_m is None else above_m
+    needed = (pose["latitude_deg"], pose["longitude_deg"], above_m, pose["attitude"])
     if any(value is None for value in needed) or size_mm is None or not focal_length_mm:
         return None
-    height = float(pose["height_above_home_m"])
+    height = float(above_m or 0.0)
     if height <= 0.5:
         return None
     rotation = camera_pose.matrix_of(tuple(pose["attitude"])) @ np.asarray(mount, dtype=np.float64).reshape(3, 3)

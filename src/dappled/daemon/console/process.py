@@ -201,6 +201,7 @@ def start(
         "token": opened.token,
         "hosts": list(settings.console.hosts),
         "map": settings.console.map,
+        "area": settings.console.area,
         "endpoint": opened.private or publish.slices,
         "ask": f"{opened.private}.ask" if opened.private else publish.ask,
         "recipe": None if recipe is None else asdict(recipe),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
-from dappled.drivers.camera import EXPOSURES, SettingName
+from dappled.drivers.camera import ExposurePlan, off_plan
 from dappled.errors import counted
 from dappled.flight import Tag
 
@@ -33,9 +33,6 @@ _LAPSED_NS = 60 * 10**9
 _SAME = 0.01  # lens settings that differ by less are equal, but for rounding
 _STEPS = (1, 2, 4)  # pixels
 DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}
-
-
-ExposurePlan = Mapping[SettingName, tuple[str, float]]  # what is planned, as it is written, and as a number
 
 
 class HasExposurePlan(Protocol):
@@ -354,29 +351,6 @@ class Judge:
         if not all(map(math.isfinite, (*pose.velocity_ned_m_s, *rates, *moving))):
             return None, "the telemetry's numbers are not finite"
         return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), ""
-
-
-def taken_with(tag: Tag) -> dict[SettingName, float | None]:
-    """The numbers of a frame's exposure; None for unknown."""
-    return {
-        "iso": tag.iso,
-        "shutter_speed": tag.exposure_s,
-        "aperture": tag.f_number,
-        "focal_length": tag.focal_length_mm,
-    }
-
-
-def off_plan(tag: Tag, plan: ExposurePlan) -> tuple[str, ...]:
-    """What a frame was taken with instead of the planned exposure and focal length, in words; nothing of what the plan
-    leaves open."""
-    said = []
-    values = taken_with(tag)
-    for name, (wanted, target) in plan.items():
-        one, value = EXPOSURES[name], values[name]
-        if value is None or not one.is_same(value, target):
-            taken = f"{one.title} unknown" if value is None else one.words(value)
-            said.append(f"{taken}, not {wanted} as planned")
-    return tuple(said)
 
 
 def _height(pose: Pose) -> tuple[float | None, str]:

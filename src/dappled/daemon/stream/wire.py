@@ -176,6 +176,8 @@ def pose_face(tag: Tag) -> dict[str, Any]:
         "longitude_deg": degrees(pose.longitude_rad),
         "altitude_msl_m": pose.altitude_msl_m,
         "height_above_home_m": pose.height_above_home_m,
+        "height_above_ground_m": pose.ground.metres if pose.ground else None,
+        "ground_source": pose.ground.source if pose.ground else None,
         "velocity_ned_m_s": list(pose.velocity_ned_m_s) if pose.velocity_ned_m_s else None,
         "attitude": list(pose.attitude) if pose.attitude else None,
         "roll_deg": degrees(roll),

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from dappled.config import profiles
 from dappled.decode.array_types import Floats
+from dappled.decode.geometry.area import PlannedArea
 from dappled.decode.optics import Sensor
 from dappled.drivers.raw import reading
 from dappled.errors import DappledError
 from dappled.flight import LedgerReader, layout
 from dappled.products.maps import ground as grounds
-from dappled.products.maps.area import PlannedArea
 from dappled.products.maps.earth import EarthError, Projection, utm
 from dappled.products.maps.eye import Eye, EyeError, intrinsics, look
 from dappled.products.maps.ground import Flat, Ground

@@ -14,10 +14,10 @@ from PIL import Image, ImageDraw, ImageFont
 
 from dappled import durable
 from dappled.decode.array_types import Floats
+from dappled.decode.geometry.area import PlannedArea
 from dappled.errors import counted
 from dappled.products.extras import need
 from dappled.products.maps import cog
-from dappled.products.maps.area import PlannedArea
 from dappled.products.maps.coverage import Coverage
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.map_grid import unwrapped

@@ -17,7 +17,7 @@ let interval = null, lastChecks = null, wasStale = false, sending = false, stopp
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
 const handlers = {
-  about(event) { recording(event.recording); map.setBackground(event.map); map.setPath(event.path); if (event.start) began(event.start); },
+  about(event) { recording(event.recording); map.setBackground(event.map); map.setArea(event.area); map.setPath(event.path); if (event.start) began(event.start); },
   start(event) { began(event.start); },
   state(event) { token = event.token; tokenAt = performance.now(); if (event.health) showState(event); tick(); },
   frame: showFrame,
@@ -39,7 +39,7 @@ function recording(given) {
   for (const id of ["tab-live", "clock-box"]) $(id).hidden = isRecording;
 }
 
-function showState({ health, checks, verdict, frames_left: framesLeft = null }) {
+function showState({ health, checks, verdict, area = null, frames_left: framesLeft = null }) {
   heardAt = performance.now();
   utcAt = health.utc_ns;
   if (flight && health.flight && health.flight !== flight) location.reload();
@@ -51,7 +51,8 @@ function showState({ health, checks, verdict, frames_left: framesLeft = null }) 
   interval = health.interval ?? null;
   showInterval();
   map.setVehicle(health.vehicle);
-  showInstruments(health, framesLeft);
+  if (area) map.setHoles(area.version);
+  showInstruments(health, framesLeft, area);
   settings.show(health.settings ?? []);
   const place = health.vehicle;
   $("map-text").textContent = place
@@ -87,7 +88,7 @@ function showVerdict(verdict, checks) {
 }
 
 // What a photographer looks at, of the body as it is now; what is not known is "unknown", and never 0.
-function showInstruments(health, framesLeft) {
+function showInstruments(health, framesLeft, area) {
   const body = Object.fromEntries((health.settings ?? []).map((one) => [one.name, one.value]));
   const cell = (name, value, known = true) => element("div", { "data-known": String(known) }, element("dt", {}, name), element("dd", {}, known ? value : "unknown"));
   const of = (name, setting, text = (value) => value) => cell(name, body[setting] ? text(body[setting]) : "", Boolean(body[setting]));
@@ -100,6 +101,7 @@ function showInstruments(health, framesLeft) {
     cell("vehicle's battery", power ? powerWords(power) : "", Boolean(power) && (power.voltage_v ?? power.remaining_percent) !== null),
     cell("GNSS", fix ? fixWords(fix) : "", Boolean(fix)),
     cell("frames left", framesLeft === null ? "" : framesLeft.toLocaleString("en").replaceAll(",", "\u202f"), framesLeft !== null),
+    ...(area ? [cell("area seen", areaWords(area), area.share !== null)] : []),
     histogramCell(),
   );
 }
@@ -112,6 +114,11 @@ function fixWords({ fix_type: type, satellites }) {
 
 function powerWords({ voltage_v: volts, remaining_percent: percent, low }) {
   return [percent === null ? "" : `${percent} %`, volts === null ? "" : `${fixed(volts, 1)} V`, low ? "low" : ""].filter(Boolean).join(", ");
+}
+
+// Rounded down: 100 % has no hole.
+function areaWords({ share, frames: count }) {
+  return `${Math.floor(share * 1000) / 10} % by ${count} ${count === 1 ? "frame" : "frames"}`;
 }
 
 // The histogram of the frame that is shown, and how much of it is clipped.

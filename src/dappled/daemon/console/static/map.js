@@ -12,6 +12,7 @@ export class FieldMap {
     this.frames = new Map();  // index → {corners, image}
     this.selected = null;
     this.background = null;
+    this.area = null;         // planned: rings, bounds, and what no frame has seen yet
     this.following = true;
     this.centre = [0, 0];     // metres east, north
     this.scale = 4;           // CSS pixels per metre
@@ -63,10 +64,25 @@ export class FieldMap {
     image.src = "/api/map";
   }
 
+  setArea(area) {
+    if (!area || this.area) return;
+    this.area = { ...area, version: -1, holes: null };
+    this.redraw();
+  }
+
+  setHoles(version) {
+    if (!this.area || this.area.version === version) return;
+    this.area.version = version;
+    const image = new Image();
+    image.onload = () => { this.area.holes = image; this.redraw(); };
+    image.src = `/api/holes.png?v=${version}`;
+  }
+
   select(index) { this.selected = index; this.redraw(); }
 
   fit() {
-    const points = [...this.track, ...[...this.frames.values()].flatMap((frame) => frame.corners)].map((one) => this.place(one));
+    const planned = (this.area?.rings ?? []).flat().map(([lat, lon]) => [lon, lat]);
+    const points = [...this.track, ...[...this.frames.values()].flatMap((frame) => frame.corners), ...planned].map((one) => this.place(one));
     if (!points.length) return;
     const xs = points.map((p) => p[0]), ys = points.map((p) => p[1]);
     const [west, east, south, north] = [Math.min(...xs), Math.max(...xs), Math.min(...ys), Math.max(...ys)];
@@ -96,6 +112,7 @@ export class FieldMap {
     this.drawGrid(w, h, line, soft);
     const on = (point) => { const [x, y] = this.place(point); return [w / 2 + (x - this.centre[0]) * this.scale, h / 2 - (y - this.centre[1]) * this.scale]; };
     for (const frame of this.frames.values()) this.drawPicture(frame, on);
+    this.drawArea(on, link);
     for (const [index, frame] of this.frames) {
       pen.strokeStyle = index === this.selected ? link : soft;
       pen.lineWidth = index === this.selected ? 2.5 : 0.8;
@@ -119,6 +136,27 @@ export class FieldMap {
     const lons = frame.corners.map((c) => c[0]), lats = frame.corners.map((c) => c[1]);
     const [left, top] = on([Math.min(...lons), Math.max(...lats)]), [right, bottom] = on([Math.max(...lons), Math.min(...lats)]);
     this.pen.drawImage(frame.image, left, top, right - left, bottom - top);
+  }
+
+  drawArea(on, link) {
+    if (!this.area) return;
+    const { rings, bounds, holes } = this.area, pen = this.pen;
+    if (holes) {
+      const [left, top] = on([bounds.west, bounds.north]), [right, bottom] = on([bounds.east, bounds.south]);
+      pen.imageSmoothingEnabled = false;
+      pen.drawImage(holes, left, top, right - left, bottom - top);
+      pen.imageSmoothingEnabled = true;
+    }
+    pen.strokeStyle = link;
+    pen.lineWidth = 1.5;
+    pen.setLineDash([6, 4]);
+    for (const ring of rings) {
+      pen.beginPath();
+      ring.forEach(([lat, lon], i) => pen[i ? "lineTo" : "moveTo"](...on([lon, lat])));
+      pen.closePath();
+      pen.stroke();
+    }
+    pen.setLineDash([]);
   }
 
   drawBackground(w, h) {

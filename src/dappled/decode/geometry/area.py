@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 from xml.etree import ElementTree
 
 import numpy as np
@@ -16,11 +16,17 @@ from numpy.typing import NDArray
 from dappled.bounds import parsing
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, counted, sentence
-from dappled.products.maps.earth import Projection
 
 MOST_CORNERS = 2000
 _BAD = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, ElementTree.ParseError)
 Ring = tuple[tuple[float, float], ...]  # (latitude, longitude) in degrees, the first corner not repeated
+
+
+class MapProjection(Protocol):
+    """Whatever leads from degrees to metres on a map."""
+
+    def to_map(self, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
+        """East and north."""
 
 
 class AreaError(DappledError):
@@ -41,24 +47,28 @@ class PlannedArea:
         """Those of all polygons."""
         return tuple(ring for polygon in self.polygons for ring in polygon)
 
-    def on_map(self, projection: Projection) -> list[Floats]:
+    def on_map(self, projection: MapProjection) -> list[Floats]:
         """Each ring (n, 2), east and north on the map."""
         return [np.stack(projection.to_map(*np.array(ring).T), axis=1) for ring in self.rings]
 
-    def inside(self, projection: Projection, east: Floats, north: Floats) -> NDArray[np.bool_]:
+    def inside(self, projection: MapProjection, east: Floats, north: Floats) -> NDArray[np.bool_]:
         """Whether places of any shape on the map lie in the area."""
         found = np.zeros(np.shape(east), dtype=bool)
         rings = iter(self.on_map(projection))
         for polygon in self.polygons:
-            within = np.zeros_like(found)
-            for _ in polygon:
-                ring = next(rings)
-                for (x, y), (next_x, next_y) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-                    crosses = (y > north) != (next_y > north)
-                    if crosses.any():
-                        within ^= crosses & (east < x + (north - y) / (next_y - y) * (next_x - x))
-            found |= within
+            found |= within([next(rings) for _ in polygon], east, north)
         return found
+
+
+def within(rings: Sequence[Floats], east: Floats, north: Floats) -> NDArray[np.bool_]:
+    """Whether places of any shape lie in an odd number of rings, (n, 2) each, east and north."""
+    found = np.zeros(np.shape(east), dtype=bool)
+    for ring in rings:
+        for (x, y), (next_x, next_y) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            crosses = (y > north) != (next_y > north)
+            if crosses.any():
+                found ^= crosses & (east < x + (north - y) / (next_y - y) * (next_x - x))
+    return found
 
 
 def read(path: Path) -> PlannedArea:
