@@ -9,7 +9,7 @@ import pytest
 
 from dappled.clock import RecordedClock
 from dappled.config.settings import PlannedBody
-from dappled.daemon.body_plan import BodyPlan, BodyReport
+from dappled.daemon.body_plan import BodyPlan, BodyReport, BodyTemperature
 from dappled.daemon.health import go_no_go
 from dappled.drivers.camera import CameraError, Setting, SettingName, SettingsChanged, StateChanged, check_change
 from dappled.flight import Tag
@@ -83,6 +83,22 @@ def test_a_battery_that_will_not_last_is_told_and_is_a_caution_before_flight(wor
     rig.read()
     assert f"the camera's battery is nearly empty: {word.strip()}" in rig.report().problems()
     assert rig.check() == ("caution", f"its battery is nearly empty: {word.strip()}")
+
+
+def test_how_warm_the_body_is_is_told_and_is_a_caution_where_it_is_hot() -> None:
+    rig = Rig(Body())
+    rig.body.now = AS_PLANNED
+    rig.read()
+    assert rig.report().values()["temperature_c"] is None
+    rig.plan.take(BodyTemperature(24.0))
+    assert rig.report().values()["temperature_c"] == 24.0
+    assert rig.check()[0] == "go"
+    assert rig.check()[1].endswith(", 24 °C")
+    rig.plan.take(BodyTemperature(50.0))
+    assert rig.check() == ("caution", "it is 50 °C warm inside")
+    rig.plan.camera_changed(StateChanged("absent", "unplugged", 0))
+    rig.plan.take(StateChanged("ready", "", 0))
+    assert rig.report().temperature_c is None  # it may be another body
 
 
 @pytest.mark.parametrize(

@@ -62,12 +62,22 @@ _BY_HAND: Mapping[SettingName, str] = {
 
 
 @dataclass(frozen=True, slots=True)
+class BodyTemperature:
+    """How warm a body was inside when it took a frame, by the frame's file."""
+
+    degrees_c: float
+
+
+BodyNews = StateChanged | SettingsChanged | Tag | BodyTemperature
+
+
+@dataclass(frozen=True, slots=True)
 class BodyReport:
     """How the body stands to the plan. `wrong` are sentences; `unknown` are the titles of planned settings that the
     body doesn't report. `drift` says what the last frames were taken with instead; `card_frames` is the room on its
     card, None where it reports none or stores elsewhere. `battery` is its word for what its battery holds, "" where it
-    says nothing, `battery_percent` that as a number, where it is one. `read`: its settings were read; `checked`: they
-    are compared.
+    says nothing, `battery_percent` that as a number, where it is one; `temperature_c` is that of the last frame's file.
+    `read`: its settings were read; `checked`: they are compared.
     """
 
     read: bool
@@ -79,6 +89,7 @@ class BodyReport:
     battery: str
     battery_percent: int | None
     battery_low: bool
+    temperature_c: float | None
 
     def problems(self) -> list[str]:
         """What the pilot is told, a sentence each."""
@@ -102,6 +113,7 @@ class BodyReport:
             "battery": self.battery,
             "battery_percent": self.battery_percent,
             "battery_low": self.battery_low,
+            "temperature_c": self.temperature_c,
         }
 
 
@@ -124,6 +136,7 @@ class BodyPlan:
         self._manual = planned.exposure_mode == "manual"
         self._last: dict[SettingName, tuple[float, int]] = {}
         self._drift, self._drift_ns = "", 0
+        self._temperature_c: float | None = None
 
     # what a ground station uses
 
@@ -139,7 +152,7 @@ class BodyPlan:
 
     # what the camera reports
 
-    def take(self, news: StateChanged | SettingsChanged | Tag) -> str | None:
+    def take(self, news: BodyNews) -> str | None:
         """Take what the camera reported, in order. Returns a sentence for a frame that is not as planned."""
         match news:
             case StateChanged():
@@ -148,13 +161,15 @@ class BodyPlan:
                 self.settings_changed(news)
             case Tag():
                 return self.tagged(news)
+            case BodyTemperature(degrees):
+                self._temperature_c = degrees
         return None
 
     def camera_changed(self, change: StateChanged) -> None:
         """The camera has come or gone. One that has gone is compared, and set, when it is opened again."""
         self._ready = change.state in ("ready", "busy")  # the settings are read before
         if change.state in ("absent", "faulted"):
-            self._found, self._may_set = (), True
+            self._found, self._may_set, self._temperature_c = (), True, None
 
     def settings_changed(self, change: SettingsChanged) -> None:
         """The settings were read. The first ones after opening are changed to the plan's where the body lets them."""
@@ -208,6 +223,7 @@ class BodyPlan:
             battery=battery,
             battery_percent=percent,
             battery_low=low,
+            temperature_c=self._temperature_c,
         )
 
     def _replan(self) -> None:

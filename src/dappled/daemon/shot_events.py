@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections import deque
 
+from dappled.daemon.body_plan import BodyNews, BodyTemperature
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera, captured_shot
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.health.logbook import Logbook, of_shot
@@ -17,7 +18,7 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
-from dappled.flight import Recording, Tag
+from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
 _OF_BODY = 1000  # the working loop takes them fifty times a second
@@ -48,7 +49,7 @@ class ShotEvents(Observer):
         self._shutter, self._component, self._logbook = shutter, component, logbook
         self._depth, self._recipe, self._outside = depth, recipe, outside
         self.misfit = ""
-        self.of_body: deque[StateChanged | SettingsChanged | Tag] = deque(maxlen=_OF_BODY)
+        self.of_body: deque[BodyNews] = deque(maxlen=_OF_BODY)
 
     def settled(self, index: int, ok: bool) -> None:
         """See Observer."""
@@ -69,6 +70,8 @@ class ShotEvents(Observer):
             self._component.say(text)
         if pending.tag is not None:
             self.of_body.append(pending.tag)
+        if pending.body_c is not None:
+            self.of_body.append(BodyTemperature(pending.body_c))
         self._outside.tagged(pending)
 
     def finished(self, pending: PendingShot) -> None:

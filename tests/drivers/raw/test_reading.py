@@ -286,6 +286,12 @@ def test_real_photographs_say_their_focal_length(shared_data: Path) -> None:
         assert (told.make, told.focal_length_mm) == (make, focal_length_mm)
 
 
+def test_a_real_body_says_how_warm_it_was(shared_data: Path) -> None:
+    """exiftool says 24 °C of this one."""
+    assert read_metadata(shared_data / "raw" / "real_Canon_EOS_450D.jpg").temperature_c == 24.0
+    assert read_metadata(shared_data / "raw" / "real_FujiFilm_FinePixS5500.jpg").temperature_c is None
+
+
 def test_a_lenslet_photograph(shared_data: Path) -> None:
     frame = reading.read(shared_data / "lenslet" / "ulf_letters" / "letters_ULF_M1.png")
     assert frame.mosaic.shape == (960, 1280)

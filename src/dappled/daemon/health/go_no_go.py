@@ -16,6 +16,7 @@ FAILING = 3  # so many frames in a row that can't be decoded are no accident
 _FRAME_BYTES = 20e6  # of a large one: whether little room is left before a flight has shown its own
 _FRAMES = ("frames", "frame")
 _CARD_FRAMES = 100
+_HOT_C = 50.0  # inside a body; Canon's may be used in air of up to 40 °C
 _EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine with a date before 2023 has no clock
 
 
@@ -84,6 +85,9 @@ def _body(health: Mapping[str, Any]) -> list[Check]:
         doubts.append(f"its card has room for {counted(room, 'frame')}")
     if body.get("battery_low"):
         doubts.append(f"its battery is nearly empty: {body['battery']}")
+    degrees_c = body.get("temperature_c")
+    if degrees_c is not None and degrees_c >= _HOT_C:
+        doubts.append(f"it is {degrees_c:.0f} °C warm inside")
     if not body["checked"]:
         doubts.append("its settings are not compared with a plan (body.check)")
     elif not body["read"]:
@@ -92,7 +96,9 @@ def _body(health: Mapping[str, Any]) -> list[Check]:
         doubts.append(f"it doesn't report {', '.join(body['unknown'])}: look at it")
     if doubts:
         return [Check("Body", "caution", "; ".join(doubts))]
-    return [Check("Body", "go", "as planned" if room is None else f"as planned, room for {counted(room, 'frame')}")]
+    more = [] if room is None else [f"room for {counted(room, 'frame')}"]
+    more += [] if degrees_c is None else [f"{degrees_c:.0f} °C"]
+    return [Check("Body", "go", ", ".join(("as planned", *more)))]
 
 
 def frames_left(health: Mapping[str, Any]) -> int | None:

@@ -56,6 +56,7 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
     yield _gauge("vehicle_battery_percent", "What is left in the vehicle's battery", {"": left})
     yield _gauge("vehicle_battery_volts", "The vehicle's battery", {"": volts})
     yield _gauge("camera_battery_percent", "What is left in the camera's battery", {"": body.get("battery_percent")})
+    yield _gauge("camera_celsius", "How warm the camera was inside at its last frame", {"": body.get("temperature_c")})
     yield _counter("mavlink_packets", "Packets heard and sent", {"": link["packets"]})
     yield _counter("positions", "Positions heard", {"": link["positions"]})
     stages = {stage["name"]: stage for stage in health["stages"] if "waiting" in stage}

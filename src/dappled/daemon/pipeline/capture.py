@@ -44,7 +44,8 @@ class PendingShot:
 
     `over`: its observers know that it is finished. `entered`: its row is in the ledger. `follows` says, for a shot
     whose file stays at the camera, how it will come; `where` is then when and where it was exposed, as far as that is
-    known without the file. `rates_rad_s` are the body's at mid-exposure.
+    known without the file. `rates_rad_s` are the body's at mid-exposure. `body_c` is the camera's
+    temperature as its file has it.
     """
 
     shot: Shot
@@ -52,6 +53,7 @@ class PendingShot:
     frame: Frame | None = None
     tag: Tag | None = None
     rates_rad_s: Vector3 | None = None
+    body_c: float | None = None
     decoded: DecodedFrame | None = None
     verdict: Verdict | None = None
     problem: str = ""

@@ -44,11 +44,20 @@ class FrameSettings:
     iso: float | None = None
     model: str = ""
     taken: str | None = None
+    temperature_c: float | None = None
 
     @classmethod
     def of(cls, facts: ExposureSettings) -> Self:
         """From a file's metadata."""
-        return cls(facts.focal_length_mm, facts.f_number, facts.exposure_s, facts.iso, facts.model or "", facts.taken)
+        return cls(
+            facts.focal_length_mm,
+            facts.f_number,
+            facts.exposure_s,
+            facts.iso,
+            facts.model or "",
+            facts.taken,
+            facts.temperature_c,
+        )
 
 
 class Zoom:
@@ -143,6 +152,7 @@ class Tagging:
         camera = camera_name(self._names.camera, settings.model)
         pending.tag = tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
         self._ends.writer.tagged(pending.tag)
+        pending.body_c = settings.temperature_c
         pending.rates_rad_s = self._rates(pose)
         pending.ms["tag"] = (time.monotonic_ns() - began) / 1e6
         self._ends.tell(self._ends.observer.tagged, pending)

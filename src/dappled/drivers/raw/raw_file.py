@@ -32,6 +32,7 @@ _EVERY = 5  # odd, so that the colours of a mosaic take turns
 _EXIF_IFD = 0x8769
 _MAKE, _MODEL, _DATETIME = 0x010F, 0x0110, 0x0132
 _EXPOSURE, _F_NUMBER, _ISO, _TAKEN, _SUBSECONDS, _FOCAL = 0x829A, 0x829D, 0x8827, 0x9003, 0x9291, 0x920A
+_MAKER_NOTE, _SHOT_INFO, _TEMPERATURE, _FOOTER = 0x927C, 4, 12, 8
 _RAF_JPEG = 84  # offset and length of the embedded JPEG, big-endian, in a Fujifilm RAF header
 _BAD = (
     OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struct.error, EOFError, ArithmeticError,
@@ -44,7 +45,7 @@ class ExposureSettings:
     """Camera and exposure as recorded in the file; None where they are not.
 
     `taken` is local time without a zone, ISO 8601 ("2008-04-15T13:11:23" or with a fraction). `focal_sigma_mm` is half
-    of what the focal length is rounded to.
+    of what the focal length is rounded to; `temperature_c` is the body's, of Canon EOS bodies.
     """
 
     make: str | None = None
@@ -55,6 +56,7 @@ class ExposureSettings:
     iso: float | None = None
     taken: str | None = None
     focal_sigma_mm: float | None = None
+    temperature_c: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +199,27 @@ def _from(exif: Image.Exif) -> ExposureSettings:
         iso=positive(detail.get(_ISO, exif.get(_ISO))),
         taken=_time(detail.get(_TAKEN) or exif.get(_TAKEN) or exif.get(_DATETIME), detail.get(_SUBSECONDS)),
         focal_sigma_mm=_rounding(detail.get(_FOCAL, exif.get(_FOCAL))),
+        temperature_c=_canon_temperature_c(detail.get(_MAKER_NOTE)),
     )
+
+
+def _canon_temperature_c(note: object) -> float | None:
+    """The temperature inside a Canon EOS body: number 12 of ShotInfo in its maker note, 0 for unknown, less 128.
+
+    The note is a TIFF directory, whose offsets count from the file's header; its last eight bytes, "II*\\0" and a
+    number, say at which offset the body wrote it.
+    """
+    if not (isinstance(note, bytes) and len(note) > _FOOTER and note[-_FOOTER:-4] == b"II*\0"):
+        return None
+    (begins,) = struct.unpack("<I", note[-4:])
+    for at in range(2, 2 + 12 * min(struct.unpack("<H", note[:2])[0], (len(note) - 2) // 12), 12):
+        tag, kind, count, offset = struct.unpack("<HHII", note[at : at + 12])
+        if (tag, kind) == (_SHOT_INFO, 3) and count > _TEMPERATURE:
+            place = offset - begins + 2 * _TEMPERATURE
+            raw = note[place : place + 2] if place >= 0 else b""
+            value = int.from_bytes(raw, "little", signed=True) if len(raw) == 2 else 0
+            return float(value - 128) if 0 < value < 256 else None
+    return None
 
 
 def _rounding(focal: object) -> float | None:
