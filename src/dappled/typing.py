@@ -3,7 +3,7 @@
 from dappled.daemon.stream.subscriber import Subscription
 from dappled.daemon.stream.wire import Message
 from dappled.decode.depth import DepthMap, DistanceMap
-from dappled.decode.geometry import Gnss, Pose
+from dappled.decode.geometry import Gnss, GroundHeight, Pose
 from dappled.decode.lightfield.refocus import StereoPair
 from dappled.flight import Tag
 from dappled.products.opened import Opened, OpenedFlight, OpenedFrame, OpenedLightField
@@ -12,6 +12,7 @@ __all__ = [
     "DepthMap",
     "DistanceMap",
     "Gnss",
+    "GroundHeight",
     "Message",
     "Opened",
     "OpenedFlight",

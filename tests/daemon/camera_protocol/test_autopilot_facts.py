@@ -69,7 +69,7 @@ FACTS: dict[str, tuple[tuple[str, str], ...]] = {
         ("matrix", "none"),
     ),
     "285 is sent to a companion's port only on request": (
-        (MOCK, "test_a_gimbals_attitude_is_sent_on_request_alone"),
+        (MOCK, "test_what_a_vehicle_has_is_sent_on_request_alone"),
         (PROTOCOL, "test_a_gimbals_attitude_is_requested_where_the_camera_hangs_on_it_until_it_comes"),
         ("daemon/health/test_record.py", "test_a_gimbal_that_is_not_heard_is_a_problem_where_the_camera_is_on_it"),
     ),

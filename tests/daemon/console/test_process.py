@@ -92,7 +92,7 @@ def test_a_stream_over_tcp_gets_an_endpoint_of_the_daemon_s_own(slices: str, pri
 
 
 def setup(folder: Path) -> dict[str, Any]:
-    return {"token": "", "hosts": [], "map": "", "endpoint": f"ipc://{folder}/s", "ask": "", "recipe": None,
+    return {"token": "", "hosts": [], "map": "", "area": "", "endpoint": f"ipc://{folder}/s", "ask": "", "recipe": None,
             "mount": [1, 0, 0, 0, 1, 0, 0, 0, 1], "run": "0000"}  # fmt: skip
 
 
