@@ -80,10 +80,11 @@ def flown(
     if process.poll() is not None:
         process.stderr.close()
         pytest.fail("".join(said))
+    url = said[-1].split()[1]  # before others follow it
     reader = threading.Thread(target=said.extend, args=[process.stderr])
     reader.start()
     try:
-        yield Daemon(said[-1].split()[1], folder / "flights", process, said)
+        yield Daemon(url, folder / "flights", process, said)
         process.send_signal(signal.SIGTERM)
         assert process.wait(20) in (code, -signal.SIGKILL), "".join(said)
     finally:
@@ -229,6 +230,7 @@ def test_a_person_shoots_looks_and_focuses(chromium: Browser, daemon: Daemon) ->
     watched = opened(chromium, daemon, LAPTOP)
     page = watched.page
     assert page.inner_text("#verdict-word") == "Go"
+    until(page, "document.querySelector('#checks').innerText.includes('Vehicle battery')")  # reported once a second
     subjects = {"Camera", "Body", "Disk", "Autopilot", "Vehicle battery", "Position", "Clock", "Decoding", "Service"}
     assert subjects == set(page.locator("#checks b").all_inner_texts())
     frame = shoot(page)
