@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -55,18 +55,21 @@ def boards(
     return tuple(made)
 
 
-def photographs(seed: int, made: tuple[SharpBoard, ...]) -> tuple[SharpBoard, ...]:
-    """The boards with parts of a photograph on them, each turned or mirrored in another way."""
+def photographs(
+    made: tuple[SharpBoard, ...], chance: np.random.Generator, *, darkest: float, grey: bool
+) -> tuple[SharpBoard, ...]:
+    """The boards with parts of a photograph on them, each turned or mirrored in another way; `darkest` is added."""
     file = cbook.get_sample_data("grace_hopper.jpg")
     assert not isinstance(file, np.ndarray)
     with file:
         picture = (np.asarray(Image.open(file).convert("RGB"), dtype=np.float32) / 255) ** 2.2
-    chance = np.random.default_rng([seed, 20])
     found = []
     for board in made:
         part = np.rot90(picture, int(chance.integers(4)))[:: int(chance.choice([-1, 1]))]
-        grey = part.mean(axis=2, keepdims=True).repeat(3, axis=2) + np.float32(0.05)
-        found.append(replace(board, picture=np.ascontiguousarray(grey / grey.mean() * board.colour[0])))
+        if grey:
+            part = part.mean(axis=2, keepdims=True).repeat(3, axis=2)
+        part = part + np.float32(darkest)
+        found.append(replace(board, picture=np.ascontiguousarray(part / part.mean() * board.colour[0])))
     return tuple(found)
 
 
@@ -86,7 +89,7 @@ class Family:
         """The camera before the scene of a seed."""
         scene = boards(seed, exponent=self.exponent, finest=self.finest, largest_px=self.largest_px)
         if self.photographs:
-            scene = photographs(seed, scene)
+            scene = photographs(scene, np.random.default_rng([seed, 20]), darkest=0.05, grey=True)
         plain = RayCamera(
             MASK, shape=shape, seed=seed, boards=scene, full_well_e=SNR_100, stop="square", f_number=self.f_number
         )
@@ -228,21 +231,33 @@ def reached(frame: Frame, f_number: float = F_NUMBER) -> Reached:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("families", nargs="*", metavar="FAMILY", help=f"of {', '.join(FAMILIES)} (default: all)")
-    parser.add_argument("--seeds", type=int, default=1, help="frames of each family (default: 1)")
+def options(text: str, families: Collection[str], *, seeds: int) -> argparse.ArgumentParser:
+    """The options of a benchmark of frames, `seeds` of each family by default."""
+    parser = argparse.ArgumentParser(description=text)
+    parser.add_argument("families", nargs="*", metavar="FAMILY", help=f"of {', '.join(families)} (default: all)")
+    parser.add_argument("--seeds", type=int, default=seeds, help=f"frames of each family (default: {seeds})")
     parser.add_argument("--first", type=int, default=0, help="the first seed (default: 0)")
     parser.add_argument("--shape", type=int, nargs=2, default=(560, 740), metavar=("H", "W"), help="of a frame in px")
-    parser.add_argument("--keep", type=Path, help="folder of simulated frames, used again if they are there")
-    parser.add_argument("--picture", type=Path, help="draw a view of the last frame and its errors")
+    parser.add_argument("--picture", type=Path, help="draw a view of the last frame, true and made")
     parser.add_argument("--json", action="store_true", help="figures as JSON: the least of the seeds")
+    return parser
+
+
+def chosen(parser: argparse.ArgumentParser, families: Collection[str]) -> tuple[argparse.Namespace, list[str]]:
+    """What the command line says, and the families it names; all where it names none."""
     arguments = parser.parse_args()
-    if unknown := set(arguments.families) - set(FAMILIES):
+    if unknown := set(arguments.families) - set(families):
         parser.error(f"no family of these names: {', '.join(sorted(unknown))}")
+    return arguments, arguments.families or list(families)
+
+
+def main() -> None:
+    parser = options(__doc__ or "", FAMILIES, seeds=1)
+    parser.add_argument("--keep", type=Path, help="folder of simulated frames, used again if they are there")
+    arguments, families = chosen(parser, FAMILIES)
     high, wide = arguments.shape
     figures: dict[str, float] = {}
-    for name in arguments.families or FAMILIES:
+    for name in families:
         rows = []
         for seed in range(arguments.first, arguments.first + arguments.seeds):
             kept = arguments.keep and arguments.keep / f"{name}-{seed}-{high}x{wide}.npz"

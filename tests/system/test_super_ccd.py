@@ -50,9 +50,21 @@ def test_a_masked_raf_is_calibrated_and_decoded(seed: int, tmp_path: Path, capsy
     step = Grid.of(body.chip.shape, body.lattice).step
     y, x = np.mgrid[0 : found.views.shape[2], 0 : found.views.shape[3]].astype(np.float64)
     at = np.array([found.grid[0, 0] * y + MARGINS[0], found.grid[1, 1] * x + 2 * MARGINS[1]]) / step
-    wanted = np.array(
-        [[ndimage.map_coordinates(views[v, u, GREEN], at, order=3, mode="nearest") for u in range(5)] for v in range(5)]
-    )
+
+    def true_views(colour: int) -> np.ndarray:
+        lines = [[ndimage.map_coordinates(one[colour], at, order=3, mode="nearest") for one in line] for line in views]
+        return np.array(lines)
+
+    wanted = true_views(GREEN)
     mean = np.broadcast_to(found.views.mean(axis=(0, 1)), wanted.shape)
     assert _psnr(found.views - wanted) > 37
     assert _psnr(found.views - wanted) > _psnr(mean - wanted) + 4
+
+    recipe = Recipe("auto", MASK, calibration=str(calibration), workers=2, colour=True)
+    painted = Darkroom(recipe).decode(frame).light_field.views
+    assert painted.shape == (*found.views.shape, 3)
+    for colour in range(3):
+        wanted = true_views(colour)
+        made = painted[..., colour] * (wanted.mean() / painted[..., colour].mean())  # grey in its mean
+        mean = np.broadcast_to(wanted.mean(axis=(0, 1)), wanted.shape)
+        assert _psnr(made - wanted) > _psnr(mean - wanted) + 10

@@ -6,10 +6,13 @@ import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import tomli_w
 
+from dappled.cli import main
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.mocks import shoot
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from tests.simulated.calibration import from_frame
 from tests.system.quality import Score, score
@@ -118,3 +121,19 @@ def test_the_mask_s_installation_is_found(tmp_path: Path) -> None:
         assert (fit.mask_distance_mm, fit.distance_fitted) == (0.48, False)
         shadow_per_px = 15.5 * (1 - camera.installed.distance_mm / 50) * 0.01  # 15.5/mm, 50 mm, pixels of 0.01 mm
         assert math.hypot(*fit.lattice.ky) == pytest.approx(shadow_per_px, rel=2e-5)
+
+
+@pytest.mark.slow
+def test_nothing_is_told_of_views_where_the_frame_is_clipped(tmp_path: Path) -> None:
+    white, frame, calibration = tmp_path / "white.dng", tmp_path / "frame.dng", tmp_path / "calibration.toml"
+    shot = ["--scale", "0.25", "--rays"]
+    assert shoot.main([str(white), "--scene", "white", "--f-number", "29.8", *shot, "level=0.2"]) == 0
+    assert shoot.main([str(frame), *shot, "level=0.6"]) == 0
+    assert main(["calibrate", str(white), "--mask", MASK, "-o", str(calibration)]) == 0
+    field = Darkroom(Recipe(CAMERA, MASK, calibration=str(calibration))).decode(frame).light_field
+    sigma = field.view_sigma
+    assert sigma is not None
+    share = np.isnan(sigma).mean()
+    assert 0 < share < 0.6
+    assert any("clipped" in words for words in field.attributes["doubts"])
+    assert np.isfinite(field.attributes["view_sigma"]).all()

@@ -170,6 +170,12 @@ def spread(plane: Plane) -> Plane:
     return wide
 
 
+def colour_index(shape: tuple[int, int], cfa: NDArray[np.integer]) -> NDArray[np.int8]:
+    """int8 (H, W): which colour each pixel of a frame of this shape is, `cfa` (a, b) repeating over it."""
+    whole = [-(-n // m) for n, m in zip(shape, cfa.shape, strict=True)]
+    return np.tile(cfa.astype(np.int8), whole)[: shape[0], : shape[1]]
+
+
 def local_colours(
     plane: Plane, cfa: NDArray[Any], colours: Sequence[int], reference: Sequence[int], *, cell_px: int = 12
 ) -> NDArray[np.float32]:

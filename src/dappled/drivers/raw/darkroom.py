@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
@@ -23,18 +23,22 @@ from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
+from dappled.decode.lightfield.clipping import unknown_where_clipped
+from dappled.decode.lightfield.colour_views import dc_views, in_colour
 from dappled.decode.optics import LAWS
 from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import check_shape, lineariser
-from dappled.decode.spectrum.plane import Places, coloured, find_defects, local_colours, mended, spread
+from dappled.decode.spectrum.plane import Places, colour_index, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check_report
-from dappled.drivers.raw.raw_file import Exposure, exposure, not_linear
+from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, exposure, not_linear, shares_of_white
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
+
+Painter = Callable[[LightField], NDArray[np.float32]]  # views in colour of a light field with grey ones
 
 
 class DarkroomError(DappledError):
@@ -206,7 +210,7 @@ class Darkroom:
             raw = self.read(path)
         with naming(path):
             with _timed(ms, "plane"):
-                rows, chroma = self._lineariser.rows(raw, colour=self.recipe.colour and views)
+                rows, painted = self._lineariser.rows(raw, colour=self.recipe.colour and views)
                 plane = self._lineariser.upright(rows, raw)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
             if isinstance(decoder, MaskDecoder):
@@ -227,10 +231,10 @@ class Darkroom:
                         light_field, report = decoder.decode_reported(
                             plane, focal_length_mm=focal_length_mm, f_number=f_number, views=views
                         )
-                if chroma is not None:
-                    light_field = replace(
-                        light_field, views=coloured(light_field.views, light_field.grid, chroma, plane.shape)
-                    )
+                if painted is not None:
+                    light_field = replace(light_field, views=painted(light_field))
+                if light_field.view_sigma is not None:
+                    light_field = unknown_where_clipped(light_field, self._lineariser.clipped(raw), MOST_CLIPPED)
         dropped = isinstance(decoder, MaskDecoder) and decoder.calibration is None  # its metres don't hold then
         attributes = {
             **light_field.attributes,
@@ -375,13 +379,22 @@ class FrameLineariser:
         """Put each sample where it is on the chip: spread the samples of a staggered sensor."""
         if self._recipe.mask == profiles.LENSLET:
             return rows
-        key = rows.shape, raw.camera_model or ""
-        if key not in self._staggered:
-            self._staggered[key] = camera_profile(self._recipe, key[1]).staggered(key[0])
-        return spread(rows.plane(self._recipe.workers)) if self._staggered[key] else rows
+        if self._is_staggered(rows.shape, raw.camera_model or ""):
+            return spread(rows.plane(self._recipe.workers))
+        return rows
 
-    def rows(self, raw: RawFile, *, colour: bool) -> tuple[LinearRows, NDArray[np.float32] | None]:
-        """Return the plane's linear rows, and with `colour` local colours (3, rows, columns) as shares of it."""
+    def clipped(self, raw: RawFile) -> Plane:
+        """Return 1 where a masked frame's pixel is clipped and 0 elsewhere; spread, local means stay the same."""
+        found = (shares_of_white(raw, 1) >= WHITE_SHARE).astype(np.float32)
+        return spread(found) if self._is_staggered(raw.mosaic.shape, raw.camera_model or "") else found
+
+    def _is_staggered(self, shape: tuple[int, int], model: str) -> bool:
+        if (shape, model) not in self._staggered:
+            self._staggered[shape, model] = camera_profile(self._recipe, model).staggered(shape)
+        return self._staggered[shape, model]
+
+    def rows(self, raw: RawFile, *, colour: bool) -> tuple[LinearRows, Painter | None]:
+        """Return the plane's linear rows, and with `colour` what makes their light field's views coloured."""
         raw = override(raw, self._recipe)
         lenslets = self._recipe.mask == profiles.LENSLET
         cfa, black = _one_index_a_colour(raw)
@@ -393,22 +406,40 @@ class FrameLineariser:
                 self._defects = find_defects(dark, period)
                 self._dark = dark = mended(dark, self._defects, period)
             raw = replace(raw, mosaic=mended(raw.mosaic, self._defects, period))
+        check_shape(raw.mosaic)
+        shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
         reference: list[int] = []
-        chroma = None
+        flat = self._gain(shape) if self._recipe.white and not lenslets else None
+        painted: Painter | None = None
         if cfa is not None:
             names = raw.colour_names
             # Behind lenslets the grey view is the mean of the colours; a masked frame has most of its detail in green.
             reference = [names.index("G")] if "G" in names and not lenslets else sorted({int(c) for c in cfa.flat})
             if colour and all(name in names for name in "RGB"):
                 even = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=balance, dark=dark)
-                chroma = local_colours(even, cfa, [names.index(name) for name in "RGB"], reference)
+                colours = [names.index(name) for name in "RGB"]
+                if lenslets:
+                    painted = _by_shares(local_colours(even, cfa, colours, reference), even.shape)
+                else:
+                    painted = self._by_dc_views(even if flat is None else even * flat, cfa, colours, raw)
         elif colour:
             raise DecodeError("the frame has no colour pattern: decode it without --colour, or name it with --cfa")
-        check_shape(raw.mosaic)
-        shape = raw.mosaic.shape[0], raw.mosaic.shape[1]
         linear = lineariser(shape, black=black, white=raw.white, cfa=cfa, balance=balance, reference=reference)
-        flat = self._gain(shape) if self._recipe.white and not lenslets else None
-        return linear.apply(raw.mosaic, dark=dark, flat=flat), chroma
+        return linear.apply(raw.mosaic, dark=dark, flat=flat), painted
+
+    def _by_dc_views(self, even: Plane, cfa: NDArray[np.int64], colours: list[int], raw: RawFile) -> Painter:
+        """Colours of masked frames: each from its own pixels, where they are on the chip."""
+        shape = even.shape[0], even.shape[1]
+        index = colour_index(shape, cfa)
+        if self._is_staggered(shape, raw.camera_model or ""):
+            even, index = spread(0.5 * even), np.rint(spread(index + np.float32(1)) / 2).astype(np.int8) - np.int8(1)
+
+        def painted(field: LightField) -> NDArray[np.float32]:
+            size = field.views.shape[2], field.views.shape[3]
+            made = dc_views(even, index, colours, size, field.grid)
+            return in_colour(field.views, field.slices[0].real, made)
+
+        return painted
 
     def _white_balance(self) -> NDArray[np.float64] | None:
         """Return the gains that make the white frame grey; None without one."""
@@ -432,6 +463,11 @@ class FrameLineariser:
                 white = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa)
                 self._gains[shape] = planes.white_gain(white, cell_px=math.sqrt(white.size) / 32)
         return self._gains[shape]
+
+
+def _by_shares(shares: NDArray[np.float32], shape: tuple[int, ...]) -> Painter:
+    """Colours of frames behind lenslets: local ones, the same for all views of a place."""
+    return lambda field: coloured(field.views, field.grid, shares, shape)
 
 
 def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:

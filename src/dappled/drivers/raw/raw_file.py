@@ -140,11 +140,16 @@ class Exposure:
     black_share: float
 
 
-def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
-    """Measure one pixel of `every` × `every`."""
+def shares_of_white(raw: RawFile, every: int) -> NDArray[np.float32]:
+    """One pixel of `every` × `every`, linear: 0 is black, 1 is white."""
     black = float(np.mean(raw.black))
     values = raw.mosaic[::every, ::every].astype(np.float32)
-    share = (values - black) / (raw.white - black)
+    return np.asarray((values - black) / (raw.white - black))
+
+
+def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
+    """Measure one pixel of `every` × `every`."""
+    share = shares_of_white(raw, every)
     steps = np.minimum(np.sqrt(np.clip(share, 0, 1)) * STEPS, STEPS - 1).astype(np.uint8)
     counts = np.bincount(steps.ravel(), minlength=STEPS)
     shares = tuple(float(one) for one in counts / share.size)

@@ -1,0 +1,45 @@
+"""Where pixels are clipped nobody knows how far views are from the truth: their standard errors are unknown there."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+
+from dappled.decode.array_types import Floats, Singles
+from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.patch_model import SIDE
+
+
+def unknown_where_clipped(field: LightField, clipped: Singles, most: float) -> LightField:
+    """The light field with `view_sigma` NaN in patches of which more than the share `most` is clipped.
+
+    `clipped` (H, W) is 1 where a pixel of the frame is clipped, else 0 (its local mean counts). The attribute
+    `view_sigma`, an rms over the frame, then leaves these patches out; it is None where none is left.
+    """
+    if field.view_sigma is None:
+        return field
+    rows, columns = field.view_sigma.shape[2:]
+    across = _summed(clipped, _bounds(rows, field.grid[0, 0], field.grid[0, 2]))
+    total = _summed(across.T, _bounds(columns, field.grid[1, 1], field.grid[1, 2])).T
+    area = SIDE**2 * field.grid[0, 0] * field.grid[1, 1]
+    lost = total / area > most
+    if not lost.any():
+        return field
+    sigma = np.where(lost, np.float32(np.nan), field.view_sigma)
+    told = None if lost.all() else np.sqrt(np.mean(sigma[:, :, ~lost] ** 2, axis=2)).tolist()
+    return replace(field, view_sigma=sigma, attributes={**field.attributes, "view_sigma": told})
+
+
+def _bounds(patches: int, step: float, first: float) -> Floats:
+    """(patches + 2,) in pixels: patch i lies from bound i to bound i + 2, half over each neighbour."""
+    half = SIDE // 2
+    return np.asarray((half * np.arange(-1, patches + 1) - 0.5) * step + first + 0.5)
+
+
+def _summed(values: Singles, bounds: Floats) -> Singles:
+    """(patches, …) sums over the rows of each patch; a patch beyond the frame has less."""
+    ends = np.clip(np.rint(bounds), 0, len(values)).astype(int)
+    halves = np.stack([values[a:b].sum(axis=0, dtype=np.float32) for a, b in itertools.pairwise(ends)])
+    return np.asarray(halves[:-1] + halves[1:])

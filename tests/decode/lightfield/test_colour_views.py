@@ -1,0 +1,85 @@
+"""Views in red, green and blue: the DC bands, and the line of colour over grey, by scenes with known colours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dappled.decode import DecodeError
+from dappled.decode.lightfield.colour_views import dc_views, in_colour
+
+BAYER = np.array([[0, 1], [1, 2]])
+GRID = np.array([[6.0, 0.0, 0.0], [0.0, 6.0, 0.0]])
+SHAPE, SIZE = (288, 336), (48, 56)
+INNER = (slice(8, -8), slice(8, -8))
+
+
+def index_of(shape: tuple[int, int]) -> NDArray[np.int64]:
+    return np.tile(BAYER, (shape[0] // 2, shape[1] // 2))
+
+
+def test_waves_within_the_band_come_out_at_the_samples_of_a_slice() -> None:
+    """Each colour its own wave, below half a sample a cycle: 1/20 cycles/pixel at 6 px a sample."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    waves = [
+        0.4 + 0.1 * np.cos(2 * np.pi * (fy * y + fx * x) + k)
+        for k, (fy, fx) in enumerate([(0.01, 0.05), (0.05, 0.0), (0.03, -0.03)])
+    ]
+    index = index_of(SHAPE)
+    plane = np.choose(index, waves).astype(np.float32)
+    made = dc_views(plane, index, (0, 1, 2), SIZE, GRID)
+    for colour, wave in enumerate(waves):
+        np.testing.assert_allclose(made[colour][INNER], wave[::6, ::6][INNER], atol=2e-3)
+
+
+def test_detail_beyond_the_band_and_an_origin_between_pixels() -> None:
+    y, _ = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    plane = (0.3 + 0.001 * y + 0.1 * np.cos(2 * np.pi * 0.15 * y)).astype(np.float32)
+    grid = GRID.copy()
+    grid[0, 2] = 2.5
+    made = dc_views(plane, np.zeros(SHAPE, dtype=np.int64), (0,), SIZE, grid)[0]
+    np.testing.assert_allclose(
+        made[INNER], (0.3 + 0.001 * (6 * np.arange(48) + 2.5))[:, None].repeat(56, 1)[INNER], atol=5e-4
+    )
+
+
+def test_a_colour_without_pixels_is_refused() -> None:
+    with pytest.raises(DecodeError, match="no pixel of colour 3"):
+        dc_views(np.ones(SHAPE, dtype=np.float32), index_of(SHAPE), (3,), SIZE, GRID)
+
+
+def test_places_without_a_sample_count_for_no_colour() -> None:
+    """As on a Super CCD's lattice: half of the places are empty."""
+    index = index_of(SHAPE)
+    index[(np.add(*np.mgrid[: SHAPE[0], : SHAPE[1]]) // 2) % 2 == 1] = -1
+    plane = np.where(index >= 0, np.float32(0.3), np.float32(0))
+    np.testing.assert_allclose(dc_views(plane, index, (0, 1, 2), SIZE, GRID), 0.3, atol=1e-6)
+
+
+def test_an_edge_between_two_colours_moves_with_the_parallax() -> None:
+    """Two colours blend as their greys do: with exact grey views each view's colour is exact, too."""
+    x = np.arange(60)
+    edges = np.stack([1 / (1 + np.exp(-(x - 30 - d))) for d in (-2, -1, 0, 1, 2)])
+    blend = np.broadcast_to(edges[None, :, None, :], (1, 5, 20, 60)).astype(np.float32)
+    left, right = np.array([0.6, 0.1, 0.1]), np.array([0.05, 0.2, 0.5])
+    truth = left + (right - left) * blend[..., None]
+    views = (blend * 0.3 + 0.1).astype(np.float32)
+    colours = np.moveaxis(truth.mean(axis=(0, 1)), -1, 0).astype(np.float32)
+    made = in_colour(views, views.mean(axis=(0, 1)), colours)
+    off, one_for_all = made - truth, colours.transpose(1, 2, 0) - truth
+    assert float(np.mean(off**2)) < 0.05 * float(np.mean(one_for_all**2))
+
+
+def test_grey_without_texture_gives_a_colour_its_share() -> None:
+    views = np.full((3, 3, 12, 12), 0.2, dtype=np.float32)
+    views[0] += np.float32(0.01)
+    colours = np.stack([np.full((12, 12), value, dtype=np.float32) for value in (0.4, 0.2, 0.1)])
+    made = in_colour(views, views[1, 1], colours)
+    np.testing.assert_allclose(made[1], np.broadcast_to([0.4, 0.2, 0.1], made[1].shape), rtol=1e-5)
+    np.testing.assert_allclose(made[0] - made[1], np.broadcast_to([0.02, 0.01, 0.005], made[0].shape), rtol=1e-3)
+
+
+def test_black_is_no_error() -> None:
+    black = np.zeros((12, 12), dtype=np.float32)
+    assert np.isfinite(in_colour(np.zeros((2, 2, 12, 12), dtype=np.float32), black, np.stack([black] * 3))).all()
