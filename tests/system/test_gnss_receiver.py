@@ -103,7 +103,8 @@ def test_marks_time_the_frames_and_the_stream_comes_out_again(
         exposed_ns = start_utc_ns + round(json.loads(path.read_text())["mid_exposure_t_s"] * 1e9)
         assert tags[index].time_source == "hot shoe (TIM-TM2)"
         assert abs(tags[index].utc_ns - exposed_ns) < 4 * 10**6
-        assert tags[index].utc_sigma_ns < 10**7
+        assert tags[index].utc_sigma_ns < 10**7  # without the mark it is more than the body's 15 ms
+        assert abs(tags[index].utc_ns - exposed_ns) < 2 * tags[index].utc_sigma_ns
     output = tmp_path / "rover.ubx"
     assert main(["flight", "gnss", str(folder), "-o", str(output)]) == 0
     assert output.read_bytes() == receiver.sent
