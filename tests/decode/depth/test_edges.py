@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dappled.decode.depth.edges import sharpened
+from dappled.decode.depth.edges import levelled, sharpened
 
 SHAPE = (24, 40)
 COLUMNS = np.mgrid[: SHAPE[0], : SHAPE[1]][1]
@@ -39,3 +39,15 @@ def test_small_holes_close_and_large_ones_stay_unknown() -> None:
 def test_nothing_known_stays_so() -> None:
     nothing = np.full(SHAPE, np.nan, dtype=np.float32)
     assert np.isnan(sharpened(nothing, nothing, PICTURE)[0]).all()
+
+
+def test_steps_between_disparities_go_and_jumps_stay() -> None:
+    slope = (COLUMNS * 0.01).astype(np.float32)
+    stepped = (np.round(slope / 0.1) * 0.1).astype(np.float32)
+    stepped[:, 20:] += 1.0
+    stepped[3:5, 8] = np.nan
+    made = levelled(stepped)
+    true = slope + np.where(COLUMNS < 20, 0, 1)
+    assert np.nanmax(np.abs(made - true)[:, 7:14]) < 0.02
+    assert np.nanmax(np.abs(made - true)) < 0.06
+    np.testing.assert_array_equal(np.isnan(made), np.isnan(stepped))

@@ -1,8 +1,9 @@
-"""Estimate depth from contrast, photo-consistency of clean views, and neighbouring pixels together.
+"""Estimate depth from contrast, photo-consistency of clean views, slices, and neighbouring pixels together.
 
 Each is a log-likelihood, so they can be added. Refocus contrast tolerates noise, and enlarges near objects by half a
-window. Photo-consistency keeps edges where they are, and needs clean views. Semi-global matching decides where both
-are weak. On clean views the middle one's edges then decide to which side the pixels at a jump of disparity belong.
+window. Photo-consistency keeps edges where they are, and needs clean views. Of noisy masked frames the slices are asked
+instead, in halves of the aperture (see `halves`). Semi-global matching decides where all are weak. The middle view's
+edges then decide to which side the pixels at a jump of disparity belong.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.depth import contrast as depth_contrast
-from dappled.decode.depth.depth_map import DepthMap, Search, Volume, box, confidence, judged, peaked, windowed
-from dappled.decode.depth.edges import sharpened
+from dappled.decode.depth.depth_map import DepthMap, Map, Search, Volume, box, confidence, judged, peaked, windowed
+from dappled.decode.depth.edges import levelled, sharpened
 from dappled.decode.depth.evidence import Evidence
+from dappled.decode.depth.halves import Part, best_half, unexplained, voted, whole
 from dappled.decode.depth.photo_consistency import WINDOW, compared, differences
 from dappled.decode.lightfield import ViewStack
 from dappled.workers import each
@@ -30,14 +32,21 @@ _SAMPLE = 160  # px a side: as much of the middle tells how well views agree
 _NARROW = 5  # px: the window in which noisy views are compared
 _LEAST_VARIANCE = 1e-8
 _SPREAD_CLEAN = 0.055  # variance over information, measured on the seeds of benchmarks/depth.py
+# Of noisy masked frames, measured on the masked frames of benchmarks/depth.py, seeds 1 and 2.
+_VOTE_WINDOW = 11  # px
+_SMALL_HALVES, _LARGE_HALVES = 8.0, 32.0
+_SPREAD_HALVES, _SAMPLES_HALVES = 2.0, 60.0  # variance over information; of the votes, as in `confidence`
+_AGREE = 0.1  # px/view: a peak of the whole aperture's likelihood so near is that of the same surface
+_ONE_SURFACE = 0.4  # px/view: with a larger range of disparities around there is a jump
+_HALO = 6  # px: by so much near things are too large before the middle view's edges decide
 _ASTRAY, _DRAWN = 0.5, 0.25  # of a step: a peak of another surface; how far selected peaks are off
 _PULL = 0.3  # of how far neighbours moved the peak
 
 
 def depth(evidence: Evidence, search: Search) -> DepthMap:
-    """The depth map by all methods that the evidence allows: photo-consistency only of plain views."""
+    """The depth map by the methods that suit the evidence."""
     if evidence.white:
-        return _decided(_by_contrast(evidence, search), search, search.contrast_window)
+        return _of_slices(evidence, search)
     disparities, stack = search.disparities(), evidence.stack
     variance = _disagreement(stack, disparities, search.workers)
     # Where noise is as strong as texture, one view can't be compared with another: contrast takes over.
@@ -80,6 +89,53 @@ def _of_clean(cost: Volume, stack: ViewStack, search: Search, window: int) -> De
     sigma = np.hypot(found.sigma, _PULL * np.abs(astray))
     sharp, error = sharpened(found.disparity, sigma.astype(np.float32), stack.middle())
     return replace(found, disparity=sharp, sigma=error)
+
+
+def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
+    """By what disparities leave unexplained of halves of the aperture, and on even surfaces of all of it."""
+    part = whole(evidence)
+    rough = _by_votes(part, evidence.shown(), search)
+    disparities, window = search.disparities(), search.contrast_window
+    likelihood = unexplained(part, disparities, workers=search.workers)
+    likelihood, spread = windowed(np.negative(likelihood, out=likelihood), window)
+    known = rough.known
+    start = np.rint((np.where(known, rough.disparity, disparities[0]) - disparities[0]) / search.step).astype(np.intp)
+    fine, curvature = peaked(likelihood, disparities, np.clip(start, 0, len(disparities) - 1))
+    # What a jump spreads over reaches farther than the window.
+    reach = 2 * window - 1
+    far = np.where(known, rough.disparity, np.inf), np.where(known, rough.disparity, -np.inf)
+    even = ndimage.maximum_filter(far[0], reach) - ndimage.minimum_filter(far[1], reach) < _ONE_SURFACE
+    agree = even & (np.abs(fine - rough.disparity) < _AGREE)
+    found = judged(
+        np.where(agree, fine, rough.disparity),
+        curvature,
+        rough.confidence,
+        spread=spread,
+        window=window,
+        method="combined",
+    )
+    share = np.where(agree & found.known, rough.sigma**4 / (rough.sigma**4 + found.sigma**4), np.float32(0))
+    both = share > 0
+    disparity = np.where(both, rough.disparity + share * (fine - rough.disparity), rough.disparity)
+    sigma = np.where(both, np.sqrt(share * found.sigma**2 + (1 - share) * rough.sigma**2), rough.sigma)
+    return replace(rough, disparity=disparity, sigma=sigma)
+
+
+def _by_votes(part: Part, middle: Map, search: Search) -> DepthMap:
+    """The disparities that neighbours select among the votes around a pixel; jumps at the edges of the middle view."""
+    disparities = search.disparities()
+    window = search.window or _VOTE_WINDOW
+    cost = voted(best_half(part, disparities, workers=search.workers), window)
+    smooth = smoothed(cost, small=_SMALL_HALVES, large=_LARGE_HALVES, workers=search.workers)
+    start = smooth.argmin(axis=0)
+    disparity, curvature = peaked(np.negative(smooth, out=smooth), disparities, start)
+    likelihood = np.negative(cost, out=cost)
+    _, own = peaked(likelihood, disparities, start)
+    curvature = np.where(own > 0, own, curvature)  # where neighbours overrule a pixel it has no peak there
+    sure = confidence(likelihood, np.take_along_axis(likelihood, start[None], axis=0)[0], _SAMPLES_HALVES)
+    found = judged(disparity, curvature, sure, spread=_SPREAD_HALVES, window=window, method="combined")
+    sharp, sigma = sharpened(found.disparity, found.sigma, middle, near=_HALO - 1, reach=_HALO)
+    return replace(found, disparity=levelled(sharp), sigma=sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,35 +7,38 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.depth.depth_map import Map
+from dappled.decode.lightfield.light_field import centred
 
-_NEAR = 3  # px: pixels beside a jump, or beside something unknown
-_REACH = 3  # px: the median's window reaches so far
+_NEAR, _REACH = 3, 3  # px: pixels beside a jump, or beside something unknown; how far the median's window reaches
 _JUMP = 0.07  # px/view
 _ALIKE = 0.08  # of the middle view's range: pixels that differ by more hardly count
 _ROUNDS = 2
+_LEVEL, _LEVEL_REACH = 0.15, 6  # px/view: neighbours that differ by more are another surface; px
 _CHUNK = 65_536  # pixels whose windows are in memory at once
 
 
-def sharpened(disparity: Map, sigma: Map, middle: Map) -> tuple[Map, Map]:
+def sharpened(disparity: Map, sigma: Map, middle: Map, *, near: int = _NEAR, reach: int = _REACH) -> tuple[Map, Map]:
     """(disparity, σ), NaN where unknown: at jumps the weighted median of the known pixels nearby, its σ, and half
     of the range that the middle half of their weight takes.
 
     What is unknown beside something known takes part, and becomes known where most of what looks alike is known.
+    Jumps are looked for in windows of `near` px a side, and the median's window reaches `reach` px to each side.
     """
     low, high = np.quantile(middle, [0.05, 0.95])
     alike = np.float32(max(_ALIKE * float(high - low), 1e-6))
     for _ in range(_ROUNDS):
-        disparity, sigma = _once(disparity, sigma, middle, alike)
+        disparity, sigma = _once(disparity, sigma, middle, alike, (near, reach))
     return disparity, sigma
 
 
-def _once(disparity: Map, sigma: Map, middle: Map, alike: np.float32) -> tuple[Map, Map]:
+def _once(disparity: Map, sigma: Map, middle: Map, alike: np.float32, sides: tuple[int, int]) -> tuple[Map, Map]:
+    near, reach = sides
     known = np.isfinite(disparity)
-    highest = ndimage.maximum_filter(np.where(known, disparity, -np.inf), _NEAR)
-    lowest = ndimage.minimum_filter(np.where(known, disparity, np.inf), _NEAR)
+    highest = ndimage.maximum_filter(np.where(known, disparity, -np.inf), near)
+    lowest = ndimage.minimum_filter(np.where(known, disparity, np.inf), near)
     rows, columns = np.nonzero(highest - lowest > np.where(known, _JUMP, -1.0))
-    wide = [np.pad(a, _REACH, mode="edge") for a in (np.where(known, disparity, np.inf), sigma, middle)]
-    side = np.arange(2 * _REACH + 1)
+    wide = [np.pad(a, reach, mode="edge") for a in (np.where(known, disparity, np.inf), sigma, middle)]
+    side = np.arange(2 * reach + 1)
     made, errors = disparity.copy(), sigma.copy()
     for start in range(0, len(rows), _CHUNK):
         y, x = rows[start : start + _CHUNK], columns[start : start + _CHUNK]
@@ -71,3 +74,23 @@ def _median(
     known = enough & np.isfinite(found) & np.isfinite(sigma)
     unknown = np.float32(np.nan)
     return np.where(known, found, unknown)[:, 0], np.where(known, sigma, unknown)[:, 0]
+
+
+def levelled(disparity: Map) -> Map:
+    """The mean of the known pixels nearby that differ by little: the steps between the disparities that were tried go,
+    jumps and what is unknown stay."""
+    around = np.pad(disparity, _LEVEL_REACH, mode="edge")
+    height, width = disparity.shape
+    total, weights = np.zeros_like(disparity), np.zeros_like(disparity)
+    side = range(2 * _LEVEL_REACH + 1)
+    shares: Map = np.exp(-(centred(len(side)) ** 2) / (0.5 * _LEVEL_REACH**2)).astype(np.float32)
+    for dy in side:
+        for dx in side:
+            beside = around[dy : dy + height, dx : dx + width] - disparity
+            alike = np.abs(beside) < _LEVEL  # false where either is unknown
+            share = shares[dy] * shares[dx]
+            total += np.where(alike, share * beside, 0)
+            weights += share * alike
+    total /= np.maximum(weights, np.float32(1e-6))
+    total += disparity
+    return total

@@ -1,6 +1,6 @@
 """Estimate depth from views by one of several methods, each pixel with its uncertainty, or unknown.
 
-`combined` combines photo-consistency, contrast and neighbouring pixels; `contrast` asks which refocused picture
+`combined` combines photo-consistency, contrast, slices and neighbouring pixels; `contrast` asks which refocused picture
 explains the measurements best (bears noise); `stereo` matches pairs of views with OpenCV (clean views, to compare).
 """
 
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from dappled.decode.depth import combined, contrast, stereo
+from dappled.decode.depth import combined, contrast, halves, stereo
 from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
 from dappled.decode.depth.evidence import Evidence, of_views
 from dappled.decode.errors import DecodeError
@@ -28,7 +28,7 @@ _FINEST, _FINEST_OF_VIEWS = 0.15, 0.15  # px: a step moves the outermost view by
 _MOST_LEVELS = 64  # no more disparities than these
 _COARSE_SIDE = 160  # px: pictures are made smaller than this to look for the range
 _WIDEST = 4.0  # px/view
-_MARGIN = 0.1  # px/view beyond the range that was found
+_MARGIN, _MARGIN_OF_SLICES = 0.1, 0.2  # px/view beyond the range that was found, with half a step, or a whole one
 _SURE = 0.6  # the share of pixels, those with most texture, that the range is read off
 
 
@@ -64,7 +64,7 @@ def search(evidence: Evidence, low: float, high: float, *, window: int | None = 
 
 
 def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, float]:
-    """The disparities between which the scene lies, with a margin: contrast on pictures made smaller."""
+    """The disparities between which the scene lies, with a margin: what they explain of pictures made smaller."""
     stack = evidence.stack
     height, width = stack.views.shape[2:]
     factor = max(1, math.ceil(max(height, width) / _COARSE_SIDE))
@@ -82,14 +82,19 @@ def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, flo
     widest = min(_WIDEST, 0.25 * width / max(stack.reach, 1e-9))
     looked = Search(-widest, widest, max(0.35 * factor / stack.reach, widest / 40), 9, workers)
     disparities = looked.disparities()
-    likelihood, _ = windowed(contrast.explained(coarse, disparities, workers=workers), looked.contrast_window)
+    if evidence.white:
+        volume = -halves.unexplained(halves.whole(coarse), disparities, workers=workers)
+    else:
+        volume = contrast.explained(coarse, disparities, workers=workers)
+    likelihood, _ = windowed(volume, looked.contrast_window)
     margin = likelihood.max(axis=0) - likelihood.mean(axis=0)
     textured = margin >= np.quantile(margin, 1 - _SURE)
-    edge = max(3, min(margin.shape) // 10)
+    edge = max(3, min(margin.shape) // (20 if evidence.white else 10))
     textured[:edge] = textured[-edge or None :] = False
     peaks, _ = peaked(likelihood, disparities, likelihood.argmax(axis=0))
     best = ndimage.median_filter(peaks, 3)
     found = best[textured] if textured.any() else best.ravel()
     low, high = (float(x) for x in np.quantile(found, [0.002, 0.998]))
-    margin_px = 0.5 * (disparities[1] - disparities[0]) + _MARGIN
+    step = disparities[1] - disparities[0]
+    margin_px = step + _MARGIN_OF_SLICES if evidence.white else 0.5 * step + _MARGIN
     return max(low - margin_px, -1.2 * widest), min(high + margin_px, 1.2 * widest)

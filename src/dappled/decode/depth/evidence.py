@@ -36,7 +36,8 @@ class Evidence:
     `stack.views` are the views without any shrinking: unbiased, and noisier than the views made for display. `white`
     says that n is the frame's own white noise and each sample a measurement of its own; else it is a guess from the
     views. `made` are the views of a masked frame as they were made for display (grey), where the frame has next to no
-    noise and they were plainly inverted; else None.
+    noise and they were plainly inverted; else None. `middle` is the middle view of a masked frame as it was made for
+    display (grey): its edges are where they are in the scene.
     """
 
     stack: ViewStack
@@ -44,6 +45,11 @@ class Evidence:
     weights: NDArray[np.float64]
     white: bool
     made: ViewStack | None = None
+    middle: Image | None = None
+
+    def shown(self) -> Image:
+        """The grey middle view to look for edges in."""
+        return self.stack.middle() if self.middle is None else self.middle
 
     def lags(self) -> NDArray[np.float64]:
         """(2V−1, 2U−1) sums of W over pairs of views with the same separation."""
@@ -109,6 +115,7 @@ def of_light_field(field: LightField) -> Evidence:
         weights,
         white=True,
         made=_noise_free(stack.grey(), weights, field),
+        middle=stack.grey().middle(),
     )
 
 
