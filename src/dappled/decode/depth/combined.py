@@ -35,8 +35,9 @@ _SPREAD_CLEAN = 0.055  # variance over information, measured on the seeds of ben
 # Of noisy masked frames, measured on the masked frames of benchmarks/depth.py, seeds 1 and 2.
 _VOTE_WINDOW = 11  # px
 _SMALL_HALVES, _LARGE_HALVES = 8.0, 32.0
-_SPREAD_HALVES, _SAMPLES_HALVES = 2.0, 60.0  # variance over information; of the votes, as in `confidence`
+_SPREAD_HALVES, _SAMPLES_HALVES = 2.0, 40.0  # variance over information; of the votes, as in `confidence`
 _AGREE = 0.1  # px/view: a peak of the whole aperture's likelihood so near is that of the same surface
+_SCATTER_WHOLE = 1.15  # the variance of the whole aperture's peak, beyond what `judged` supposes
 _ONE_SURFACE = 0.4  # px/view: with a larger range of disparities around there is a jump
 _HALO = 6  # px: by so much near things are too large before the middle view's edges decide
 _ASTRAY, _DRAWN = 0.5, 0.25  # of a step: a peak of another surface; how far selected peaks are off
@@ -110,7 +111,7 @@ def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
         np.where(agree, fine, rough.disparity),
         curvature,
         rough.confidence,
-        spread=spread,
+        spread=_SCATTER_WHOLE * spread,
         window=window,
         method="combined",
     )

@@ -84,24 +84,27 @@ def unexplained(part: Part, disparities: NDArray[np.float64], *, workers: int = 
     count, height, width = part.measured.shape
     shape = fft.next_fast_len(height + 2 * _PAD), fft.next_fast_len(width + 2 * _PAD, real=True)
     margins = ((0, 0), (_PAD, shape[0] - height - _PAD), (_PAD, shape[1] - width - _PAD))
-    spectra = fft.rfft2(np.pad(part.measured, margins, mode="symmetric"), workers=workers)
+    padded = np.pad(part.measured, margins, mode="symmetric").transpose(1, 0, 2)
+    spectra = np.ascontiguousarray(fft.rfft2(padded, axes=(0, 2), workers=workers))  # (fy, c, fx)
     fy, fx = fft.fftfreq(shape[0]), fft.rfftfreq(shape[1])
-    matrix = part.matrix.astype(np.float32)
-    expected = np.float32((count - 1) / 2)
+    # For products (c, j) @ (j, fx), one a row: too small for BLAS to start threads of its own.
+    matrix = part.matrix.astype(np.complex64)
+    floor, expected = np.float32(1 / part.variance), np.float32((count - 1) / 2)
     out = np.empty((len(disparities), height, width), dtype=np.float32)
 
     def one(number: int) -> None:
         turns = -2j * np.pi * disparities[number]
-        rows = np.exp(turns * np.outer(part.steps[:, 0], fy)).astype(np.complex64)
+        rows = np.exp(turns * np.outer(fy, part.steps[:, 0])).astype(np.complex64)
         columns = np.exp(turns * np.outer(part.steps[:, 1], fx)).astype(np.complex64)
-        shears = (rows[:, :, None] * columns[:, None, :]).reshape(len(part.steps), -1)
-        gains = ((matrix @ shears.real) + 1j * (matrix @ shears.imag)).reshape(spectra.shape)
-        weight = np.einsum("cyx,cyx->yx", gains.real, gains.real) + np.einsum("cyx,cyx->yx", gains.imag, gains.imag)
-        picture = np.einsum("cyx,cyx->yx", gains.conj(), spectra) / (weight + np.float32(1 / part.variance))
-        gains *= -picture
+        gains = (rows[:, None, :] * matrix) @ columns
+        weight = np.einsum("ycx,ycx->yx", gains.view(np.float32), gains.view(np.float32)).reshape(
+            *spectra.shape[::2], 2
+        )
+        picture = np.einsum("ycx,ycx->yx", gains.conj(), spectra) / (weight.sum(axis=2) + floor)
+        gains *= -picture[:, None]
         gains += spectra
-        left = fft.irfft2(gains, s=shape)[:, _PAD : _PAD + height, _PAD : _PAD + width]
-        np.einsum("cyx,cyx->yx", left, left, out=out[number])
+        left = fft.irfft2(gains, s=shape, axes=(0, 2))[_PAD : _PAD + height, :, _PAD : _PAD + width]
+        np.einsum("ycx,ycx->yx", left, left, out=out[number])
         out[number] *= 0.5
         out[number] -= expected
 
