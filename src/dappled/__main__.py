@@ -19,6 +19,10 @@ def main() -> int:
         return command(loaded=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))
     except KeyboardInterrupt:  # while it told how the verb had failed
         return INTERRUPTED
+    finally:
+        # An interruption that passed through exec() of a text, as dataclasses are made by, is remembered though it was
+        # caught, and `python -m` ends by SIGINT instead of with the code. The next such exec() forgets it.
+        exec("")  # noqa: S102
 
 
 if __name__ == "__main__":

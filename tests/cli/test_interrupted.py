@@ -44,6 +44,27 @@ def test_an_interruption_while_modules_load_ends_without_a_word(module: str) -> 
     assert (done.returncode, done.stdout, done.stderr) == (INTERRUPTED, "", "")
 
 
+# The same for `python -m`, where a stop comes while text is made into code, as it is for each dataclass.
+_STOPS_ITSELF = """
+import sys
+from importlib.abc import MetaPathFinder
+class Watch(MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name == "dappled.mocks.simulation":
+            exec("import os, signal; os.kill(os.getpid(), signal.SIGTERM)")
+sys.meta_path.insert(0, Watch())
+"""
+
+
+def test_a_stop_while_code_is_made_has_the_exit_code_of_an_interruption(tmp_path: Path) -> None:
+    (tmp_path / "sitecustomize.py").write_text(_STOPS_ITSELF)
+    done = subprocess.run(
+        [sys.executable, "-m", "dappled", "run", "--simulate"], cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (INTERRUPTED, "", "")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("pages", [0, 1, 24])
 def test_a_run_ends_in_order_with_pages_open(tmp_path: Path, pages: int) -> None:
