@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from dappled.decode.depth import estimate, evidence
-from dappled.decode.lightfield import LightField
+from dappled.decode.lightfield import LightField, ViewStack
+from dappled.decode.lightfield.light_field import centred
 from tests.decode.scenes import Board, paint
 
 
@@ -30,3 +32,19 @@ def test_views_count_only_without_noise_and_without_the_joint_model() -> None:
     by_views = estimate.estimate(evidence.of_views(clean.made), between=(-1, 1.5))
     np.testing.assert_array_equal(estimate.estimate(clean, between=(-1, 1.5)).disparity, by_views.disparity)
     assert estimate.estimate(clean, "contrast", between=(-1, 1.5)).known_share() == 0  # its slices are empty
+
+
+@pytest.mark.parametrize(("shape", "kept"), [((9, 9), (5, 5)), ((5, 5), (5, 5)), ((1, 9), (1, 5)), ((8, 7), (8, 4))])
+def test_every_second_of_many_views_is_left_and_the_outermost_ones_stay(
+    shape: tuple[int, int], kept: tuple[int, int]
+) -> None:
+    rng = np.random.default_rng(1)
+    views = rng.random((*shape, 12, 14), dtype=np.float32)
+    whole = evidence.of_views(ViewStack(views, centred(shape[0]), centred(shape[1])), 0.1)
+    fewer = evidence.thinned(whole)
+    assert fewer.stack.views.shape[:2] == kept
+    assert fewer.stack.reach == whole.stack.reach
+    np.testing.assert_allclose(fewer.images, fewer.stack.views * fewer.weights[0, 0], rtol=1e-5)
+    assert fewer.weights.shape == (kept[0] * kept[1],) * 2
+    np.testing.assert_array_equal(fewer.stack.views[0, 0], views[0, 0])
+    np.testing.assert_array_equal(fewer.stack.views[-1, -1], views[-1, -1])

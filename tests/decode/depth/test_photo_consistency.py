@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.depth.photo_consistency import compared, differences
+from dappled.decode.depth.photo_consistency import STRIP, compared, differences
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.light_field import centred
 from tests.decode.scenes import Board, paint
@@ -42,3 +42,15 @@ def test_the_better_half_of_the_arms_counts() -> None:
     stack.views[1, 0] = 5
     assert differences(stack, np.zeros(1), limit=0.25).max() == pytest.approx(0.25, rel=1e-4)
     assert compared(stack) == 2
+
+
+@pytest.mark.parametrize("every", [1, 2, 3, 9])
+@pytest.mark.parametrize("height", [STRIP - 5, 3 * STRIP, 5 * STRIP + 7])
+def test_some_strips_are_those_of_the_whole(height: int, every: int) -> None:
+    stack, _ = paint([Board(0.3)], (height, 40), 3)
+    whole = differences(stack, DISPARITIES, limit=np.inf)
+    some = differences(stack, DISPARITIES, limit=np.inf, every=every)
+    strips = [whole[:, top : top + STRIP] for top in range(0, height, STRIP)]
+    first = next(k for k, strip in enumerate(strips) if np.array_equal(strip, some[:, : strip.shape[1]]))
+    assert 0 <= first < every
+    np.testing.assert_array_equal(some, np.concatenate(strips[first::every], axis=1))

@@ -8,6 +8,7 @@ edges then decide to which side the pixels at a jump of disparity belong.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from dappled.decode.depth.depth_map import DepthMap, Map, Search, Volume, box, c
 from dappled.decode.depth.edges import levelled, sharpened
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.depth.halves import Part, best_half, unexplained, voted, whole
-from dappled.decode.depth.photo_consistency import WINDOW, compared, differences
+from dappled.decode.depth.photo_consistency import STRIP, WINDOW, compared, differences
 from dappled.decode.lightfield import ViewStack
 from dappled.workers import each
 
@@ -28,7 +29,7 @@ _NEGLIGIBLE = 0.3  # with a smaller share contrast only enlarges what is near
 _SMALL, _LARGE = 4.0, 30.0  # P1 and P2, in units of the log-likelihood
 _SMALL_CLEAN, _LARGE_CLEAN = 2.0, 8.0  # the same where views are clean: it has fewer samples
 _OUTLIER = 20.0  # variances: a view that differs by more sees something else
-_SAMPLE = 160  # px a side: as much of the middle tells how well views agree
+_SAMPLE = 12_000  # px, in strips over the whole height: as many tell how well views agree
 _NARROW = 5  # px: the window in which noisy views are compared
 _LEAST_VARIANCE = 1e-8
 _SPREAD_CLEAN = 0.055  # variance over information, measured on the seeds of benchmarks/depth.py
@@ -180,11 +181,9 @@ def _texture(stack: ViewStack) -> float:
 def _disagreement(stack: ViewStack, disparities: NDArray[np.float64], workers: int) -> float:
     """The variance of a view about the scene at its best disparity: noise, interpolation, gloss; median over pixels."""
     height, width = stack.views.shape[2:]
-    most = _SAMPLE + 2 * int(np.abs(disparities).max() * stack.reach)
-    top, left = max(0, (height - most) // 2), max(0, (width - most) // 2)
-    part = np.ascontiguousarray(stack.views[:, :, top : top + most, left : left + most])
-    sample = ViewStack(part, stack.row_steps, stack.column_steps)
-    least = differences(sample, disparities, limit=np.inf, workers=workers).min(axis=0)
+    strips = max(2, math.ceil(_SAMPLE / (STRIP * width)))
+    every = max(1, math.ceil(height / STRIP) // strips)
+    least = differences(stack, disparities, limit=np.inf, every=every, workers=workers).min(axis=0)
     return max(float(np.median(least)) / (2 * max(1, compared(stack))), _LEAST_VARIANCE)
 
 

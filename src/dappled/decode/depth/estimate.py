@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from dappled.decode.depth import combined, contrast, halves, stereo
 from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
-from dappled.decode.depth.evidence import Evidence, of_views
+from dappled.decode.depth.evidence import Evidence, of_views, thinned
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
@@ -65,6 +65,7 @@ def search(evidence: Evidence, low: float, high: float, *, window: int | None = 
 
 def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, float]:
     """The disparities between which the scene lies, with a margin: what they explain of pictures made smaller."""
+    evidence = evidence if evidence.white else thinned(evidence)
     stack = evidence.stack
     height, width = stack.views.shape[2:]
     factor = max(1, math.ceil(max(height, width) / _COARSE_SIDE))

@@ -11,7 +11,7 @@ views Q = Kᵀ B/n and the weights W = Kᵀ K/n.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ _LEAST_NOISE = 1e-9  # variance: float32
 _NOISE_FREE = 5e-3  # of the variance of a view's fine detail
 _UNMEASURED = 1e-6  # of the weight of what was measured best
 _DETAIL = 3.0  # px: sigma
+_MANY = 7  # views a side
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +80,16 @@ def of_views(stack: ViewStack, noise_rms: float | None = None) -> Evidence:
     variance = _LEAST_NOISE + (noise_rms**2 if noise_rms is not None else view_noise(grey.views))
     count = grey.views.shape[0] * grey.views.shape[1]
     return Evidence(grey, grey.views / np.float32(variance), np.eye(count) / variance, white=noise_rms is not None)
+
+
+def thinned(evidence: Evidence) -> Evidence:
+    """The same of every second row and column of many plain views; the outermost ones and the middle one stay."""
+    stack = evidence.stack
+    rows, columns = (2 if count >= _MANY and count % 2 else 1 for count in stack.views.shape[:2])
+    images, views = evidence.images[::rows, ::columns], stack.views[::rows, ::columns]
+    kept = np.arange(evidence.weights.shape[0]).reshape(stack.views.shape[:2])[::rows, ::columns].ravel()
+    fewer = ViewStack(views, stack.row_steps[::rows], stack.column_steps[::columns], stack.sensor_px_per_disparity)
+    return replace(evidence, stack=fewer, images=images, weights=evidence.weights[np.ix_(kept, kept)])
 
 
 def of_light_field(field: LightField) -> Evidence:

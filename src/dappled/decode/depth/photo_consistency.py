@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +15,18 @@ from dappled.decode.lightfield.light_field import Image
 from dappled.workers import each
 
 _SMOOTH_PX = 0.6  # sigma: what linear interpolation does to a picture depends less on the fraction then
-_TILE = 32  # rows at a time: what is worked on stays in the processor's cache
+STRIP = 32  # rows at a time: what is worked on stays in the processor's cache
 WINDOW = 3  # px
 
 
 def differences(
-    stack: ViewStack, disparities: NDArray[np.float64], *, limit: float, window: int = WINDOW, workers: int = 1
+    stack: ViewStack,
+    disparities: NDArray[np.float64],
+    *,
+    limit: float,
+    window: int = WINDOW,
+    every: int = 1,
+    workers: int = 1,
 ) -> Image:
     """float32 (D, h, w): squared difference of the views from the middle one, summed over the better half of the arms.
 
@@ -27,17 +34,17 @@ def differences(
     right, above and below it, of each the nearest and the outermost (the others tell hardly more). Behind an edge some
     arms see something else and the others don't: those with the smaller sums count, so near edges stay where they are.
 
-    Grey views; each squared difference counts up to `limit` at most, as the mean over `window` px a side.
+    Grey views; each squared difference counts up to `limit` at most, as the mean over `window` px a side. `every`: of
+    so many strips of `STRIP` rows one is looked at, and the others are left out of the result.
     """
-    views = ndimage.gaussian_filter(stack.views, (0, 0, _SMOOTH_PX, _SMOOTH_PX))
     v0, u0 = (int(np.argmin(np.abs(steps))) for steps in (stack.row_steps, stack.column_steps))
-    middle = views[v0, u0]
+    middle = _smooth(stack.views[v0, u0])
     height, width = middle.shape
     most = float(np.abs(disparities).max()) * stack.reach
     half = window // 2
     pad = math.ceil(most) + 2 + half
-    beside = {k: np.pad(views[v0, k], pad, mode="edge") for _, k, _ in _arms(stack.column_steps, u0)}
-    above = {k: np.pad(views[k, u0], pad, mode="edge") for _, k, _ in _arms(stack.row_steps, v0)}
+    beside = {k: np.pad(_smooth(stack.views[v0, k]), pad, mode="edge") for _, k, _ in _arms(stack.column_steps, u0)}
+    above = {k: np.pad(_smooth(stack.views[k, u0]), pad, mode="edge") for _, k, _ in _arms(stack.row_steps, v0)}
     sides = [
         (axis, [(lines[k], step) for sign, k, step in _arms(steps, at) if sign == side])
         for axis, lines, steps, at in ((1, beside, stack.column_steps, u0), (0, above, stack.row_steps, v0))
@@ -45,11 +52,14 @@ def differences(
     ]
     arms = [(axis, chosen) for axis, chosen in sides if chosen]
     wide = np.pad(middle, half, mode="edge")
-    out = np.empty((len(disparities), height, width), dtype=np.float32)
+    tops = range(0, height, STRIP)[(len(range(0, height, STRIP)) - 1) % every // 2 :: every]
     most_counted = np.float32(limit)
+    counts = [min(STRIP, height - top) for top in tops]
+    begins = dict(zip(tops, accumulate(counts, initial=0), strict=False))
+    out = np.empty((len(disparities), sum(counts), width), dtype=np.float32)
 
     def one(top: int) -> None:
-        rows = min(_TILE, height - top) + 2 * half
+        rows = min(STRIP, height - top) + 2 * half
         target = wide[top : top + rows]
         for number, disparity in enumerate(disparities):
             found = []
@@ -64,9 +74,9 @@ def differences(
                     np.minimum(made, most_counted, out=made)
                     total += made
                 found.append(_mean(total, window))
-            out[number, top : top + rows - 2 * half] = _better(found)
+            out[number, begins[top] : begins[top] + rows - 2 * half] = _better(found)
 
-    each(one, range(0, height, _TILE), workers)
+    each(one, tops, workers)
     return out
 
 
@@ -87,6 +97,11 @@ def _arms(steps: NDArray[np.float64], at: int) -> list[tuple[int, int, float]]:
     chosen = [(-1, k) for k in sorted({before[0], before[-1]} if before else ())]
     chosen += [(1, k) for k in sorted({after[0], after[-1]} if after else ())]
     return [(sign, k, float(steps[k] - steps[at])) for sign, k in chosen]
+
+
+def _smooth(view: Image) -> Image:
+    made: Image = ndimage.gaussian_filter(view, _SMOOTH_PX)
+    return made
 
 
 def _shifted(image: Image, shifts: tuple[float, float], corner: tuple[int, int], shape: tuple[int, ...]) -> Image:
