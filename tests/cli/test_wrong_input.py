@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -150,3 +151,24 @@ def test_the_same_frame_as_it_is_passes_without_a_doubt(masked: NDArray[np.float
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
     assert light_files.load(tmp_path / "f.npz").attributes["doubts"] == []
     assert main(["calibrate", *words, "-o", str(tmp_path / "c.toml")]) == 0
+
+
+def test_vignetting_is_a_doubt_unless_a_white_frame_takes_it_off(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    y, x = (np.linspace(-1, 1, side) for side in QUARTER.shape)
+    masked = replace(SHOT, scene="white").frame()
+    lens = 1 - 0.25 * (y[:, None] ** 2 + x**2)
+    frame = dng_of(tmp_path / "f.dng", SHOT, masked * lens)
+    white = dng_of(tmp_path / "w.dng", SHOT, np.full(QUARTER.shape, 0.4) * lens)
+    words = ["decode", str(frame), *quarter(tmp_path), "-o", str(tmp_path / "f.npz"), "--overwrite"]
+    assert main(words) == 0
+    assert "in doubt: its corners have " in capsys.readouterr().out
+    attributes = light_files.load(tmp_path / "f.npz").attributes
+    lost, sigma = attributes["falloff"]
+    assert abs(lost - 0.5) < 3 * sigma
+    assert any("give a white frame" in doubt for doubt in attributes["doubts"])
+    assert main([*words, "--white", str(white)]) == 0
+    assert "its corners" not in capsys.readouterr().out
+    attributes = light_files.load(tmp_path / "f.npz").attributes
+    assert (attributes["falloff"], attributes["doubts"]) == (None, [])

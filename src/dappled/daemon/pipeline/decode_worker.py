@@ -213,7 +213,7 @@ class LawLooks:
 
     def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
         """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""
-        doubts = [words for words in (done.report.doubt, done.calibration_doubt) if words]
+        doubts = [words for words in (done.report.doubt, done.calibration_doubt, done.falloff_doubt) if words]
         if done.report.carriers_from == "measured" or _lens(done) not in self._unseen:
             return done.carriers_found, doubts
         observable, missing = self._unseen[_lens(done)]

@@ -25,6 +25,7 @@ from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.lightfield.clipping import unknown_where_clipped
 from dappled.decode.lightfield.colour_views import dc_views, in_colour
+from dappled.decode.lightfield.falloff import Falloff, falloff
 from dappled.decode.optics import LAWS
 from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
@@ -121,7 +122,7 @@ class DecodeResult:
 
     `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubt` is what
     the calibration itself was in doubt about, `exposed` how the file's values are, `not_linear` why they may not follow
-    the light.
+    the light, `falloff` what light the corners lose, None for lenslets, with a white frame, and where nothing tells.
     """
 
     light_field: LightField
@@ -132,6 +133,12 @@ class DecodeResult:
     checked: LawCheck | None = None
     calibration_doubt: str | None = None
     not_linear: tuple[str, ...] = ()
+    falloff: Falloff | None = None
+
+    @property
+    def falloff_doubt(self) -> str | None:
+        """What the lens takes from the corners, where that is large and sure, in a sentence; else None."""
+        return None if self.falloff is None else self.falloff.doubt
 
     @property
     def search(self) -> LawSearch | None:
@@ -248,8 +255,12 @@ class Darkroom:
         with _timed(ms, "exposure"):
             exposed = exposure(raw)
         bent = tuple(not_linear(raw, exposed)) if isinstance(decoder, MaskDecoder) else ()
-        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), bent)
-        doubts = (made.contradiction, made.unsettled, report.doubt, made.calibration_doubt, *bent)
+        lost: Falloff | None = None
+        if isinstance(decoder, MaskDecoder) and not self.recipe.white:
+            lost = falloff(light_field.slices[0].real)
+        attributes["falloff"] = None if lost is None else [lost.lost, lost.sigma]
+        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), bent, lost)
+        doubts = (made.contradiction, made.unsettled, report.doubt, made.calibration_doubt, made.falloff_doubt, *bent)
         attributes["doubts"] = [words for words in doubts if words]
         if self._checks and not made.observable:
             attributes["carriers_found"] = None
