@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dappled.decode.depth import combined, estimate, evidence, stereo
+from dappled.decode.depth import estimate, evidence, stereo
 from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.light_field import ViewStack, centred
@@ -146,15 +146,6 @@ def test_windows_sum_and_tell_their_variance() -> None:
     weight = windowed(np.ones((1, 40, 40), np.float32), 13)[0][0, 20, 20]
     # The variance of the weighted mean is `spread` times one sample's over the sum of weights.
     assert np.var(made[0, 20:-20, 20:-20] / weight) == pytest.approx(spread / weight, rel=0.15)
-
-
-def test_neighbours_decide_where_a_pixel_cannot() -> None:
-    cost = np.zeros((5, 20, 20), np.float32)
-    cost[:, :, :] = np.abs(np.arange(5) - 3)[:, None, None]
-    cost[:, 10, 10] = 0.1 * np.abs(np.arange(5) - 1)  # a weak opinion of its own
-    made = combined.smoothed(cost, small=0.5, large=2.0, workers=2)
-    assert (made.argmin(axis=0) == 3).all()
-    np.testing.assert_array_equal(made, combined.smoothed(cost, small=0.5, large=2.0))
 
 
 def test_the_picture_of_each_view_has_moved_by_its_step() -> None:

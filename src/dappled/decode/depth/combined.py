@@ -8,31 +8,26 @@ edges then decide to which side the pixels at a jump of disparity belong.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
+from dappled.decode.depth import clean
 from dappled.decode.depth import contrast as depth_contrast
+from dappled.decode.depth.clean import LEAST_VARIANCE, agreement
 from dappled.decode.depth.depth_map import DepthMap, Map, Search, Volume, box, confidence, judged, peaked, windowed
 from dappled.decode.depth.edges import levelled, sharpened
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.depth.halves import Part, best_half, unexplained, voted, whole
-from dappled.decode.depth.photo_consistency import STRIP, WINDOW, compared, differences
+from dappled.decode.depth.matching import smoothed
+from dappled.decode.depth.photo_consistency import WINDOW, Lines
 from dappled.decode.lightfield import ViewStack
-from dappled.workers import each
 
 _CLEAN, _NOISY = 2.0, 200.0  # contrast's share beside photo-consistency, by noise over texture and its square
 _NEGLIGIBLE = 0.3  # with a smaller share contrast only enlarges what is near
 _SMALL, _LARGE = 4.0, 30.0  # P1 and P2, in units of the log-likelihood
-_SMALL_CLEAN, _LARGE_CLEAN = 2.0, 8.0  # the same where views are clean: it has fewer samples
-_OUTLIER = 20.0  # variances: a view that differs by more sees something else
-_SAMPLE = 12_000  # px, in strips over the whole height: as many tell how well views agree
 _NARROW = 5  # px: the window in which noisy views are compared
-_LEAST_VARIANCE = 1e-8
-_SPREAD_CLEAN = 0.055  # variance over information, measured on the seeds of benchmarks/depth.py
 # Of noisy masked frames, measured on the masked frames of benchmarks/depth.py, seeds 1 and 2.
 _VOTE_WINDOW = 11  # px
 _SMALL_HALVES, _LARGE_HALVES = 8.0, 32.0
@@ -41,8 +36,6 @@ _AGREE = 0.1  # px/view: a peak of the whole aperture's likelihood so near is th
 _SCATTER_WHOLE = 1.15  # the variance of the whole aperture's peak, beyond what `judged` supposes
 _ONE_SURFACE = 0.4  # px/view: with a larger range of disparities around there is a jump
 _HALO = 6  # px: by so much near things are too large before the middle view's edges decide
-_ASTRAY, _DRAWN = 0.5, 0.25  # of a step: a peak of another surface; how far selected peaks are off
-_PULL = 0.3  # of how far neighbours moved the peak
 
 
 def depth(evidence: Evidence, search: Search) -> DepthMap:
@@ -50,47 +43,21 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
     if evidence.white:
         return _of_slices(evidence, search)
     disparities, stack = search.disparities(), evidence.stack
-    variance = _disagreement(stack, disparities, search.workers)
+    lines = Lines.of(stack, disparities, window=search.window or WINDOW)
+    told = agreement(stack, lines, disparities, workers=search.workers)
+    variance = told.typical
     # Where noise is as strong as texture, one view can't be compared with another: contrast takes over.
-    noise = variance / max(_texture(stack), _LEAST_VARIANCE)
+    noise = variance / max(_texture(stack), LEAST_VARIANCE)
     share = min(1.0, _CLEAN * noise + _NOISY * noise**2)
-    window = search.window or WINDOW
-    cost = differences(stack, disparities, limit=_OUTLIER * variance, window=window, workers=search.workers)
-    cost *= np.float32(1 / (4 * variance))  # a difference has twice the variance
     if share < _NEGLIGIBLE:
-        return _of_clean(cost, stack, search, window)
+        return clean.depth(stack, lines, search, told)
+    cost = clean.unlikely(lines, search, variance)
     contrast = _by_contrast(evidence, search)
     # The evidence counted in variances of a guessed noise; now it is known how well views agree.
     weight = np.float32(share / contrast.samples * _guessed(evidence) / variance)
     both = np.subtract(np.multiply(contrast.likelihood, weight, out=contrast.likelihood), cost, out=cost)
     samples = contrast.samples * box(_NARROW) ** 2
     return _decided(_Seen(both, contrast.spread, samples), search, _NARROW, widen=True)
-
-
-def _of_clean(cost: Volume, stack: ViewStack, search: Search, window: int) -> DepthMap:
-    """By photo-consistency alone: the peak that neighbours select, and jumps of disparity at the picture's edges."""
-    disparities = search.disparities()
-    smooth = smoothed(cost, small=_SMALL_CLEAN, large=_LARGE_CLEAN, workers=search.workers)
-    start = smooth.argmin(axis=0)
-    np.negative(smooth, out=smooth)
-    np.negative(cost, out=cost)
-    selected, _ = peaked(smooth, disparities, start)
-    own, curvature = peaked(cost, disparities, start)
-    best = np.take_along_axis(cost, start[None], axis=0)[0]
-    sure = confidence(cost, best, compared(stack) / window**2)
-    # Where even the best disparity leaves more than noise (gloss, edges), its error is as much larger.
-    curvature /= np.maximum(best / (-0.5 * compared(stack)), 1)
-    # The selected peak is drawn towards the disparities that were tried, a pixel's own one has more noise.
-    drawn = (_DRAWN * search.step) ** 2
-    astray = own - selected
-    mixed = drawn * curvature / (drawn * curvature + np.float32(_SPREAD_CLEAN))
-    disparity = selected + np.where(np.abs(astray) < _ASTRAY * search.step, mixed, 0) * astray
-    found = judged(
-        disparity.astype(np.float32), curvature, sure, spread=_SPREAD_CLEAN, window=window, method="combined"
-    )
-    sigma = np.hypot(found.sigma, _PULL * np.abs(astray))
-    sharp, error = sharpened(found.disparity, sigma.astype(np.float32), stack.middle())
-    return replace(found, disparity=sharp, sigma=error)
 
 
 def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
@@ -176,50 +143,3 @@ def _texture(stack: ViewStack) -> float:
     """The variance of the middle view's fine detail."""
     middle = stack.middle()
     return float(np.var(middle - ndimage.gaussian_filter(middle, 3.0)))
-
-
-def _disagreement(stack: ViewStack, disparities: NDArray[np.float64], workers: int) -> float:
-    """The variance of a view about the scene at its best disparity: noise, interpolation, gloss; median over pixels."""
-    height, width = stack.views.shape[2:]
-    strips = max(2, math.ceil(_SAMPLE / (STRIP * width)))
-    every = max(1, math.ceil(height / STRIP) // strips)
-    least = differences(stack, disparities, limit=np.inf, every=every, workers=workers).min(axis=0)
-    return max(float(np.median(least)) / (2 * max(1, compared(stack))), _LEAST_VARIANCE)
-
-
-def smoothed(cost: Volume, *, small: float, large: float, workers: int = 1) -> Volume:
-    """Semi-global matching (Hirschmüller 2008): float32 (D, h, w), the mean over four directions.
-
-    Along each direction the best path's cost is L(p, d) = C(p, d) + min(L(q, d), L(q, d±1) + P1, min L(q) + P2)
-    − min L(q), q being the pixel before p. `small` and `large` are P1 and P2 in the cost's unit.
-    """
-    total = np.empty_like(cost)
-    for axis in (0, 1):
-        lines = np.ascontiguousarray(np.moveaxis(cost, axis + 1, 0))  # (n, D, m)
-        paths = [np.empty_like(lines), np.empty_like(lines)]
-
-        def one(way: int, lines: Volume = lines, paths: list[Volume] = paths) -> None:
-            _along(lines[::-1] if way else lines, paths[way][::-1] if way else paths[way], small, large)
-
-        each(one, (0, 1), workers)
-        paths[0] += paths[1]
-        if axis == 0:
-            total[...] = np.moveaxis(paths[0], 0, 1)
-        else:
-            total += np.moveaxis(paths[0], 0, 2)
-    total *= np.float32(0.25)
-    return total
-
-
-def _along(lines: Volume, out: Volume, small: float, large: float) -> None:
-    """The paths' costs (n, D, m) from the first line to the last."""
-    out[0] = lines[0]
-    for i in range(1, len(lines)):
-        previous, best = out[i - 1], out[i]
-        least = previous.min(axis=0)
-        np.minimum(previous, least + np.float32(large), out=best)
-        if len(best) > 1:
-            np.minimum(best[1:], previous[:-1] + np.float32(small), out=best[1:])
-            np.minimum(best[:-1], previous[1:] + np.float32(small), out=best[:-1])
-        best -= least
-        best += lines[i]

