@@ -24,9 +24,10 @@ _STRIPS = 4  # in each direction
 _TURNS = 10  # of the fit
 _LARGE_SLOPE = 0.7  # robust standard deviations: from here on a slope counts less
 _OWN = 0.05  # of the logarithm: the least standard error; a scene's light is never even to less
+_STRIPS_ARE_ALIKE = 1.35  # times their scatter: 68 % of errors before boards are within, as strips share edges
 # What is a doubt: see the figures in docs/decoding.md.
 _LEAST_LOST, _MOST_LOST = 0.22, 0.65
-_LEAST_SIGMAS = 5.0  # of the logarithm
+_LEAST_SIGMAS = 3.75  # of the logarithm
 _MOST_AGAINST = 1  # strips
 
 
@@ -78,7 +79,7 @@ def falloff(picture: NDArray[np.floating]) -> Falloff | None:
         ]
     )
     whole = _common_bend(down, across, between_y, between_x)
-    sigma = math.hypot(float(each.std(ddof=1)) / math.sqrt(len(each)), _OWN)
+    sigma = math.hypot(_STRIPS_ARE_ALIKE * float(each.std(ddof=1)) / math.sqrt(len(each)), _OWN)
     left = math.exp(min(whole, 1.0))
     return Falloff(1 - left, left * sigma, int(np.sum(each > 0)))
 
