@@ -26,6 +26,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.optics import Mask, Sensor
+from dappled.drivers.raw.raw_file import WHITE_SHARE
 from dappled.mocks.scene.ray_camera import RayCamera
 from dappled.mocks.scene.sharp_boards import SharpBoard
 from dappled.products.exports import prints
@@ -206,7 +207,8 @@ def at_every_sample(sigma: NDArray[np.float32], shape: tuple[int, ...]) -> NDArr
 def reached(frame: Frame, f_number: float = F_NUMBER) -> Reached:
     """Decode a frame both ways."""
     known = calibrated(frame)
-    decoder = MaskDecoder(known.sensor, MASK, "geometric", DISTANCE_MM, known)
+    clipped = (frame.plane >= WHITE_SHARE).astype(np.float32)
+    decoder = MaskDecoder(known.sensor, MASK, "geometric", DISTANCE_MM, known, clipped=clipped)
     began = time.process_time()
     joint = decoder.decode(frame.plane, focal_length_mm=FOCAL_MM, f_number=f_number)
     took = time.process_time() - began

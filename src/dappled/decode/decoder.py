@@ -14,6 +14,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.array_types import Singles
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import (
@@ -25,8 +26,8 @@ from dappled.decode.lightfield.aperture import (
     own_transfer,
     shown_aperture,
     transfer,
-    used_aperture,
 )
+from dappled.decode.lightfield.clipping import clipped_shares
 from dappled.decode.lightfield.frame_views import TakenSlices, place_of, views_of
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.mask_place import MaskPlace, cycles_per_radian
@@ -164,7 +165,8 @@ class MaskDecoder:
     says that the planes are colour mosaics. `taper` apodises the bands, see `slices.extract`. `at` is this frame's own
     lattice where a search has found it, `ratio` the matrix, row by row, of the lattice found in a flight over the
     law's: a print scaled and turned. Without `joint_views` the views are made quickly, each spatial frequency alike
-    (see `views`): depth is computed from slices and needs no better ones. `buffers` are reused from frame to frame.
+    (see `views`): depth is computed from slices and needs no better ones. `clipped` (H, W) is 1 where this frame's
+    pixels are clipped, else 0; None: nowhere. `buffers` are reused from frame to frame.
     """
 
     sensor: Sensor
@@ -181,6 +183,7 @@ class MaskDecoder:
     at: Lattice | None = None
     ratio: tuple[float, float, float, float] | None = None
     joint_views: bool = True
+    clipped: Singles | None = None
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     def __post_init__(self) -> None:
@@ -395,6 +398,9 @@ class MaskDecoder:
             row_over_column=down / across,
             noise_variance=noise_rms**2 * slices.band,
             colours=self.colours,
+            clipped=None
+            if self.clipped is None
+            else clipped_shares(self.clipped, slices.values.shape[1:], slices.grid) > 0,
         )
         width: UsedAperture | None = None
         place: MaskPlace | None = None
@@ -411,7 +417,7 @@ class MaskDecoder:
                 rotation_rad=rotation,
                 aperture=taken.aperture,
             )
-            taken = replace(taken, kappa_cycles=width.kappa, aperture=width.aperture)
+            taken = taken.through(width)
             through = taken.aperture.transform(angular_frequencies(taken.orders, width.kappa, rotation)).real
             keep = np.abs(through) > _LEAST_THROUGH
             if np.linalg.matrix_rank([order for order, usable in zip(taken.orders, keep, strict=True) if usable]) < 2:
@@ -458,8 +464,8 @@ class MaskDecoder:
         corner = at_corner(known.origin, lattice, self.sensor.shape)
         transfers = transfer(taken.orders, [magnitudes[order] for order in taken.orders], corner)
         taken = replace(taken, transfers=transfers, rotation_rad=known.rotation_rad)
-        width = self._width(taken, known)
-        found = replace(taken, kappa_cycles=width.kappa, aperture=width.aperture)
+        width = taken.width(distance_known=known.distance_fitted)
+        found = taken.through(width)
         if not self.joint_views:
             return found, width, None
         turned = cycles_per_radian(lattice, self.sensor)
@@ -471,10 +477,10 @@ class MaskDecoder:
             values=place.undone(taken.values, taken.orders, turned, taken.samples_px),
             transfers=transfers * transfer(taken.orders, np.ones(len(transfers)), place.periods),
         )
-        again = self._width(moved, known)
+        again = moved.width(distance_known=known.distance_fitted)
         if width.fits and not again.fits:
             return found, width, None
-        return replace(moved, kappa_cycles=again.kappa, aperture=again.aperture), again, place
+        return moved.through(again), again, place
 
     def _shown(
         self, width: UsedAperture | None, turns: float, focal_length_mm: float
@@ -486,14 +492,3 @@ class MaskDecoder:
         shown = turns / width.kappa
         known = self.calibration.nearest(focal_length_mm).distance_fitted
         return shown, shown * width.sigma / width.kappa if known else None
-
-    def _width(self, taken: TakenSlices, known: LatticeFit) -> UsedAperture:
-        return used_aperture(
-            taken.values,
-            taken.transfers,
-            taken.orders,
-            nominal_kappa=taken.kappa_cycles,
-            rotation_rad=taken.rotation_rad,
-            aperture=taken.aperture,
-            distance_known=known.distance_fitted,
-        )

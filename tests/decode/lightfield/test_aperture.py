@@ -101,6 +101,17 @@ def test_another_shape_of_aperture_is_not_fitted() -> None:
     assert (found.kappa, found.fitted, found.aperture) == (1.0, False, Aperture(5))
 
 
+@pytest.mark.parametrize("astray", [0.0, 1e-3, 3e-3])
+def test_what_no_aperture_explains_is_told(astray: float) -> None:
+    """Light of the mean that is in each slice, whatever its transfer."""
+    slices = _slices(0.5, 0.0, Aperture(5), texture=0.0)
+    slices[1::2] += astray * slices[0]
+    found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.5, rotation_rad=0.0, aperture=Aperture(5))
+    in_phase = np.abs((TRANSFERS[1::2] / np.abs(TRANSFERS[1::2])).real)
+    wanted = astray * float(np.sqrt(np.sum(in_phase**2) / (len(ORDERS) - 1)))
+    assert found.unexplained == pytest.approx(wanted, rel=0.15, abs=2e-5)
+
+
 def test_what_tells_nothing_leaves_the_f_number_s_word() -> None:
     black = np.zeros((13, 20, 30), dtype=np.complex64)
     for slices, transfers in ((black, TRANSFERS), (_slices(1.0, 0.0, Aperture(5), 0.0), np.eye(13)[0] + 0j)):

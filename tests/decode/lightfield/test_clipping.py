@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dappled.decode.lightfield import LightField
-from dappled.decode.lightfield.clipping import unknown_where_clipped
+from dappled.decode.lightfield.clipping import clipped_shares, unknown_where_clipped
 
 SHAPE, SIZE, STEP = (600, 720), (100, 120), 6.0  # of the frame, of a view, pixels a sample
 PATCHES = 10, 11
@@ -56,3 +56,13 @@ def test_nothing_is_told_of_a_frame_that_is_clipped_all_over() -> None:
 def test_without_standard_errors_there_is_nothing_to_take_back() -> None:
     given = field(told=False)
     assert unknown_where_clipped(given, np.ones(SHAPE, dtype=np.float32), 0.01) is given
+
+
+def test_the_share_of_each_patch_that_is_clipped() -> None:
+    """A spot of 20 × 20 pixels is 400 of the 144 × 144 of a patch."""
+    clipped = np.zeros(SHAPE, dtype=np.float32)
+    clipped[290:310, 190:210] = 1
+    shares = clipped_shares(clipped, SIZE, field().grid)
+    assert shares.shape == PATCHES
+    assert shares.max() == pytest.approx(400 / 144**2)
+    np.testing.assert_array_equal(np.argwhere(shares > 0), [[4, 2], [4, 3], [5, 2], [5, 3]])

@@ -208,7 +208,8 @@ class UsedAperture:
 
     `aperture` says how light comes through: beams, filled cells, or a round stop. `share` is κ over the nominal one,
     where that is farther off than f-number and distance should be, or where the frame agrees with no aperture (NaN);
-    None where there is no such reason for doubt.
+    None where there is no such reason for doubt. `unexplained` is the rms of what the means of the slices differ from
+    those of this aperture, as a share of the plane's mean: clipped pixels and a stop of another shape leave it.
     """
 
     kappa: float
@@ -216,6 +217,7 @@ class UsedAperture:
     fitted: bool
     aperture: Aperture
     share: float | None = None
+    unexplained: float = 0.0
 
     @property
     def fits(self) -> bool:
@@ -369,7 +371,10 @@ def _fitted(
     curvature = below - 2 * centre + above
     step = math.log(kappas[1] / kappas[0])
     kappa = float(kappas[best]) * math.exp(0.5 * step * (below - above) / curvature)
-    return UsedAperture(kappa, kappa * step * math.sqrt(2 / curvature), True, aperture), centre
+    left = (there[best] - seen) * _TEXTURE / error
+    unexplained = float(np.sqrt(np.mean(left**2)))
+    sigma = kappa * step * math.sqrt(2 / curvature)
+    return UsedAperture(kappa, sigma, True, aperture, unexplained=unexplained), centre
 
 
 def mean_of_slices(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:

@@ -1,4 +1,4 @@
-"""Where pixels are clipped nobody knows how far views are from the truth: their standard errors are unknown there."""
+"""Which patches of a frame's views hold clipped pixels, and their standard errors: unknown where these are many."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.patch_model import SIDE
+from dappled.decode.lightfield.patches import Patches
 
 
 def unknown_where_clipped(field: LightField, clipped: Singles, most: float) -> LightField:
@@ -20,16 +21,20 @@ def unknown_where_clipped(field: LightField, clipped: Singles, most: float) -> L
     """
     if field.view_sigma is None:
         return field
-    rows, columns = field.view_sigma.shape[2:]
-    across = _summed(clipped, _bounds(rows, field.grid[0, 0], field.grid[0, 2]))
-    total = _summed(across.T, _bounds(columns, field.grid[1, 1], field.grid[1, 2])).T
-    area = SIDE**2 * field.grid[0, 0] * field.grid[1, 1]
-    lost = total / area > most
+    lost = clipped_shares(clipped, field.views.shape[2:4], field.grid) > most
     if not lost.any():
         return field
     sigma = np.where(lost, np.float32(np.nan), field.view_sigma)
     told = None if lost.all() else np.sqrt(np.mean(sigma[:, :, ~lost] ** 2, axis=2)).tolist()
     return replace(field, view_sigma=sigma, attributes={**field.attributes, "view_sigma": told})
+
+
+def clipped_shares(clipped: Singles, shape: tuple[int, ...], grid: Floats) -> Floats:
+    """(m, n) the share of each patch that is clipped, of slices of `shape` (h, w) on this `grid` (see `LightField`)."""
+    rows, columns = Patches((shape[0], shape[1]), SIDE).grid
+    across = _summed(clipped, _bounds(rows, grid[0, 0], grid[0, 2]))
+    total = _summed(across.T, _bounds(columns, grid[1, 1], grid[1, 2])).T
+    return np.asarray(total / (SIDE**2 * grid[0, 0] * grid[1, 1]), dtype=np.float64)
 
 
 def _bounds(patches: int, step: float, first: float) -> Floats:

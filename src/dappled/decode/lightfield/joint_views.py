@@ -74,12 +74,14 @@ def joint_views(
     samples_px: tuple[float, float],
     noise: Floats,
     reach: float,
+    astray: Floats | None = None,
     workers: int = 1,
 ) -> JointViews:
     """The views of slices complex64 (K, h, w), the half plane of `model`, DC first.
 
     `samples_px` are the rows and columns of a slice's sample in sensor columns, `noise` (K,) the variances of slice
-    pixels, `reach` the largest usual disparity in sensor columns over the aperture.
+    pixels, `reach` the largest usual disparity in sensor columns over the aperture, `astray` (patches,) the share of
+    a patch's light that gets into each slice but the first, whatever its transfer, row by row of `sigma`; None: none.
     """
     patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
     cut = patches.cut(slices)
@@ -95,21 +97,27 @@ def joint_views(
     rings[0] = 0
     count = model.aperture.views
     windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
-    parts = [np.flatnonzero(group == number) for number in np.unique(group)]
+    shares = np.zeros(len(means)) if astray is None else astray
+    # Patches that light goes astray in are apart, but have the spectrum of their group.
+    parts = [
+        (alike, alike & (shares == share))
+        for alike in (group == number for number in np.unique(group))
+        for share in np.unique(shares[alike])
+    ]
     variance = np.empty((count * count, len(means)))
     beyond = np.zeros(len(means), dtype=bool)
 
     looked: dict[int, _Looked] = {}
 
     def look(part: int) -> None:
-        members = parts[part]
-        mean = float(np.sqrt(np.mean(means[members] ** 2)))
-        at_edges = group[members[0]] == groups
-        here = replace(frame, noise=frame.noise + (rings * mean) ** 2) if at_edges else frame
-        looked[part] = _Looked.of(here, patches.spectra(cut[:, members]), mean)
+        alike, members = parts[part]
+        mean = float(np.sqrt(np.mean(means[alike] ** 2)))
+        ringing = rings * mean if group[members][0] == groups else np.zeros(len(rings))
+        here = replace(frame, noise=frame.noise + ringing**2, astray=float(shares[members][0]))
+        looked[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, members[alike])
 
     def solve(part: int) -> None:
-        members = parts[part]
+        members = parts[part][1]
         found = _solve(looked[part], lean, patches.spectra(cut[:, members]))
         windowed[members] = patches.images(found.spectra)
         variance[:, members], beyond[members] = found.variance, found.beyond
@@ -215,13 +223,13 @@ class _Looked:
     likely: LikelyKinds
 
     @classmethod
-    def of(cls, frame: FrameModel, spectra: Complexes, mean: float) -> _Looked:
-        """From their spectra (F, A, N) and mean."""
+    def of(cls, frame: FrameModel, spectra: Complexes, mean: float, members: NDArray[np.bool_]) -> _Looked:
+        """From the spectra (F, A, M) and mean of the patches that look like them, and which of these they are (M,)."""
         power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
         spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
         own = spectrum.at(frame.radius(frame.frequencies))
         rests = rests_of(frame, spectrum, own, mean)
-        return cls(frame, own, rests, LikelyKinds.of(frame, own, rests, spectra))
+        return cls(frame, own, rests, LikelyKinds.of(frame, own, rests, spectra[:, :, members]))
 
 
 def _solve(looked: _Looked, lean: float, spectra: Complexes) -> _Solved:

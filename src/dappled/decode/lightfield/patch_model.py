@@ -89,7 +89,8 @@ class DisparityRange:
 class FrameModel:
     """What all groups of patches share. `frequencies` (F, 2) in cycles per sensor column; `per_bin` of a patch;
     `weights` (F,) of a frequency in likelihoods; `ranges` of disparities; `folds` from beyond the band; `alone`
-    (A, V·U), how the slices hold what each view has alone; `noise` (A,)."""
+    (A, V·U), how the slices hold what each view has alone; `noise` (A,); `astray`, the share of the scene's light
+    that gets into each slice but the first, whatever its transfer."""
 
     model: SliceModel
     frequencies: Floats
@@ -101,6 +102,7 @@ class FrameModel:
     folds: tuple[list[Fold], list[Fold]]
     alone: Complexes
     noise: Floats
+    astray: float = 0.0
 
     @classmethod
     def of(
@@ -165,7 +167,9 @@ def rests_of(
     through = (np.abs(frame.ranges[USUAL].seen) ** 2).mean(axis=(1, 2, 3)) * own
     plain = np.zeros((len(own), size, size), dtype=np.complex64)
     each = frame.noise + LEAST_NOISE + _ERROR * through[:, None]
-    each = each + frame.lowest[:, None] * (_MEAN_ERROR * mean * SIDE) ** 2 * np.abs(frame.model.transfers) ** 2
+    means = frame.lowest * (mean * SIDE) ** 2
+    each = each + _MEAN_ERROR**2 * means[:, None] * np.abs(frame.model.transfers) ** 2
+    each[:, 1:] += frame.astray**2 * (own + means)[:, None]
     plain[:, range(size), range(size)] = each
     from_beyond = [folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size) for some in frame.folds]
     lonely = (frame.alone @ frame.alone.conj().T).astype(np.complex64) * own.astype(np.float32)[:, None, None]

@@ -220,9 +220,13 @@ class Darkroom:
                 rows, painted = self._lineariser.rows(raw, colour=self.recipe.colour and views)
                 plane = self._lineariser.upright(rows, raw)
             decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
+            clipped: Plane | None = None
             if isinstance(decoder, MaskDecoder):
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
                 decoder = replace(decoder, joint_views=joint_views)
+                if views and joint_views:
+                    clipped = self._lineariser.clipped(raw)
+                    decoder = replace(decoder, clipped=clipped)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
             with _timed(ms, "slices and views" if views else "slices"):
@@ -240,8 +244,8 @@ class Darkroom:
                         )
                 if painted is not None:
                     light_field = replace(light_field, views=painted(light_field))
-                if light_field.view_sigma is not None:
-                    light_field = unknown_where_clipped(light_field, self._lineariser.clipped(raw), MOST_CLIPPED)
+                if clipped is not None:
+                    light_field = unknown_where_clipped(light_field, clipped, MOST_CLIPPED)
         dropped = isinstance(decoder, MaskDecoder) and decoder.calibration is None  # its metres don't hold then
         attributes = {
             **light_field.attributes,
@@ -448,7 +452,10 @@ class FrameLineariser:
         def painted(field: LightField) -> NDArray[np.float32]:
             size = field.views.shape[2], field.views.shape[3]
             made = dc_views(even, index, colours, size, field.grid)
-            return in_colour(field.views, field.slices[0].real, made)
+            sensor = camera_profile(self._recipe, raw.camera_model or "").sensor((even.shape[0], even.shape[1]))
+            high = field.grid[0, 0] * math.hypot(*sensor.row_mm)
+            wide = field.grid[1, 1] * math.hypot(*sensor.column_mm)
+            return in_colour(field.views, field.slices[0].real, made, row_over_column=high / wide)
 
         return painted
 
