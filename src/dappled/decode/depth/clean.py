@@ -19,6 +19,7 @@ from dappled.decode.depth.depth_map import DepthMap, Map, Search, Volume, confid
 from dappled.decode.depth.edges import sharpened
 from dappled.decode.depth.matching import smoothed
 from dappled.decode.depth.photo_consistency import STRIP, WINDOW, Lines, compared, differences, strips
+from dappled.decode.depth.scatter import scattered
 from dappled.decode.lightfield import ViewStack
 
 # All measured on 9 × 9 views of benchmarks/depth.py, seeds 1 and 2.
@@ -27,6 +28,9 @@ _SMALL, _LARGE = 3.6, 11.0  # P1 and P2, in units of the log-likelihood
 _SPREAD = 0.055  # variance over information
 _DRAWN, _ASTRAY = 0.25, 0.5  # of a step: how far selected peaks are off; a peak of another surface
 _PULL = 0.3  # of how far neighbours moved the peak
+# The variance is so much of what the peak tells, and of that by which neighbours scatter about a plane, a jump counting
+# as so much of a step, over so many px. On seeds 1 to 6 each scene has 65 to 76 % within σ, 93 to 97 % within 2 σ.
+_TOLD, _SCATTER, _MOST_SCATTER, _SCATTER_REACH = 0.3, 1.05, 0.5, 1.5
 _SAMPLE = 12_000  # px, in strips over the whole height: as many tell how well views agree
 _CLASSES, _DETAIL_PX = 8, 1.5  # of pixels, by how finely they are textured; how far around a pixel that is looked at
 _LEAST_SHARE = 0.1  # of the typical variance, where there is no texture
@@ -123,4 +127,6 @@ def depth(stack: ViewStack, lines: Lines, search: Search, told: Agreement) -> De
     found = judged(disparity.astype(np.float32), curvature, sure, spread=_SPREAD, window=window, method="combined")
     sigma = np.hypot(found.sigma, _PULL * np.abs(astray))
     sharp, error = sharpened(found.disparity, sigma.astype(np.float32), stack.middle())
+    rough = scattered(sharp, apart=window, most=_MOST_SCATTER * search.step, reach=_SCATTER_REACH)
+    error = np.sqrt(_TOLD * error**2 + _SCATTER * np.where(np.isfinite(rough), rough**2, error**2))
     return replace(found, disparity=sharp, sigma=error)
