@@ -127,6 +127,6 @@ def summary(made: DecodeResult) -> str:
         whole += f"; {words}"
     if made.report.doubt:
         whole += f": {made.report.doubt}"
-    if doubts := [words for words in (made.falloff_doubt, *made.not_linear) if words]:
-        whole += f"; in doubt: {'; '.join(doubts)}"
+    if made.not_linear:
+        whole += f"; in doubt: {'; '.join(made.not_linear)}"
     return whole

@@ -96,14 +96,21 @@ def test_carriers_that_must_be_seen_and_are_not_are_a_doubt_about_every_frame(
     assert "laws" not in ask(worker_of(flown[0]), bare, 0, look=False)["ms"]
 
 
-def test_vignetting_is_a_doubt_about_a_frame(flown: tuple[Recipe, list[Path]], tmp_path: Path) -> None:
+def test_vignetting_of_the_first_frame_with_a_lens_is_a_doubt_about_all(
+    flown: tuple[Recipe, list[Path]], tmp_path: Path
+) -> None:
     shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, scene="white")
     y, x = (np.linspace(-1, 1, side) for side in QUARTER.shape)
     corners = 1 - 0.2 * (y[:, None] ** 2 + x**2)
-    worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
-    for name, plane, doubted in (("even", shot.frame(), False), ("darker", shot.frame() * corners, True)):
-        seen = ask(worker, dng_of(tmp_path / f"{name}.dng", shot, plane), 0)["seen"]
-        assert any("its corners have" in words for words in seen["doubts"]) is doubted
+    even, darker = (
+        dng_of(tmp_path / f"{name}.dng", shot, plane)
+        for name, plane in (("even", shot.frame()), ("darker", shot.frame() * corners))
+    )
+    for frames, doubted in (((even, darker), False), ((darker, even), True)):
+        worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
+        for index, path in enumerate(frames):
+            seen = ask(worker, path, index)["seen"]
+            assert any("its corners have" in words for words in seen["doubts"]) is doubted
 
 
 def test_a_search_that_fails_costs_no_frame_and_is_a_doubt_until_carriers_are_seen(

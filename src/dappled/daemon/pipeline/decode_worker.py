@@ -50,6 +50,7 @@ class DecodeWorker:
         self._preview_px = 1024
         self._looks = False
         self._laws = LawLooks()
+        self._lens_seen: dict[tuple[float | None, float | None], list[str]] = {}
         self._sensors: dict[tuple[str, int, int], tuple[tuple[float, float], VerdictBounds] | None] = {}
 
     def __call__(self, question: ChannelMessage) -> WorkerReply:
@@ -100,6 +101,7 @@ class DecodeWorker:
         blob = Blob.of(preview, "preview")
         ms["preview"] = (time.perf_counter() - began) * 1e3
         found, doubts = self._laws.judge(done)
+        doubts += self._lens_doubts(configured, done)
         began = time.perf_counter()
         try:
             picture = self._picture(configured, done, np.abs(slices[0]))
@@ -124,6 +126,14 @@ class DecodeWorker:
             "decision": None if decided is None or index < decided.first else asdict(decided),
         }
         return facts, (body.fd, blob.fd)
+
+    def _lens_doubts(self, configured: Darkroom, done: DecodeResult) -> list[str]:
+        """What is strange about the lens, by the first frame at this focal length and f-number."""
+        lens = _lens(done)
+        if lens not in self._lens_seen:
+            lost = configured.lost_at_corners(done.light_field)
+            self._lens_seen[lens] = [lost.doubt] if lost is not None and lost.doubt is not None else []
+        return self._lens_seen[lens]
 
     def _look(
         self, configured: Darkroom, path: str, known: Mapping[str, Any], index: int, done: DecodeResult
@@ -213,7 +223,7 @@ class LawLooks:
 
     def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
         """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""
-        doubts = [words for words in (done.report.doubt, done.calibration_doubt, done.falloff_doubt) if words]
+        doubts = [words for words in (done.report.doubt, done.calibration_doubt) if words]
         if done.report.carriers_from == "measured" or _lens(done) not in self._unseen:
             return done.carriers_found, doubts
         observable, missing = self._unseen[_lens(done)]

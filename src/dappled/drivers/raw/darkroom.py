@@ -122,7 +122,7 @@ class DecodeResult:
 
     `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubt` is what
     the calibration itself was in doubt about, `exposed` how the file's values are, `not_linear` why they may not follow
-    the light, `falloff` what light the corners lose, None for lenslets, with a white frame, and where nothing tells.
+    the light in the scene, vignetting among it.
     """
 
     light_field: LightField
@@ -133,12 +133,6 @@ class DecodeResult:
     checked: LawCheck | None = None
     calibration_doubt: str | None = None
     not_linear: tuple[str, ...] = ()
-    falloff: Falloff | None = None
-
-    @property
-    def falloff_doubt(self) -> str | None:
-        """What the lens takes from the corners, where that is large and sure, in a sentence; else None."""
-        return None if self.falloff is None else self.falloff.doubt
 
     @property
     def search(self) -> LawSearch | None:
@@ -223,10 +217,9 @@ class Darkroom:
             clipped: Plane | None = None
             if isinstance(decoder, MaskDecoder):
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
-                decoder = replace(decoder, joint_views=joint_views)
                 if views and joint_views:
                     clipped = self._lineariser.clipped(raw)
-                    decoder = replace(decoder, clipped=clipped)
+                decoder = replace(decoder, joint_views=joint_views, clipped=clipped)
             focal_length_mm = focal_length_mm or raw.focal_length_mm
             f_number = f_number or raw.f_number
             with _timed(ms, "slices and views" if views else "slices"):
@@ -258,17 +251,22 @@ class Darkroom:
         }
         with _timed(ms, "exposure"):
             exposed = exposure(raw)
-        bent = tuple(not_linear(raw, exposed)) if isinstance(decoder, MaskDecoder) else ()
-        lost: Falloff | None = None
-        if isinstance(decoder, MaskDecoder) and not self.recipe.white:
-            lost = falloff(light_field.slices[0].real)
+        bent = not_linear(raw, exposed) if isinstance(decoder, MaskDecoder) else []
+        lost = self.lost_at_corners(light_field) if views else None
+        if lost is not None and lost.doubt is not None:
+            bent.append(lost.doubt)
         attributes["falloff"] = None if lost is None else [lost.lost, lost.sigma]
-        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), bent, lost)
-        doubts = (made.contradiction, made.unsettled, report.doubt, made.calibration_doubt, made.falloff_doubt, *bent)
+        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), tuple(bent))
+        doubts = (made.contradiction, made.unsettled, report.doubt, made.calibration_doubt, *bent)
         attributes["doubts"] = [words for words in doubts if words]
         if self._checks and not made.observable:
             attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))
+
+    def lost_at_corners(self, light_field: LightField) -> Falloff | None:
+        """Return what light a frame's corners lose; None for lenslets, with a white frame, and where nothing tells."""
+        asked = self.recipe.mask != profiles.LENSLET and not self.recipe.white
+        return falloff(light_field.slices[0].real) if asked else None
 
     def decision(self, made: DecodeResult, index: int) -> LawDecision | None:
         """Return what the search of frame `index` decides for its flight; None where it found nothing."""
