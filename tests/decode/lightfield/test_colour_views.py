@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dappled.decode import DecodeError
+from dappled.decode.array_types import Singles
 from dappled.decode.lightfield.colour_views import dc_views, in_colour
 
 BAYER = np.array([[0, 1], [1, 2]])
@@ -78,6 +79,55 @@ def test_grey_without_texture_gives_a_colour_its_share() -> None:
     made = in_colour(views, views[1, 1], colours)
     np.testing.assert_allclose(made[1], np.broadcast_to([0.4, 0.2, 0.1], made[1].shape), rtol=1e-5)
     np.testing.assert_allclose(made[0] - made[1], np.broadcast_to([0.02, 0.01, 0.005], made[0].shape), rtol=1e-3)
+
+
+def moving(y: Singles, x: Singles, views: int = 5, *, down: float, across: float) -> tuple[Singles, Singles]:
+    """True views (V, U, h, w, 3) that move by so many samples, of stripes of two colours with the same grey on a
+    texture, and their greys, the mean of the colours."""
+    steps = np.arange(views) - (views - 1) / 2
+    made = []
+    for v in steps:
+        line = []
+        for u in steps:
+            at, to = y - down * v, x - across * u
+            grey = 0.3 + 0.03 * (np.sin(0.9 * at + 0.4 * to) + np.sin(0.3 * at - 0.8 * to) + np.sin(0.5 * to))
+            tint = 0.5 * np.tanh(2 * np.sin(0.35 * to + 0.2 * at))
+            line.append(np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1))
+        made.append(line)
+    truth = np.asarray(made, dtype=np.float32)
+    return truth, truth.mean(axis=-1)
+
+
+def error(views: Singles, row_over_column: float, truth: Singles, grey: Singles) -> float:
+    """The rms of colour views, in shares of that of the DC views taken for every view."""
+    dc = truth.mean(axis=(0, 1))
+    made = in_colour(
+        views, grey.mean(axis=(0, 1)), np.ascontiguousarray(np.moveaxis(dc, -1, 0)), row_over_column=row_over_column
+    )
+    cut = (..., slice(8, -8), slice(8, -8), slice(None))
+    return float(np.sqrt(np.mean((made - truth)[cut] ** 2) / np.mean((dc - truth)[cut] ** 2)))
+
+
+def test_an_edge_between_colours_of_the_same_grey_moves_as_the_texture_around_does() -> None:
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    truth, grey = moving(y, x, down=0.3, across=0.3)
+    assert error(grey, 1.0, truth, grey) < 0.3
+
+
+def test_a_sample_that_is_higher_than_wide_moves_by_fewer_rows() -> None:
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    truth, grey = moving(y, x, down=0.1, across=0.4)
+    assert error(grey, 4.0, truth, grey) < 0.5 * error(grey, 1.0, truth, grey)
+
+
+def test_what_no_move_explains_counts_less() -> None:
+    """Each view has errors of its own, and nothing moves."""
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    truth, grey = moving(y, x, down=0.0, across=0.0)
+    off = np.random.default_rng(1).normal(0, 0.01, grey.shape).astype(np.float32)
+    dc = np.ascontiguousarray(np.moveaxis(truth[0, 0], -1, 0))
+    made = in_colour(grey + off, grey[0, 0], dc)
+    assert np.std((made - truth)[..., 1]) < 0.5 * np.std(off)
 
 
 def test_black_is_no_error() -> None:

@@ -1,8 +1,12 @@
 """Views in red, green and blue behind a printed mask: each colour's own DC view, with the parallax of the grey views.
 
 Red alone is sampled every other pixel, and most carriers would alias onto others; around zero frequency it is whole.
-Where two things meet, their colours blend in the DC view as their greys do, so a colour is near a straight line over
-grey, a few samples around (He, Sun and Tang, "Guided image filtering"): along it each view's colour follows its grey.
+What a view's grey differs from the DC view's has three parts. One is a move: grey changes by disparity times its slope,
+as in optical flow (Lucas and Kanade), and colours move as far, even where two of them have the same grey. Another is
+shade, the same for all around. The rest is what neither explains: sharper edges, and what is hidden. Where two things
+meet, their colours blend in the DC view as their greys do, so a colour is near a straight line over grey, a few samples
+around (He, Sun and Tang, "Guided image filtering"): along it a colour follows shade and rest. Where moves explain
+little, the rest is mostly the views' own error, and counts less.
 """
 
 from __future__ import annotations
@@ -16,6 +20,9 @@ from scipy import ndimage, sparse
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.errors import DecodeError
 
+_AROUND = 11  # samples of a view on each side, in which one disparity is fitted
+_STEADY = 0.02  # of the mean square slope of grey: where there is less of it, no disparity is told
+_TRUST = 1.5  # times the share that moves explain, and at most 1: the square of how much of the rest counts
 _BOX = 5  # samples of a view on each side, in which a colour is taken as linear in grey
 _CELL_PX = 12  # local means: half a period of the mask
 _LOBES = 12  # of the interpolating sinc on each side
@@ -50,26 +57,63 @@ def dc_views(
     return made
 
 
-def in_colour(views: Singles, grey: Singles, colours: Singles) -> Singles:
-    """float32 (V, U, h, w, C): each colour's DC view plus its slope over grey times what a view differs from the grey
-    DC view.
+def in_colour(views: Singles, grey: Singles, colours: Singles, *, row_over_column: float = 1.0) -> Singles:
+    """float32 (V, U, h, w, C): each colour's DC view, moved by the disparity around, plus its slope over grey times
+    what the move leaves of a view's difference from the grey DC view.
 
-    `views` (V, U, h, w), `grey` (h, w) their DC view, `colours` (C, h, w) as from `dc_views`. The slope is the colour's
-    covariance with grey over grey's variance in boxes, averaged over the boxes that hold a sample. Where grey hardly
-    varies, it tends to the colour's share of grey.
+    `views` (V, U, h, w), evenly spaced over the aperture; `grey` (h, w) their DC view, `colours` (C, h, w) as from
+    `dc_views`; `row_over_column` the height of a sample over its width. The slope is the colour's covariance with grey
+    over grey's variance in boxes, averaged over the boxes that hold a sample. Where grey hardly varies, it tends to the
+    colour's share of grey.
     """
+    down, across = (np.arange(n) - (n - 1) / 2 for n in views.shape[:2])
+    places = (down / row_over_column).astype(np.float32), across.astype(np.float32)
+    beyond = views - grey
+    disparity = _disparity(beyond, grey, places)
+    rest = beyond - _moved(grey, disparity, places)
+    shade = _around(rest).astype(np.float32)
+    rest = shade + (rest - shade) * _trusted(rest - shade, beyond - shade)
     mean = _box(grey)
     spread = np.maximum(_box(grey * grey) - mean**2, 0)
     level = max(float(np.abs(grey).mean()), 1e-12)
     least = (_FLAT * level) ** 2
-    beyond = views - grey
     made = np.empty((*views.shape, len(colours)), dtype=np.float32)
     for number, colour in enumerate(colours):
         own = _box(colour)
         ratio = np.clip(own / np.maximum(mean, _DARK * level), 0, _MOST)
         slope = _box((_box(colour * grey) - own * mean + least * ratio) / (spread + least))
-        made[..., number] = colour + slope.astype(np.float32) * beyond
+        made[..., number] = colour + _moved(colour, disparity, places) + slope.astype(np.float32) * rest
     return made
+
+
+def _disparity(beyond: Singles, grey: Singles, places: tuple[Singles, Singles]) -> Singles:
+    """(h, w) samples from view to view: the least squares of `beyond` (V, U, h, w) less disparity · place · slope."""
+    (down, across), (dy, dx) = places, np.gradient(grey)
+    along = dy * np.tensordot(down, beyond.sum(axis=1), 1) + dx * np.tensordot(across, beyond.sum(axis=0), 1)
+    squares = len(across) * (down @ down) * dy**2 + len(down) * (across @ across) * dx**2
+    least = max(_STEADY * float(squares.mean()), 1e-12)
+    return np.asarray(_around(along) / (_around(squares) + least), dtype=np.float32)
+
+
+def _moved(image: Singles, disparity: Singles, places: tuple[Singles, Singles]) -> Singles:
+    """(V, U, h, w): by how much each view of an image (h, w) differs from it where all of it moves."""
+    dy, dx = np.gradient(image)
+    down, across = places
+    rows = down[:, None, None] * (disparity * dy)
+    columns = across[:, None, None] * (disparity * dx)
+    return np.asarray(rows[:, None] + columns, dtype=np.float32)
+
+
+def _trusted(rest: Singles, beyond: Singles) -> Singles:
+    """(h, w) how much of the rest counts, from 0 to 1."""
+    left, whole = (_around(np.mean(part**2, axis=(0, 1))) for part in (rest, beyond))
+    explained = 1 - left / np.maximum(whole, 1e-20)
+    return np.asarray(np.sqrt(np.clip(_TRUST * explained, 0, 1)), dtype=np.float32)
+
+
+def _around(values: Floats | Singles) -> Floats:
+    """Local means of images (…, h, w)."""
+    return np.asarray(ndimage.uniform_filter(values.astype(np.float64), _AROUND, mode="nearest", axes=(-2, -1)))
 
 
 def _box(values: NDArray[np.floating]) -> Floats:
