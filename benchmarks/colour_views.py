@@ -2,8 +2,9 @@
 
 Frames as in `views.py`, but behind a Bayer pattern of overlapping filters: boards of saturated colours, and boards with
 parts of a photograph on them. "shares" are views times the local colours of the frame, as they were made before; "mean"
-is the mean of the true views. PSNR in dB of red, green and blue, 1.0 = sensor white, each channel at its best exposure
-(a frame without a white frame is grey in its mean, the truth is not).
+is the mean of the true views; "limit" is what colours would be if the grey views were the true ones. PSNR in dB of red,
+green and blue, 1.0 = sensor white, each channel at its best exposure (a frame without a white frame is grey in its
+mean, the truth is not).
 """
 
 from __future__ import annotations
@@ -61,18 +62,14 @@ def main() -> None:
     for family in families:
         least = []
         for seed in range(arguments.first, arguments.first + arguments.seeds):
-            truth, made, shares, mean = decoded(family, seed, tuple(arguments.shape))
-            found = {
-                "made": by_channel(made, truth),
-                "shares": by_channel(shares, truth),
-                "mean": by_channel(mean, truth),
-            }
+            truth, views = decoded(family, seed, tuple(arguments.shape))
+            found = {name: by_channel(of, truth) for name, of in views.items()}
             least.append(min(a - b for a, b in zip(found["made"], found["mean"], strict=True)))
             if not arguments.json:
                 print(family, seed, *(f"{k} {' '.join(f'{x:.1f}' for x in v)}" for k, v in found.items()), flush=True)
         figures[f"{family}_over_mean_db"] = min(least)
     if arguments.picture:
-        corner = [one[1, 0] for one in (truth, shares, made)]
+        corner = [one[1, 0] for one in (truth, views["shares"], views["made"])]
         white = prints.white_of(corner[:1])
         prints.save(
             arguments.picture, prints.mosaic([prints.toned(p, white) for p in corner], ["true", "before", "now"])
@@ -98,8 +95,9 @@ def saturated(plain: tuple[SharpBoard, ...], chance: np.random.Generator) -> tup
     return tuple(replace(board, colour=SATURATED[k]) for board, k in zip(plain, chosen, strict=True))
 
 
-def decoded(family: str, seed: int, shape: tuple[int, int]) -> tuple[Views, Views, Views, Views]:
-    """The true views (V, U, h, w, 3), those by DC views, those by shares of grey, and the mean of the true ones."""
+def decoded(family: str, seed: int, shape: tuple[int, int]) -> tuple[Views, dict[str, Views]]:
+    """The true views (V, U, h, w, 3), and others of this shape: those by DC views ("made"), by "shares" of grey, the
+    "mean" of the true ones, and the "limit" of those by DC views."""
     one = camera(family, seed, shape)
     frame = one.expose()
     stopped = replace(one.calibration(CALIBRATED_AT), colour_filters=None, level=LEVEL, full_well_e=SNR_100)
@@ -110,14 +108,33 @@ def decoded(family: str, seed: int, shape: tuple[int, int]) -> tuple[Views, View
     field = decoder.decode(rows, focal_length_mm=FOCAL_MM, f_number=F_NUMBER)
     true = [at_samples(in_band(frame.truth.views[..., colour]), field) for colour in COLOURS]
     truth = np.stack(true, axis=-1)
-    mean = np.broadcast_to(np.nansum(truth * weights[:, :, None, None, None], axis=(0, 1)), truth.shape)
+    open_share = weights[:, :, None, None]
+    mean = np.broadcast_to(np.nansum(truth * open_share[..., None], axis=(0, 1)), truth.shape)
 
     even = planes.to_plane(frame.plane, black=0.0, white=1.0, cfa=CFA)
     index = planes.colour_index(shape, CFA)
     size = field.views.shape[2], field.views.shape[3]
-    made = in_colour(field.views, field.slices[0].real, dc_views(even, index, COLOURS, size, field.grid))
+    colours = dc_views(even, index, COLOURS, size, field.grid)
+    made = in_colour(field.views, field.slices[0].real, colours)
     shares = planes.coloured(field.views, field.grid, planes.local_colours(even, CFA, COLOURS, [1]), shape)
-    return truth, exposed(made, truth), exposed(shares, truth), mean
+    grey = true_grey(frame.plane, rows.plane(), index, truth, field.grid)
+    limit = in_colour(grey, np.nansum(grey * open_share, axis=(0, 1)), colours)
+    views = {"made": exposed(made, truth), "shares": exposed(shares, truth), "mean": mean}
+    return truth, {**views, "limit": exposed(limit, truth)}
+
+
+def true_grey(
+    plane: NDArray[np.float32],
+    evened: NDArray[np.float32],
+    index: NDArray[np.integer],
+    truth: Views,
+    grid: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """True views (V, U, h, w) of what the slices are cut from: colours evened locally, each by its share of pixels."""
+    size = truth.shape[2], truth.shape[3]
+    gains = dc_views(evened, index, COLOURS, size, grid) / dc_views(plane, index, COLOURS, size, grid)
+    shares = np.array([np.mean(index == colour) for colour in COLOURS])
+    return np.asarray(np.einsum("vuhwc,chw,c->vuhw", truth, gains, shares), dtype=np.float32)
 
 
 def exposed(made: Views, truth: Views) -> Views:
