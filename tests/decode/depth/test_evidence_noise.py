@@ -30,7 +30,11 @@ def test_views_count_only_without_noise_and_without_the_joint_model() -> None:
     assert evidence.of_light_field(field(0.1, "independent")).made is None
     assert evidence.of_light_field(field(1e-7, "joint")).made is None
     by_views = estimate.estimate(evidence.of_views(clean.made), between=(-1, 1.5))
-    np.testing.assert_array_equal(estimate.estimate(clean, between=(-1, 1.5)).disparity, by_views.disparity)
+    made = estimate.estimate(clean, between=(-1, 1.5))
+    np.testing.assert_array_equal(made.disparity, by_views.disparity)
+    shared = evidence.of_made(clean.made).shared / clean.made.reach
+    assert shared > 0
+    np.testing.assert_allclose(made.sigma, np.hypot(by_views.sigma, shared), rtol=1e-5)  # NaN where unknown
     assert estimate.estimate(clean, "contrast", between=(-1, 1.5)).known_share() == 0  # its slices are empty
 
 

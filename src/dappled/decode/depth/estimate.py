@@ -16,7 +16,7 @@ from scipy import ndimage
 from dappled.decode.array_types import Singles
 from dappled.decode.depth import combined, contrast, halves, stereo
 from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
-from dappled.decode.depth.evidence import Evidence, of_views, thinned
+from dappled.decode.depth.evidence import Evidence, of_made, thinned
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
@@ -46,7 +46,7 @@ def estimate(
     """
     known_method(method)
     if method == "combined" and evidence.made is not None:  # without noise views tell more than slices
-        evidence = of_views(evidence.made)
+        evidence = of_made(evidence.made)
     low, high = between or disparity_range(evidence, workers=workers)
     return METHODS[method](evidence, search(evidence, low, high, window=window, workers=workers))
 
