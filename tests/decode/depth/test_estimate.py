@@ -129,6 +129,26 @@ def test_the_range_is_found(low: float, high: float) -> None:
     assert found[1] - found[0] < high - low + 2.5
 
 
+@pytest.mark.parametrize("rms", [0.0, 0.02, 0.1])
+def test_noise_leaves_the_range_as_it_is(rms: float) -> None:
+    stack, truth = paint(boards(2, 160, 1.0, 4), (160, 160), 5)
+    low, high = estimate.disparity_range(evidence.of_views(noisy(stack, rms)))
+    assert low < truth.min()
+    assert high > truth.max()
+    assert high - low < np.ptp(truth) + 0.8
+
+
+def test_a_wall_without_detail_does_not_widen_the_range() -> None:
+    """Contrast finds some disparity on it, far from all others."""
+    stack, truth = paint([Board(0.3, slope=(0.002, 0.0))], (160, 160), 9)
+    y = np.mgrid[:160, :160][0]
+    stack.views[..., 90:] = (0.4 + 0.002 * y[:, 90:] / 160).astype(np.float32)
+    low, high = estimate.disparity_range(evidence.of_views(stack))
+    assert low < truth.min()
+    assert high > truth.max()
+    assert high - low < np.ptp(truth) + 1.2
+
+
 @given(st.floats(-0.9, 0.9), st.floats(0.05, 0.2))
 @settings(max_examples=30, deadline=None)
 def test_a_peak_is_read_off_between_samples(where: float, width: float) -> None:

@@ -15,8 +15,9 @@ from scipy import ndimage
 
 from dappled.decode.array_types import Singles
 from dappled.decode.depth import combined, contrast, halves, stereo
-from dappled.decode.depth.depth_map import DepthMap, Search, peaked, windowed
+from dappled.decode.depth.depth_map import DepthMap, Map, Search, peaked, windowed
 from dappled.decode.depth.evidence import Evidence, of_made, thinned
+from dappled.decode.depth.photo_consistency import Lines, differences
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
@@ -32,7 +33,11 @@ _MOST_LEVELS = 64  # no more disparities than these
 _MANY_LEVELS, _COARSEST_OF_VIEWS = 48, 0.3
 _COARSE_SIDE = 160  # px: pictures are made smaller than this to look for the range
 _WIDEST = 4.0  # px/view
-_MARGIN, _MARGIN_OF_SLICES = 0.1, 0.2  # px/view beyond the range that was found, with half a step, or a whole one
+# px/view beyond the range that was found, with half a step, of slices a whole one.
+_MARGIN, _MARGIN_OF_CLEAN, _MARGIN_OF_SLICES = 0.1, 0.15, 0.2
+# Of the mean over disparities: what the best one may leave of clean views. With noise of 0.03 of white 0.13 to 0.16 is
+# left (benchmarks/depth.py, seed 2), and the range is that without noise.
+_CLEAR = 0.15
 _SURE = 0.6  # the share of pixels, those with most texture, that the range is read off
 
 
@@ -72,11 +77,43 @@ def search(evidence: Evidence, low: float, high: float, *, window: int | None = 
 
 
 def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, float]:
-    """The disparities between which the scene lies, with a margin: what they explain of pictures made smaller."""
+    """The disparities between which the scene lies, with a margin: at pictures made smaller, by photo-consistency where
+    views are clean, which doesn't enlarge near things, else by what disparities explain."""
+    between = None if evidence.white else _range_of_clean(evidence, workers)
+    return between or _range_of_noisy(evidence, workers)
+
+
+def _range_of_clean(evidence: Evidence, workers: int) -> tuple[float, float] | None:
+    """None where noise hides which disparity is the best."""
+    stack = evidence.stack
+    factor = 2 if max(stack.views.shape[2:]) > _COARSE_SIDE else 1
+    smaller = _smaller(stack.views, factor)
+    coarse = ViewStack(smaller, stack.row_steps / factor, stack.column_steps / factor)
+    looked = _looked(coarse, factor, 5, workers)
+    disparities = looked.disparities()
+    cost = differences(
+        Lines.of(coarse, disparities, window=looked.contrast_window),
+        disparities,
+        limit=np.inf,
+        window=looked.contrast_window,
+        workers=workers,
+    )
+    least, mean = cost.min(axis=0), cost.mean(axis=0)
+    margin = mean - least
+    textured = margin >= np.quantile(margin, 1 - _SURE)
+    if not float(np.median(least[textured])) < _CLEAR * float(np.median(mean[textured])):
+        return None
+    start = cost.argmin(axis=0)
+    peaks, _ = peaked(np.negative(cost, out=cost), disparities, start)
+    return _between(
+        peaks, margin, looked, min(margin.shape) // 20, 0.5 * looked.step + _MARGIN_OF_CLEAN, left_out=0.001
+    )
+
+
+def _range_of_noisy(evidence: Evidence, workers: int) -> tuple[float, float]:
     evidence = evidence if evidence.white else thinned(evidence)
     stack = evidence.stack
-    height, width = stack.views.shape[2:]
-    factor = max(1, math.ceil(max(height, width) / _COARSE_SIDE))
+    factor = max(1, math.ceil(max(stack.views.shape[2:]) / _COARSE_SIDE))
     images = _smaller(evidence.images, factor)
     # Of plain views the images are the views but for a factor.
     views = _smaller(stack.views, factor) if evidence.white else images * np.float32(1 / evidence.weights[0, 0])
@@ -85,8 +122,7 @@ def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, flo
         stack=ViewStack(views, stack.row_steps / factor, stack.column_steps / factor),
         images=images,
     )
-    widest = min(_WIDEST, 0.25 * width / max(stack.reach, 1e-9))
-    looked = Search(-widest, widest, max(0.35 * factor / stack.reach, widest / 40), 9, workers)
+    looked = _looked(coarse.stack, factor, 9, workers)
     disparities = looked.disparities()
     if evidence.white:
         volume = -halves.unexplained(halves.whole(coarse), disparities, workers=workers)
@@ -94,16 +130,31 @@ def disparity_range(evidence: Evidence, *, workers: int = 1) -> tuple[float, flo
         volume = contrast.explained(coarse, disparities, workers=workers)
     likelihood, _ = windowed(volume, looked.contrast_window)
     margin = likelihood.max(axis=0) - likelihood.mean(axis=0)
-    textured = margin >= np.quantile(margin, 1 - _SURE)
-    edge = max(3, min(margin.shape) // (20 if evidence.white else 10))
-    textured[:edge] = textured[-edge or None :] = False
     peaks, _ = peaked(likelihood, disparities, likelihood.argmax(axis=0))
+    if evidence.white:
+        return _between(peaks, margin, looked, min(margin.shape) // 20, looked.step + _MARGIN_OF_SLICES)
+    return _between(peaks, margin, looked, min(margin.shape) // 10, 0.5 * looked.step + _MARGIN)
+
+
+def _looked(coarse: ViewStack, factor: int, window: int, workers: int) -> Search:
+    """What to look at in pictures made smaller by a factor; disparities are those of the large ones."""
+    reach = factor * coarse.reach
+    widest = min(_WIDEST, 0.25 * factor * coarse.views.shape[3] / max(reach, 1e-9))
+    return Search(-widest, widest, max(0.35 * factor / reach, widest / 40), window, workers)
+
+
+def _between(
+    peaks: Map, margin: Map, looked: Search, edge: int, beyond: float, *, left_out: float = 0.002
+) -> tuple[float, float]:
+    """The range of the peaks (h, w) of those pixels with the largest margin, `edge` px from the edge, without the
+    lowest and the highest share `left_out`, and `beyond` px/view more."""
+    textured = margin >= np.quantile(margin, 1 - _SURE)
+    edge = max(3, edge)
+    textured[:edge] = textured[-edge:] = False
     best = ndimage.median_filter(peaks, 3)
     found = best[textured] if textured.any() else best.ravel()
-    low, high = (float(x) for x in np.quantile(found, [0.002, 0.998]))
-    step = disparities[1] - disparities[0]
-    margin_px = step + _MARGIN_OF_SLICES if evidence.white else 0.5 * step + _MARGIN
-    return max(low - margin_px, -1.2 * widest), min(high + margin_px, 1.2 * widest)
+    low, high = (float(x) for x in np.quantile(found, [left_out, 1 - left_out]))
+    return max(low - beyond, 1.2 * looked.low), min(high + beyond, 1.2 * looked.high)
 
 
 def _smaller(views: Singles, factor: int) -> Singles:
