@@ -22,9 +22,9 @@ from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, transform
 
 _MOST_VIEWS = 15  # per axis
-MOSAIC_ROLLOFF = (
-    0.3  # cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, where the information of a pixel ends
-)
+# cycles/pixel: the chroma of a Bayer mosaic stands around 0.5, where the information of a pixel ends. Chosen on the
+# frames of benchmarks/lenslets.py.
+MOSAIC_ROLLOFF = 0.25
 _DARKEST = 0.05  # of the white frame's brightest view: darker parts are not brightened further
 
 
