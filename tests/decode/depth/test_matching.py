@@ -35,15 +35,3 @@ def test_it_is_the_mean_of_the_four_paths_costs(shape: tuple[int, int, int]) -> 
                     path[i, d] = lines[i, d] + np.minimum.reduce([path[i - 1, d], least + large, *beside]) - least
             whole += np.moveaxis(path[way], 0, axis) / 4
     np.testing.assert_allclose(matching.smoothed(cost, small=small, large=large), whole, rtol=1e-4)
-
-
-def test_doubt_is_the_deviation_of_what_is_likely() -> None:
-    disparities = np.linspace(-1, 1, 41)
-    costs = np.zeros((41, 40, 3), np.float32)
-    costs[:, :, 0] = (2 * (disparities - 0.3) ** 2 / (2 * 0.2**2))[:, None]  # a normal distribution at scale 2
-    costs[:, :, 1] = np.where(np.isin(np.arange(41), (10, 30)), 0, 200)[:, None]  # either of two
-    costs[:, :, 2] = np.where(np.arange(41) == 7, 0, 200)[:, None]
-    made = matching.doubt(costs, disparities, 2.0)
-    np.testing.assert_allclose(made[:, 0], 0.2, rtol=0.02)
-    np.testing.assert_allclose(made[:, 1], 0.5, rtol=1e-4)
-    np.testing.assert_allclose(made[:, 2], 0, atol=1e-3)

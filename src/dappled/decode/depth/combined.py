@@ -20,7 +20,7 @@ from dappled.decode.depth.depth_map import DepthMap, Map, Search, Volume, box, c
 from dappled.decode.depth.edges import levelled, sharpened
 from dappled.decode.depth.evidence import Evidence
 from dappled.decode.depth.halves import Part, best_half, unexplained, voted, whole
-from dappled.decode.depth.matching import doubt, smoothed
+from dappled.decode.depth.matching import smoothed
 from dappled.decode.depth.photo_consistency import WINDOW, Lines
 from dappled.decode.lightfield import ViewStack
 
@@ -32,9 +32,6 @@ _NARROW = 5  # px: the window in which noisy views are compared
 _VOTE_WINDOW = 11  # px
 _SMALL_HALVES, _LARGE_HALVES = 8.0, 32.0
 _SPREAD_HALVES, _SAMPLES_HALVES = 2.0, 40.0  # variance over information; of the votes, as in `confidence`
-# So much of the variance of what else is likely; of the costs, for a factor e. Within σ and 2 σ are then 74 and 92 % at
-# SNR 100, 79 and 92 % at SNR 50, in place of 61 and 82, 66 and 84.
-_DOUBT, _DOUBT_SCALE = 0.5, 4.0
 _AGREE = 0.1  # px/view: a peak of the whole aperture's likelihood so near is that of the same surface
 _SCATTER_WHOLE = 1.15  # the variance of the whole aperture's peak, beyond what `judged` supposes
 _ONE_SURFACE = 0.4  # px/view: with a larger range of disparities around there is a jump
@@ -67,7 +64,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
 def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
     """By what disparities leave unexplained of halves of the aperture, and on even surfaces of all of it."""
     part = whole(evidence)
-    rough, doubted = _by_votes(part, evidence.shown(), search)
+    rough = _by_votes(part, evidence.shown(), search)
     disparities, window = search.disparities(), search.contrast_window
     likelihood = unexplained(part, disparities, workers=search.workers)
     likelihood, spread = windowed(np.negative(likelihood, out=likelihood), window)
@@ -91,19 +88,16 @@ def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
     both = share > 0
     disparity = np.where(both, rough.disparity + share * (fine - rough.disparity), rough.disparity)
     sigma = np.where(both, np.sqrt(share * found.sigma**2 + (1 - share) * rough.sigma**2), rough.sigma)
-    # Where the two disagree, and where others are almost as likely, either may be wrong.
-    sigma = np.sqrt(sigma**2 + _DOUBT * doubted**2 + np.where(both, disparity - rough.disparity, 0) ** 2)
     return replace(rough, disparity=disparity, sigma=sigma)
 
 
-def _by_votes(part: Part, middle: Map, search: Search) -> tuple[DepthMap, Map]:
-    """The disparities that neighbours select among the votes around a pixel, jumps at the edges of the middle view;
-    and how far other disparities are likely (h, w)."""
+def _by_votes(part: Part, middle: Map, search: Search) -> DepthMap:
+    """The disparities that neighbours select among the votes around a pixel; jumps at the edges of the middle view."""
     disparities = search.disparities()
     window = search.window or _VOTE_WINDOW
     cost = voted(best_half(part, disparities, workers=search.workers), window)
     smooth = smoothed(cost, small=_SMALL_HALVES, large=_LARGE_HALVES, workers=search.workers)
-    start, doubted = smooth.argmin(axis=0), doubt(smooth, disparities, _DOUBT_SCALE)
+    start = smooth.argmin(axis=0)
     disparity, curvature = peaked(np.negative(smooth, out=smooth), disparities, start)
     likelihood = np.negative(cost, out=cost)
     _, own = peaked(likelihood, disparities, start)
@@ -111,7 +105,7 @@ def _by_votes(part: Part, middle: Map, search: Search) -> tuple[DepthMap, Map]:
     sure = confidence(likelihood, np.take_along_axis(likelihood, start[None], axis=0)[0], _SAMPLES_HALVES)
     found = judged(disparity, curvature, sure, spread=_SPREAD_HALVES, window=window, method="combined")
     sharp, sigma = sharpened(found.disparity, found.sigma, middle, near=_HALO - 1, reach=_HALO)
-    return replace(found, disparity=levelled(sharp), sigma=sigma), doubted
+    return replace(found, disparity=levelled(sharp), sigma=sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

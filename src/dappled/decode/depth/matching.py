@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from dappled.decode.depth.depth_map import Map, Volume
+from dappled.decode.depth.depth_map import Volume
 from dappled.workers import each, spans
 
-_ROWS = 32  # likelihoods of so many are in memory at once
 _LINES = 256  # beside each other at a time: a copy of so many is in memory
 
 
@@ -34,22 +32,6 @@ def smoothed(cost: Volume, *, small: float, large: float, workers: int = 1) -> V
     each(down, spans(cost.shape[2], _LINES), workers)
     each(across, spans(cost.shape[1], _LINES), workers)
     return total
-
-
-def doubt(costs: Volume, disparities: NDArray[np.float64], scale: float) -> Map:
-    """The standard deviation (h, w) of the disparity, when one whose cost is larger by `scale` is e times less likely.
-
-    Small where the costs have one narrow valley; large on flat ones, and where two disparities cost almost the same.
-    """
-    made = np.empty(costs.shape[1:], dtype=np.float32)
-    middle = disparities - disparities.mean()
-    powers = np.stack([np.ones_like(middle), middle, middle**2]).astype(np.float32)
-    for rows in spans(costs.shape[1], _ROWS):
-        part = costs[:, rows]
-        likely = np.exp((part.min(axis=0) - part) * np.float32(1 / scale))
-        whole, first, second = np.tensordot(powers, likely, axes=1)
-        made[rows] = np.sqrt(np.maximum(second / whole - (first / whole) ** 2, 0))
-    return made
 
 
 def _both_ways(lines: Volume, total: Volume, small: float, large: float) -> None:
