@@ -49,6 +49,27 @@ def test_the_right_disparity_leaves_noise_alone() -> None:
     assert left[means.argmin()].std() == pytest.approx(expected, rel=0.1)
 
 
+@pytest.mark.parametrize("which", [None, 0, 2])
+def test_what_is_left_is_measured_less_the_best_picture(which: int | None) -> None:
+    """As the formula says it, view by view, for a whole aperture that isn't square and for halves of both kinds."""
+    rng = np.random.default_rng(7)
+    steps = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-2.0, -1.0, 0.0, 1.0, 2.0], indexing="ij"), axis=-1).reshape(-1, 2)
+    height, width, pad = 51, 57, halves._PAD  # with the pad odd: no frequency is its own mirror image
+    drawn = rng.normal(size=(6, height, width)).astype(np.float32)
+    part = halves.Part(drawn, rng.normal(size=(6, 15)), steps, 0.7)
+    part = part if which is None else halves.halves(part)[which]
+    found = halves.unexplained(part, np.array([0.4, -0.8]))
+    spectra = np.fft.fft2(np.pad(part.measured, ((0, 0), (pad, pad), (pad, pad)), mode="symmetric"))
+    fy, fx = np.meshgrid(*(np.fft.fftfreq(n + 2 * pad) for n in (height, width)), indexing="ij")
+    for disparity, made in zip((0.4, -0.8), found, strict=True):
+        turns = np.exp(-2j * np.pi * disparity * (part.steps[:, :1, None] * fy + part.steps[:, 1:, None] * fx))
+        gains = np.tensordot(part.matrix, turns, 1)
+        picture = (gains.conj() * spectra).sum(axis=0) / ((np.abs(gains) ** 2).sum(axis=0) + 1 / part.variance)
+        left = np.fft.ifft2(spectra - gains * picture).real[:, pad:-pad, pad:-pad]
+        expected = 0.5 * (left**2).sum(axis=0) - (len(part.measured) - 1) / 2
+        np.testing.assert_allclose(made, expected, atol=1e-3 * expected.std())
+
+
 def test_a_half_does_not_depend_on_what_the_other_views_see() -> None:
     evidence, _ = measured([Board(0.5)], noise=0.0001)
     part = halves.whole(evidence)

@@ -19,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, ndimage
 
-from dappled.decode.array_types import Floats, Singles
+from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.depth_map import Volume
 from dappled.decode.depth.evidence import Evidence
-from dappled.workers import each
+from dappled.workers import each, spans
 
 _WINDOW = 3  # px
 _MOST_VOTE, _VOTES = 0.5, 100.0  # measured on the masked frames of benchmarks/depth.py, seeds 1 and 2
 _PAD = 12  # px
+_ROWS = 16  # at a time: what is worked on stays in the processor's cache
 _MEASURED = 1e-5  # of the weight of what was measured best
 _OTHERS = 0.02  # of a direction's information: what is left of it without the other half
 _LEAST_VIEWS = 3  # along an axis, to be halved
@@ -34,8 +35,8 @@ _LEAST_VIEWS = 3  # along an axis, to be halved
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """What is known of some views: `measured` y (C, h, w) with noise of variance 1, `matrix` A (C, J), `steps` (J, 2),
-    rows first, and the `variance` of the picture."""
+    """What is known of a grid of views: `measured` y (C, h, w) with noise of variance 1, `matrix` A (C, J), `steps`
+    (J, 2), row by row, and the `variance` of the picture."""
 
     measured: Singles
     matrix: Floats
@@ -86,30 +87,47 @@ def unexplained(part: Part, disparities: NDArray[np.float64], *, workers: int = 
     margins = ((0, 0), (_PAD, shape[0] - height - _PAD), (_PAD, shape[1] - width - _PAD))
     padded = np.pad(part.measured, margins, mode="symmetric").transpose(1, 0, 2)
     spectra = np.ascontiguousarray(fft.rfft2(padded, axes=(0, 2), workers=workers))  # (fy, c, fx)
-    fy, fx = fft.fftfreq(shape[0]), fft.rfftfreq(shape[1])
-    # For products (c, j) @ (j, fx), one a row: too small for BLAS to start threads of its own.
-    matrix = part.matrix.astype(np.complex64)
-    floor, expected = np.float32(1 / part.variance), np.float32((count - 1) / 2)
+    expected = np.float32((count - 1) / 2)
     out = np.empty((len(disparities), height, width), dtype=np.float32)
 
     def one(number: int) -> None:
-        turns = -2j * np.pi * disparities[number]
-        rows = np.exp(turns * np.outer(fy, part.steps[:, 0])).astype(np.complex64)
-        columns = np.exp(turns * np.outer(part.steps[:, 1], fx)).astype(np.complex64)
-        gains = (rows[:, None, :] * matrix) @ columns
-        weight = np.einsum("ycx,ycx->yx", gains.view(np.float32), gains.view(np.float32)).reshape(
-            *spectra.shape[::2], 2
-        )
-        picture = np.einsum("ycx,ycx->yx", gains.conj(), spectra) / (weight.sum(axis=2) + floor)
-        gains *= -picture[:, None]
-        gains += spectra
-        left = fft.irfft2(gains, s=shape, axes=(0, 2))[_PAD : _PAD + height, :, _PAD : _PAD + width]
-        np.einsum("ycx,ycx->yx", left, left, out=out[number])
+        by_row, columns = _turned(part, disparities[number], shape)
+        left = np.empty_like(spectra)
+        for rows in spans(shape[0], _ROWS):
+            _residual(by_row[rows], columns, spectra[rows], 1 / part.variance, left[rows])
+        seen = fft.ifft(left, axis=0, overwrite_x=True)[_PAD : _PAD + height]
+        for rows in spans(height, _ROWS):
+            lines = fft.irfft(seen[rows], n=shape[1], axis=2)[:, :, _PAD : _PAD + width]
+            np.einsum("ycx,ycx->yx", lines, lines, out=out[number, rows])
         out[number] *= 0.5
         out[number] -= expected
 
     each(one, range(len(disparities)), workers)
     return out
+
+
+def _turned(part: Part, disparity: float, shape: tuple[int, int]) -> tuple[Complexes, Complexes]:
+    """(fy, c, U) A's columns summed over the rows of views, each with its phase at a disparity; (U, fx) the phases of
+    the columns of views. Their product is Aφ. `shape` is that of the pictures."""
+    across = len(np.unique(part.steps[:, 1]))
+    row_steps, column_steps = part.steps[::across, 0], part.steps[:across, 1]
+    turns = -2j * np.pi * disparity
+    rows = np.exp(turns * np.outer(fft.fftfreq(shape[0]), row_steps)).astype(np.complex64)
+    columns = np.exp(turns * np.outer(column_steps, fft.rfftfreq(shape[1]))).astype(np.complex64)
+    matrix = part.matrix.reshape(len(part.matrix), len(row_steps), across).transpose(1, 0, 2)
+    by_row = rows @ matrix.reshape(len(row_steps), -1).astype(np.complex64)
+    return by_row.reshape(shape[0], len(part.matrix), across), columns
+
+
+def _residual(by_row: Complexes, columns: Complexes, measured: Complexes, floor: float, out: Complexes) -> None:
+    """(n, c, fx) y − AφI at some rows of frequencies, from `_turned` and `measured` y."""
+    # Products of a row each: too small for BLAS to start threads of its own.
+    gains = np.matmul(by_row, columns, out=out)
+    weight = ((by_row.conj().transpose(0, 2, 1) @ by_row @ columns) * columns.conj()).sum(axis=1).real
+    picture = (gains.conj() * measured).sum(axis=1)  # faster than einsum
+    picture /= -(weight + np.float32(floor))
+    gains *= picture[:, None]
+    gains += measured
 
 
 def best_half(part: Part, disparities: NDArray[np.float64], *, workers: int = 1) -> Volume:
