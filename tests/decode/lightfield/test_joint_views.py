@@ -12,6 +12,7 @@ from scipy import ndimage
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from dappled.decode.lightfield.joint_views import joint_views
 from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.patch_model import is_motionless
 from dappled.decode.lightfield.slice_model import SliceModel
 from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
@@ -149,7 +150,17 @@ def test_a_scene_without_parallax_has_its_mean_picture_for_every_view() -> None:
     plane = (scene + chance.normal(0, 0.003, camera.shape)).astype(np.float32)
     field = camera.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=camera.f_number)
     assert field.attributes["views_model"] == "joint"
-    assert psnr(field.views, np.broadcast_to(field.slices[0].real, field.views.shape)) > 46
+    assert psnr(field.views, np.broadcast_to(field.slices[0].real, field.views.shape)) > 55
+
+
+@pytest.mark.parametrize(("lean", "moved", "motionless"), [(5.0, 0.5, True), (5.0, 6.0, False), (-5.0, 0.5, False)])
+def test_only_a_frame_at_rest_in_which_nothing_tells_of_parallax_has_none(
+    lean: float, moved: float, motionless: bool
+) -> None:
+    """By most of its patches: a few that move, or seem to, are not asked."""
+    patches = np.full(40, moved)
+    patches[:15] += np.where(np.arange(15) % 2, 500.0, -500.0)
+    assert is_motionless(lean, patches) is motionless
 
 
 @pytest.mark.slow

@@ -33,6 +33,7 @@ from dappled.decode.lightfield.patch_model import (
     FrameModel,
     LikelyKinds,
     TexturePower,
+    is_motionless,
     lean_of,
     rests_of,
 )
@@ -118,12 +119,13 @@ def joint_views(
 
     def solve(part: int) -> None:
         members = parts[part][1]
-        found = _solve(looked[part], lean, patches.spectra(cut[:, members]))
+        found = _solve(looked[part], lean, motionless, patches.spectra(cut[:, members]))
         windowed[members] = patches.images(found.spectra)
         variance[:, members], beyond[members] = found.variance, found.beyond
 
     each(look, range(len(parts)), workers)
     lean = lean_of(np.concatenate([one.likely.gain for one in looked.values()]))
+    motionless = is_motionless(lean, np.concatenate([one.likely.moved for one in looked.values()]))
     each(solve, range(len(parts)), workers)
     windowed += (means[:, None, None] * patches.window).astype(np.float32)[:, None]
     views = patches.joined(windowed).reshape(count, count, *slices.shape[1:])
@@ -232,9 +234,11 @@ class _Looked:
         return cls(frame, own, rests, LikelyKinds.of(frame, own, rests, spectra[:, :, members]))
 
 
-def _solve(looked: _Looked, lean: float, spectra: Complexes) -> _Solved:
-    """The views of patches from their spectra (F, A, N), each of its most probable kind."""
+def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -> _Solved:
+    """The views of patches from their spectra (F, A, N), each of its most probable kind, in a frame that leans to no
+    parallax by some nats, or has none at all."""
     frame, own, rests = looked.frame, looked.own, looked.rests
+    ranges = (frame.motionless, *frame.ranges[1:]) if motionless else frame.ranges
     chosen = looked.likely.chosen(lean)
     made = np.empty((len(own), frame.alone.shape[1], spectra.shape[2]), dtype=np.complex64)
     variance = np.empty(made.shape[1:])
@@ -242,7 +246,7 @@ def _solve(looked: _Looked, lean: float, spectra: Complexes) -> _Solved:
         members = np.flatnonzero(chosen == number)
         kind = KINDS[number]
         background = _Background.of(rests[number], frame.alone, kind.alone * own)
-        found = _views(frame, frame.ranges[kind.range], own, background, spectra[:, :, members])
+        found = _views(frame, ranges[kind.range], own, background, spectra[:, :, members])
         made[:, :, members], variance[:, members] = found[0], found[1] * _TOLD[number] ** 2
     beyond = [number for number, kind in enumerate(KINDS) if kind.range == len(RANGES) - 1]
     return _Solved(made, variance, np.isin(chosen, beyond))

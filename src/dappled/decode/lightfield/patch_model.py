@@ -20,6 +20,7 @@ SIDE = 24  # samples: a patch is wide against parallax, and small against things
 STEP = SIDE // 2  # from one patch to the next
 FARTHEST = 2.0  # times the reach: nothing that moves farther is told from other things
 STILL = 1 / 16  # of the reach: hardly any parallax
+MOTIONLESS = STILL / 4  # of the reach: what a patch by itself can't tell from none
 # Of |disparity|, in reaches: hardly any, the usual ones, far ones, and what is beyond all.
 RANGES = ((0.0, STILL), (0.0, 1.0), (1.0, FARTHEST), (FARTHEST, 4.0))
 USUAL = 1  # of the ranges
@@ -42,6 +43,8 @@ _FAR_NATS = 12.0  # few things are beyond a range
 # Of detail that folds in where nothing moves: usual amounts, and those of few frequencies.
 _USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
 _LEAN, _MOST_LEAN_NATS = 4.0, 800.0  # of a patch, times the median patch
+# Of the median patch: terrain from the air has less than 1, boards with parallax of 0.3 px and more 6 to 27.
+_MOVED_NATS = 2.0
 _ALONE_NATS = 500.0  # edges between depths look like it, too
 # A patch with all its detail in the band, or without parallax, can be trusted further.
 KINDS: Sequence[PatchKind] = (
@@ -88,7 +91,8 @@ class DisparityRange:
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameModel:
     """What all groups of patches share. `frequencies` (F, 2) in cycles per sensor column; `per_bin` of a patch;
-    `weights` (F,) of a frequency in likelihoods; `ranges` of disparities; `folds` from beyond the band; `alone`
+    `weights` (F,) of a frequency in likelihoods; `ranges` of disparities, and one of `motionless` patches; `folds` from
+    beyond the band; `alone`
     (A, V·U), how the slices hold what each view has alone; `noise` (A,); `astray`, the share of the scene's light
     that gets into each slice but the first, whatever its transfer."""
 
@@ -99,6 +103,7 @@ class FrameModel:
     multiplicity: Floats
     lowest: NDArray[np.bool_]
     ranges: tuple[DisparityRange, ...]
+    motionless: DisparityRange
     folds: tuple[list[Fold], list[Fold]]
     alone: Complexes
     noise: Floats
@@ -120,6 +125,7 @@ class FrameModel:
             multiplicity=patches.multiplicity,
             lowest=np.abs(bins * patches.side).max(axis=1) < 1.5,
             ranges=tuple(DisparityRange.of(model, frequencies, near * reach, far * reach) for near, far in RANGES),
+            motionless=DisparityRange.of(model, frequencies, 0.0, MOTIONLESS * reach),
             folds=(
                 model.folds(frequencies, np.linspace(-STILL, STILL, _STILL_DISPARITIES) * reach),
                 model.folds(frequencies, np.linspace(-0.6, 0.6, _BEYOND_DISPARITIES) * reach),
@@ -210,12 +216,13 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes) -> Singles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LikelyKinds:
-    """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats `gain` the latter
-    is more probable."""
+    """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, by how many nats `gain` the latter is
+    more probable, and by how many `moved` hardly any parallax is more probable than none."""
 
     with_parallax: NDArray[np.intp]
     at_rest: NDArray[np.intp]
     gain: Floats
+    moved: Floats
 
     @classmethod
     def of(cls, frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> LikelyKinds:
@@ -225,12 +232,15 @@ class LikelyKinds:
         still = [number for number, kind in enumerate(KINDS) if kind.range == 0]
         others = [number for number, kind in enumerate(KINDS) if kind.range != 0]
         best = np.array(others)[nats[others].argmax(axis=0)]
-        at_rest = np.maximum(frame.weights @ _mean_of_odds(found[still]), at_rest_nats(frame, own, rests, spectra))
+        hardly, not_at_all = (
+            at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[0], frame.motionless)
+        )
+        at_rest = np.maximum(frame.weights @ _mean_of_odds(found[still]), hardly)
         usual = [n for n, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
         here = np.isin(best, usual)
         gain = nats[still].max(axis=0) - nats[others].max(axis=0)
         gain[here] = at_rest[here] - frame.weights @ _mean_of_odds(found[usual][:, :, here])
-        return cls(best, np.array(still)[nats[still].argmax(axis=0)], gain)
+        return cls(best, np.array(still)[nats[still].argmax(axis=0)], gain, hardly - not_at_all)
 
     def chosen(self, lean: float) -> NDArray[np.intp]:
         """(N,) the most probable of `KINDS`, where the frame as a whole leans to no parallax by some nats."""
@@ -244,15 +254,22 @@ def lean_of(gains: Floats) -> float:
     return float(np.clip(_LEAN * np.median(gains), -_MOST_LEAN_NATS, _MOST_LEAN_NATS))
 
 
-def at_rest_nats(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> Floats:
-    """(N,) log likelihoods of patches (F, A, N) without parallax.
+def is_motionless(lean: float, moved: Floats) -> bool:
+    """Whether a frame without parallax has none that any patch could tell: by `LikelyKinds.moved` of all patches."""
+    return lean > 0 and float(np.median(moved)) < _MOVED_NATS
+
+
+def at_rest_nats(
+    frame: FrameModel, some: DisparityRange, own: Floats, rests: list[Complexes], spectra: Complexes
+) -> Floats:
+    """(N,) log likelihoods of patches (F, A, N) whose disparities are in a range next to 0.
 
     Each slice then holds what is common to all views, and detail that folds in, in an amount of its own at each
     frequency: a straight edge has far more in one direction than in others, and looks like parallax where one amount
     is for all.
     """
     common = frame.model.common()
-    seen = frame.ranges[0].seen
+    seen = some.seen
     moved = (np.abs(seen - common.astype(np.complex64) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
     moved[:, 0] = own
     base, once = (np.einsum("faa->fa", rest.real) for rest in rests[:2])  # without detail beyond the band, and with it
