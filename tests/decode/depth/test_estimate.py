@@ -138,6 +138,29 @@ def test_noise_leaves_the_range_as_it_is(rms: float) -> None:
     assert high - low < np.ptp(truth) + 0.8
 
 
+def fence(side: int) -> ViewStack:
+    """9 × 9 views of upright bars, 4 of every 28 px wide, at a disparity of 1 before a fine, fainter ground at −1."""
+    rng = np.random.default_rng(5)
+    ground, bars = (rng.normal(size=(side, side)).astype(np.float32) for _ in range(2))
+    covered = np.broadcast_to(np.arange(side) % 28 < 4, (side, side))
+    steps = centred(9)
+    views = np.empty((9, 9, side, side), dtype=np.float32)
+    for v, sy in enumerate(steps.astype(int)):
+        for u, sx in enumerate(steps.astype(int)):
+            near, there = (np.roll(a, (sy, sx), axis=(0, 1)) for a in (bars, covered))
+            behind = np.roll(ground, (-sy, -sx), axis=(0, 1))
+            views[v, u] = np.where(there, 0.2 + 0.2 * near, 0.5 + 0.06 * behind)
+    return ViewStack(views, steps, steps)
+
+
+@pytest.mark.parametrize("rms", [0.0, 0.005])
+def test_the_ground_between_strong_bars_counts(rms: float) -> None:
+    """In pictures made smaller until contrast can be asked, the bars are all that is left."""
+    low, high = estimate.disparity_range(evidence.of_views(noisy(fence(420), rms)))
+    assert -1.8 < low < -1
+    assert 1 < high < 1.8
+
+
 def test_a_wall_without_detail_does_not_widen_the_range() -> None:
     """Contrast finds some disparity on it, far from all others."""
     stack, truth = paint([Board(0.3, slope=(0.002, 0.0))], (160, 160), 9)
