@@ -125,7 +125,8 @@ def _lenslets() -> tuple[Floats, Floats, NDArray[np.intp]]:
 
 def _mosaic(light: Floats, chance: np.random.Generator) -> NDArray[np.uint16]:
     electrons = chance.poisson(np.clip(light, 0, None) * FULL_WELL_E) + chance.normal(0, 6, light.shape)
-    return np.clip(np.rint(BLACK + electrons / FULL_WELL_E * (WHITE - BLACK)), 0, WHITE).astype(np.uint16)
+    counts: Floats = np.rint(BLACK + electrons / FULL_WELL_E * (WHITE - BLACK))
+    return counts.clip(0, WHITE).astype(np.uint16)
 
 
 def by_rolloff(frame: LensletFrame) -> Floats:
