@@ -35,6 +35,7 @@ class FinePix:
     made: int = 0
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _busy_until_s: float = 0.0
+    _writer: threading.Thread | None = None
     _stuck: threading.Event = field(default_factory=threading.Event)
 
     def __post_init__(self) -> None:
@@ -78,10 +79,14 @@ class FinePix:
                 return
             self._busy_until_s = now_s + self.write_s
             self.made += 1
-            number = self.made
-        threading.Thread(target=self._write, args=[number, self.wall_s()], name="finepix", daemon=True).start()
+            work = [self.made, self.wall_s(), self._writer]
+            self._writer = threading.Thread(target=self._write, args=work, name="finepix", daemon=True)
+            self._writer.start()
 
-    def _write(self, number: int, taken_s: float) -> None:
+    def _write(self, number: int, taken_s: float, before: threading.Thread | None) -> None:
+        """Frames reach the card in the order of their exposures."""
+        if before is not None:
+            before.join()
         data = picture(number, self.focal_length_mm, taken_s + self.clock_offset_s)
         target = self.card / "DCIM" / "100_FUJI" / f"DSCF{number:04d}.RAF"
         part = target.with_name(f".{target.name}")
