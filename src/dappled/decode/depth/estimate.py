@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import ndimage
 
-from dappled.decode.array_types import Singles
+from dappled.decode.array_types import Floats, Singles
 from dappled.decode.depth import combined, contrast, halves, stereo
 from dappled.decode.depth.depth_map import DepthMap, Map, Search, peaked, windowed
 from dappled.decode.depth.evidence import Evidence, of_made, thinned
@@ -53,8 +53,19 @@ def estimate(
     known_method(method)
     if method == "combined" and evidence.made is not None:  # without noise views tell more than slices
         evidence = of_made(evidence.made)
+    filled, evidence = evidence, replace(evidence, filled=None)
     low, high = between or disparity_range(evidence, workers=workers)
-    return METHODS[method](evidence, search(evidence, low, high, window=window, workers=workers))
+    searched = search(evidence, low, high, window=window, workers=workers)
+    if method == "combined" and filled.filled is not None:
+        evidence = replace(evidence, filled=_filled(filled, searched))
+    return METHODS[method](evidence, searched)
+
+
+def _filled(evidence: Evidence, searched: Search) -> Floats | None:
+    """The evidence's `filled`, if that explains pictures made smaller better than points of the aperture do."""
+    coarse, factor = _coarse(evidence)
+    looked = replace(searched, step=max(searched.step, _looked(coarse.stack, factor, 9, searched.workers).step))
+    return halves.likelier(coarse, looked.disparities(), workers=searched.workers).filled
 
 
 def known_method(name: str) -> str:
@@ -112,17 +123,7 @@ def _range_of_clean(evidence: Evidence, workers: int) -> tuple[float, float] | N
 
 
 def _range_of_noisy(evidence: Evidence, workers: int) -> tuple[float, float]:
-    evidence = evidence if evidence.white else thinned(evidence)
-    stack = evidence.stack
-    factor = max(1, math.ceil(max(stack.views.shape[2:]) / _COARSE_SIDE))
-    images = _smaller(evidence.images, factor)
-    # Of plain views the images are the views but for a factor.
-    views = _smaller(stack.views, factor) if evidence.white else images * np.float32(1 / evidence.weights[0, 0])
-    coarse = replace(
-        evidence,
-        stack=ViewStack(views, stack.row_steps / factor, stack.column_steps / factor),
-        images=images,
-    )
+    coarse, factor = _coarse(evidence if evidence.white else thinned(evidence))
     looked = _looked(coarse.stack, factor, 9, workers)
     disparities = looked.disparities()
     if evidence.white:
@@ -135,6 +136,17 @@ def _range_of_noisy(evidence: Evidence, workers: int) -> tuple[float, float]:
     if evidence.white:
         return _between(peaks, margin, looked, min(margin.shape) // 20, looked.step + _MARGIN_OF_SLICES)
     return _between(peaks, margin, looked, min(margin.shape) // 10, 0.5 * looked.step + _MARGIN)
+
+
+def _coarse(evidence: Evidence) -> tuple[Evidence, int]:
+    """The evidence of pictures made smaller by the factor."""
+    stack = evidence.stack
+    factor = max(1, math.ceil(max(stack.views.shape[2:]) / _COARSE_SIDE))
+    images = _smaller(evidence.images, factor)
+    # Of plain views the images are the views but for a factor.
+    views = _smaller(stack.views, factor) if evidence.white else images * np.float32(1 / evidence.weights[0, 0])
+    smaller = ViewStack(views, stack.row_steps / factor, stack.column_steps / factor)
+    return replace(evidence, stack=smaller, images=images), factor
 
 
 def _looked(coarse: ViewStack, factor: int, window: int, workers: int) -> Search:

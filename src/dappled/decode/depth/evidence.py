@@ -29,6 +29,7 @@ _UNMEASURED = 1e-6  # of the weight of what was measured best
 _DETAIL = 3.0  # px: sigma
 # px of the outermost view, on masked frames of benchmarks/depth.py without noise, seeds 1 and 2: 69 % within σ, not 58
 _SHARED = 0.03
+CELLS = 2  # of a filled aperture along each axis of a view: three explain a frame hardly better
 _MANY = 7  # views a side: 5 of 9 find the range of boards and fences (benchmarks/depth.py, seeds 1-3) to 0.02 px/view
 
 
@@ -41,7 +42,9 @@ class Evidence:
     views. `made` are the views of a masked frame as they were made for display (grey), where the frame has next to no
     noise and they were plainly inverted; else None. `middle` is the middle view of a masked frame as it was made for
     display (grey): its edges are where they are in the scene. `shared`: by how much whole neighbourhoods are wrong,
-    in pixels of the outermost view.
+    in pixels of the outermost view. `filled` (V·U, P): the views that light through each of P cells of a filled
+    aperture adds to, where views are light through points; W·`filled` is then what the measurements have of it. None:
+    light comes through points.
     """
 
     stack: ViewStack
@@ -51,6 +54,7 @@ class Evidence:
     made: ViewStack | None = None
     middle: Image | None = None
     shared: float = 0.0
+    filled: NDArray[np.float64] | None = None
 
     def shown(self) -> Image:
         """The grey middle view to look for edges in."""
@@ -118,7 +122,8 @@ def of_light_field(field: LightField) -> Evidence:
     if table.shape != (len(field.slices), 4) or not used.any():
         raise DecodeError("the light field's transfers don't fit its slices: decode the frame again")
     angular, transfers = table[used, :2], transfers[used]
-    kernel = Aperture(field.views.shape[0], field.attributes.get("aperture") or "beams").cells(angular)
+    aperture = Aperture(field.views.shape[0], field.attributes.get("aperture") or "beams")
+    kernel = aperture.cells(angular)
     # The band that a slice takes of the frame's spectrum holds that share of the frame's white noise.
     band = 1 / float(np.hypot(*field.grid[:, 0]) * np.hypot(*field.grid[:, 1]))
     variance = max(float(noise) ** 2 * band, _LEAST_NOISE)
@@ -137,7 +142,18 @@ def of_light_field(field: LightField) -> Evidence:
         white=True,
         made=_noise_free(stack.grey(), weights, field),
         middle=stack.grey().middle(),
+        filled=None
+        if aperture.shape == "round"
+        else _filled(kernel, Aperture(CELLS * aperture.views, "filled"), angular),
     )
+
+
+def _filled(kernel: NDArray[np.complex128], aperture: Aperture, angular: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(J, P): what has to be added to J views of a kernel (K, J) for the light of each cell of a filled aperture, so
+    that it shows in the slices as it does there."""
+    views, cells = (np.concatenate([k.real, k.imag]) for k in (kernel, aperture.cells(angular)))
+    made: NDArray[np.float64] = np.linalg.pinv(views, rcond=_UNMEASURED) @ cells
+    return made
 
 
 def _noise_free(made: ViewStack, weights: NDArray[np.float64], field: LightField) -> ViewStack | None:

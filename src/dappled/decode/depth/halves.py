@@ -13,7 +13,7 @@ are sheared by a wrong disparity: strong detail speaks for no disparity of the f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,8 @@ from scipy import fft, ndimage
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.depth_map import Volume
-from dappled.decode.depth.evidence import Evidence
+from dappled.decode.depth.evidence import CELLS, Evidence
+from dappled.decode.lightfield.light_field import centred
 from dappled.workers import each, spans
 
 _WINDOW = 3  # px
@@ -35,44 +36,81 @@ _LEAST_VIEWS = 3  # along an axis, to be halved
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """What is known of a grid of views: `measured` y (C, h, w) with noise of variance 1, `matrix` A (C, J), `steps`
-    (J, 2), row by row, and the `variance` of the picture."""
+    """What is known of a grid of aperture points: `measured` y (C, h, w) with noise of variance 1, `matrix` A (C, J),
+    `steps` (J, 2), row by row, the `variance` of the picture, and the steps (J, 2) of the `views` that the points
+    belong to (None: each is a view)."""
 
     measured: Singles
     matrix: Floats
     steps: Floats
     variance: float
+    views: Floats | None = None
+
+    def of_views(self) -> Floats:
+        """(J, 2) the step of each point's view."""
+        return self.steps if self.views is None else self.views
 
     def without(self, others: NDArray[np.bool_]) -> Part:
-        """What it tells of the other views, whatever these (J,) see."""
-        beside = self.matrix[:, others]
+        """What it tells of the other points, whatever the views of these (J,) see."""
+        _, number = np.unique(self.of_views()[others], axis=0, return_inverse=True)
+        beside = self.matrix[:, others] @ np.eye(number.max() + 1)[number.ravel()]
         noise = np.eye(len(beside)) + self.variance * beside @ beside.T
         values, vectors = np.linalg.eigh(noise)
         kept = values < 1 / _OTHERS
         whitened = (vectors[:, kept] / np.sqrt(values[kept])).T
         flat = whitened.astype(np.float32) @ self.measured.reshape(len(beside), -1)
         shape = (len(whitened), *self.measured.shape[1:])
-        return Part(flat.reshape(shape), whitened @ self.matrix[:, ~others], self.steps[~others], self.variance)
+        matrix, views = whitened @ self.matrix[:, ~others], self.of_views()[~others]
+        return Part(flat.reshape(shape), matrix, self.steps[~others], self.variance, views)
 
 
 def whole(evidence: Evidence) -> Part:
-    """All views of the evidence: y = A⁻¹Q where something was measured, A = W^½."""
+    """All points of the evidence's aperture: y = A⁻¹Q where something was measured, A = W^½."""
     values, vectors = np.linalg.eigh(evidence.weights)
     kept = values > _MEASURED * values[-1]
     root, vectors = np.sqrt(values[kept]), vectors[:, kept]
     shape = evidence.images.shape
     measured = (vectors / root).T.astype(np.float32) @ evidence.images.reshape(shape[0] * shape[1], -1)
-    stack = evidence.stack
-    steps = np.stack(np.meshgrid(stack.row_steps, stack.column_steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    axes = evidence.stack.row_steps, evidence.stack.column_steps
+    matrix, views = root[:, None] * vectors.T, _grid(*axes)
     variance = max(float(np.var(evidence.picture())), 1e-9)
-    return Part(measured.reshape(-1, *shape[2:]), root[:, None] * vectors.T, steps, variance)
+    measured = measured.reshape(-1, *shape[2:])
+    if evidence.filled is None:
+        return Part(measured, matrix, views, variance)
+    within = centred(CELLS) / CELLS
+    cells = [(axis[:, None] + within * abs(axis[1] - axis[0] if len(axis) > 1 else 0)).ravel() for axis in axes]
+    return Part(
+        measured, matrix @ evidence.filled, _grid(*cells), variance, _grid(*(np.repeat(a, CELLS) for a in axes))
+    )
+
+
+def _grid(rows: Floats, columns: Floats) -> Floats:
+    """(R·C, 2) both of each point, row by row."""
+    return np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def likelier(evidence: Evidence, disparities: NDArray[np.float64], *, workers: int = 1) -> Evidence:
+    """The evidence, its aperture filled or points, whichever leaves less unexplained at each pixel's best disparity.
+
+    The means of slices, which the aperture is fitted to, can be the same for both. But light through a cell spreads
+    over as much as neighbouring views differ by, so that coarse detail moves less from slice to slice. Taken for
+    points, a filled aperture draws faint walls of benchmarks/depth_masked.py 0.04 px/view towards disparity 0.
+    """
+    if evidence.filled is None:
+        return evidence
+    both = evidence, replace(evidence, filled=None)
+    left = []
+    for one in both:
+        found = unexplained(whole(one), disparities, workers=workers)
+        left.append(float(ndimage.uniform_filter(found, (0, _WINDOW, _WINDOW), mode="nearest").min(axis=0).mean()))
+    return both[int(left[1] <= left[0])]
 
 
 def halves(part: Part) -> list[Part]:
     """The left, right, upper and lower half of the aperture, each with the middle line; the whole where there are too
     few views for that."""
     found = []
-    for along in part.steps.T:
+    for along in part.of_views().T:
         if len(np.unique(along)) < _LEAST_VIEWS:
             continue
         found += [part.without(others) for others in (along > 1e-9, along < -1e-9)]
