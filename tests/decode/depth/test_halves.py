@@ -131,3 +131,15 @@ def test_votes_are_limited() -> None:
     made = halves.voted(cost, 5)
     assert int(made[:, 4, 6].argmin()) == 1
     assert int(made[:, 4, 4].argmin()) == 0
+
+
+def test_the_outermost_pixels_are_not_used() -> None:
+    """There slices hold the frame's end."""
+    evidence, _ = measured([Board(0.5)])
+    spoilt = evidence.images.copy()
+    for edge in (0, -1):
+        spoilt[..., edge, :] *= 100
+        spoilt[..., :, edge] *= 100
+    changed = replace(evidence, images=spoilt)
+    made, known = (halves.whole(e).measured for e in (changed, evidence))
+    np.testing.assert_array_equal(made, known)

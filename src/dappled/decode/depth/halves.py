@@ -31,6 +31,9 @@ _PAD = 12  # px
 _ROWS = 16  # at a time: what is worked on stays in the processor's cache
 _MEASURED = 1e-5  # of the weight of what was measured best
 _OTHERS = 0.02  # of a direction's information: what is left of it without the other half
+# px at the edges, where slices hold what their band leaves of the frame's end, at 3 to 260 times the noise. Without
+# them 1 to 2 % fewer pixels are wrong (benchmarks/depth.py --masked, seeds 1 and 2), near the edges.
+_CUT_OFF = 1
 _LEAST_VIEWS = 3  # along an axis, to be halved
 
 
@@ -75,6 +78,8 @@ def whole(evidence: Evidence) -> Part:
     matrix, views = root[:, None] * vectors.T, _grid(*axes)
     variance = max(float(np.var(evidence.picture())), 1e-9)
     measured = measured.reshape(-1, *shape[2:])
+    inside = slice(_CUT_OFF, -_CUT_OFF)
+    measured = np.pad(measured[:, inside, inside], ((0, 0), (_CUT_OFF,) * 2, (_CUT_OFF,) * 2), mode="edge")
     if evidence.filled is None:
         return Part(measured, matrix, views, variance)
     within = centred(CELLS) / CELLS
