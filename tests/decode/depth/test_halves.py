@@ -143,3 +143,11 @@ def test_the_outermost_pixels_are_not_used() -> None:
     changed = replace(evidence, images=spoilt)
     made, known = (halves.whole(e).measured for e in (changed, evidence))
     np.testing.assert_array_equal(made, known)
+
+
+def test_what_is_left_beyond_noise_makes_it_less_sure() -> None:
+    """The same measurements with a third of their noise told: three times as far from every disparity's picture."""
+    evidence, _ = measured([Board(0.5)])
+    bold = replace(evidence, images=9 * evidence.images, weights=9 * evidence.weights)
+    honest, misled = (float(np.nanmedian(estimate.estimate(e, between=(-0.5, 1.4)).sigma)) for e in (evidence, bold))
+    assert misled > honest

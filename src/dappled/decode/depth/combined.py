@@ -38,6 +38,10 @@ _SPREAD_HALVES, _SAMPLES_HALVES = 2.0, 40.0  # variance over information; of the
 _ODDS_UNIT = 8.0
 _AGREE = 0.1  # px/view: a peak of the whole aperture's likelihood so near is that of the same surface
 _SCATTER_WHOLE = 1.15  # the variance of the whole aperture's peak, beyond what `judged` supposes
+# What a window leaves beyond noise, in units of it: more than the first is no noise, and is alike in so many pixels
+# that it counts as often. On seeds 1 and 2 86 % of rooms then lie within 2 σ at SNR 100, else 80. With a larger second
+# one σ is too large for the boards of tests/system/test_depth_sigma.py.
+_NOT_NOISE, _ALIKE = 1.0, 4.0
 _ONE_SURFACE = 0.4  # px/view: with a larger range of disparities around there is a jump
 _HALO = 6  # px: by so much near things are too large before the middle view's edges decide
 
@@ -74,7 +78,11 @@ def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
     likelihood, spread = windowed(np.negative(likelihood, out=likelihood), window)
     known = rough.known
     start = np.rint((np.where(known, rough.disparity, disparities[0]) - disparities[0]) / search.step).astype(np.intp)
-    fine, curvature = peaked(likelihood, disparities, np.clip(start, 0, len(disparities) - 1))
+    start = np.clip(start, 0, len(disparities) - 1)
+    fine, curvature = peaked(likelihood, disparities, start)
+    left = -np.take_along_axis(likelihood, start[None], axis=0)[0] / np.float32(box(window) ** 2 * part.of_noise)
+    # Fine texture, bent surfaces and the frame's end leave what moves the peak, and is no noise.
+    astray = 1 + _ALIKE * np.maximum(left - _NOT_NOISE, 0)
     # What a jump spreads over reaches farther than the window.
     reach = 2 * window - 1
     far = np.where(known, rough.disparity, np.inf), np.where(known, rough.disparity, -np.inf)
@@ -91,7 +99,7 @@ def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
     share = np.where(agree & found.known, rough.sigma**4 / (rough.sigma**4 + found.sigma**4), np.float32(0))
     both = share > 0
     disparity = np.where(both, rough.disparity + share * (fine - rough.disparity), rough.disparity)
-    sigma = np.where(both, np.sqrt(share * found.sigma**2 + (1 - share) * rough.sigma**2), rough.sigma)
+    sigma = np.where(both, np.sqrt(share * astray * found.sigma**2 + (1 - share) * rough.sigma**2), rough.sigma)
     return replace(rough, disparity=disparity, sigma=np.hypot(sigma, open_to))
 
 

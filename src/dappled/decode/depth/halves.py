@@ -49,6 +49,11 @@ class Part:
     variance: float
     views: Floats | None = None
 
+    @property
+    def of_noise(self) -> float:
+        """What noise alone leaves of a pixel at a disparity, in `unexplained`'s unit."""
+        return (len(self.measured) - 1) / 2
+
     def of_views(self) -> Floats:
         """(J, 2) the step of each point's view."""
         return self.steps if self.views is None else self.views
@@ -125,12 +130,12 @@ def halves(part: Part) -> list[Part]:
 def unexplained(part: Part, disparities: NDArray[np.float64], *, workers: int = 1) -> Volume:
     """float32 (D, h, w): half of what each disparity leaves unexplained at a pixel, in squared noise sigmas, less what
     noise alone leaves: minus a log-likelihood, but for a constant."""
-    count, height, width = part.measured.shape
+    height, width = part.measured.shape[1:]
     shape = fft.next_fast_len(height + 2 * _PAD), fft.next_fast_len(width + 2 * _PAD, real=True)
     margins = ((0, 0), (_PAD, shape[0] - height - _PAD), (_PAD, shape[1] - width - _PAD))
     padded = np.pad(part.measured, margins, mode="symmetric").transpose(1, 0, 2)
     spectra = np.ascontiguousarray(fft.rfft2(padded, axes=(0, 2), workers=workers))  # (fy, c, fx)
-    expected = np.float32((count - 1) / 2)
+    expected = np.float32(part.of_noise)
     out = np.empty((len(disparities), height, width), dtype=np.float32)
 
     def one(number: int) -> None:
