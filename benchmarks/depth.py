@@ -24,7 +24,7 @@ from dappled.decode.lightfield import ViewStack
 from dappled.products.exports import view_folders
 
 LIMITS = (0.07, 0.03, 0.01)
-SEEDS, HELD_OUT = (1, 2), (101, 102)
+SEEDS, HELD_OUT = (1, 2), (301, 302)
 METHODS = {"combined": "combined", "opencv": "stereo"}  # what the figures call a method, and we
 PLANES = 200  # disparities among which the best constant plane is looked for
 

@@ -48,17 +48,17 @@ def estimate(
 ) -> DepthMap:  # fmt: skip
     """The depth map by one of `METHODS`, at disparities `between` two (None: where a coarse search finds the scene).
 
-    Raises DecodeError for an unknown method or a empty range.
+    Raises DecodeError for an unknown method or an empty range.
     """
     known_method(method)
     if method == "combined" and evidence.made is not None:  # without noise views tell more than slices
         evidence = of_made(evidence.made)
-    filled, evidence = evidence, replace(evidence, filled=None)
-    low, high = between or disparity_range(evidence, workers=workers)
-    searched = search(evidence, low, high, window=window, workers=workers)
-    if method == "combined" and filled.filled is not None:
-        evidence = replace(evidence, filled=_filled(filled, searched))
-    return METHODS[method](evidence, searched)
+    points = replace(evidence, filled=None)
+    low, high = between or disparity_range(points, workers=workers)
+    searched = search(points, low, high, window=window, workers=workers)
+    if method == "combined" and evidence.filled is not None:
+        points = replace(points, filled=_filled(evidence, searched))
+    return METHODS[method](points, searched)
 
 
 def _filled(evidence: Evidence, searched: Search) -> Floats | None:
