@@ -43,6 +43,7 @@ class RaySum:
     shape: tuple[int, int] = (300, 360)
     seed: int = 0
     views: int = 5
+    apart: bool = False
 
     @property
     def f_number(self) -> float:
@@ -71,12 +72,14 @@ class RaySum:
         fy, fx = np.fft.fftfreq(high)[:, None] * FINER, np.fft.rfftfreq(wide)[None] * FINER  # cycles/pixel
         f = np.hypot(fy, fx)
         size = np.maximum(f, 1 / max(self.shape)) ** -self.exponent * (f <= self.finest) * (f > 0)
-        x = np.arange(wide) / wide
+        waves = [np.cos(2 * np.pi * (np.arange(wide) / wide - n / len(self.boards))) for n in range(len(self.boards))]
+        covers = [(0.5 - 0.5 * wave) ** (len(self.boards) - 1) for wave in waves]
+        if self.apart:
+            covers = [np.exp(8 * wave) / sum(np.exp(8 * other) for other in waves) for wave in waves]
         made = []
-        for number, disparity in enumerate(self.boards):
+        for disparity, cover in zip(self.boards, covers, strict=True):
             texture = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(high, wide))) * size, s=(high, wide))
-            bump = 0.5 - 0.5 * np.cos(2 * np.pi * (x - number / len(self.boards)))
-            light = (1 + self.contrast * texture / texture.std()) * bump ** (len(self.boards) - 1)
+            light = (1 + self.contrast * texture / texture.std()) * cover
             made.append((disparity, np.fft.rfft2(light)))
         total = sum(float(spectrum[0, 0].real) for _, spectrum in made) / (high * wide)
         return [(disparity, spectrum * (0.35 / total)) for disparity, spectrum in made]

@@ -28,7 +28,7 @@ _MOST_VIEWS = 5  # along an axis: with more, the outer ones move by more than a 
 # the frame. Measured at half the ideal aperture, where weak orders decide: without it views lose up to 4.5 dB there.
 _ASTRAY = 1.0
 # Times the joint model's errors: where the noise leaves less, and so without folded detail, inverting is better.
-_CLEANER = 0.5
+_CLEANER = 0.35
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,9 +49,15 @@ _FEWEST = 12  # patches in a group
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 _ROUNDING = 1e-6  # of the strongest degree of freedom: a few of the last places of single precision
 _NEGLIGIBLE = 0.01  # of a patch's probability
-# Of the model's own standard errors, one of each kind: what 68 % of errors are within. Errors are uneven, large
-# at edges between depths; and where much folds in, the model supposes less than there is.
-_TOLD = (0.85, 1.35, 1.8, 1.8, 1.8) + (0.85, 0.75, 0.92, 1.0, 1.05, 1.4, 0.8) + (0.75, 0.92, 1.0) * 2
+# Of the model's variance, one pair of each kind: of what views have alone, and of all else. 68 % of errors are within
+# the root of the sum. Views have less alone than is supposed for their sake: it lets the slices decide where they can.
+# Beside things that move, detail that folds into still patches is not as independent as the model has it.
+_TOLD = (
+    *((1.0, 2.4), *((1.0, 10.0),) * 4),
+    *((0.03, 2.2), *((0.0, 1.3),) * 2, *((0.0, 2.0),) * 3, (0.6, 0.6)),
+    *((0.6, 0.6), (0.85, 0.85), (1.0, 1.0)) * 2,
+)
+_TOLD_MOTIONLESS = (1.0, 2.5)
 _ROUNDS = 3
 
 
@@ -247,7 +253,9 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
         kind = KINDS[number]
         background = _Background.of(rests[number], frame.alone, kind.alone * own)
         found = _views(frame, ranges[kind.range], own, background, spectra[:, :, members])
-        made[:, :, members], variance[:, members] = found[0], found[1] * _TOLD[number] ** 2
+        of_alone, of_rest = _TOLD_MOTIONLESS if motionless and kind.range == 0 else _TOLD[number]
+        left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
+        made[:, :, members], variance[:, members] = found[0], of_alone * left + of_rest * found[1]
     beyond = [number for number, kind in enumerate(KINDS) if kind.range == len(RANGES) - 1]
     return _Solved(made, variance, np.isin(chosen, beyond))
 
@@ -255,8 +263,8 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
 def _views(
     frame: FrameModel, some: DisparityRange, own: Floats, background: _Background, spectra: Complexes
 ) -> tuple[Complexes, Floats]:
-    """The views' spectra (F, V·U, N), and their variance (V·U, N) a pixel, of patches in a range and before a
-    background."""
+    """The views' spectra (F, V·U, N), and their variance (V·U, N) a pixel but for what each has alone, of patches in a
+    range and before a background."""
     size = np.sqrt(own / len(WITHIN)).astype(np.float32)[:, None, None, None]
     seen, viewed = some.seen * size, some.viewed * size
     white = background.whitener @ spectra
@@ -295,7 +303,7 @@ def _expected(
     frame: FrameModel, hypotheses: list[_Hypothesis], odds: Floats, background: _Background, spectra: Complexes
 ) -> tuple[Complexes, Floats]:
     """The views' spectra (F, V·U, N), averaged over hypotheses, and their variance (V·U, N) a pixel, with that between
-    hypotheses."""
+    hypotheses, but for what each view has alone."""
     count = len(_STRENGTHS)
     patches = odds.shape[1]
     probable = odds.reshape(len(hypotheses), count, patches)
@@ -303,7 +311,7 @@ def _expected(
     probable /= probable.sum(axis=(0, 1))
     multiplicity = frame.multiplicity.astype(np.float32)
     moved = np.zeros((len(spectra), frame.alone.shape[1], patches), dtype=np.complex64)
-    variance = np.repeat((frame.multiplicity @ background.left)[:, None], patches, axis=1)
+    variance = np.zeros(moved.shape[1:])
     for one, some in zip(hypotheses, probable, strict=True):
         odd = some.astype(np.float32)
         used = np.flatnonzero(odd.sum(axis=0))
@@ -320,5 +328,4 @@ def _expected(
         variance += (shares.reshape(count, -1) @ weighted).T @ odd
     spread = np.einsum("fvn,f->vn", moved.real**2 + moved.imag**2, multiplicity)
     # All hypotheses but one are negligible in most patches: there the two cancel but for rounding.
-    variance = np.maximum(variance - spread, (frame.multiplicity @ background.left)[:, None])
-    return background.unmixed @ spectra + moved, variance / SIDE**2
+    return background.unmixed @ spectra + moved, np.maximum(variance - spread, 0) / SIDE**2

@@ -92,9 +92,8 @@ class DisparityRange:
 class FrameModel:
     """What all groups of patches share. `frequencies` (F, 2) in cycles per sensor column; `per_bin` of a patch;
     `weights` (F,) of a frequency in likelihoods; `ranges` of disparities, and one of `motionless` patches; `folds` from
-    beyond the band; `alone`
-    (A, V·U), how the slices hold what each view has alone; `noise` (A,); `astray`, the share of the scene's light
-    that gets into each slice but the first, whatever its transfer."""
+    beyond the band; `alone` (A, V·U), how the slices hold what each view has alone; `noise` (A,); `astray`, the share
+    of the scene's light that gets into each slice but the first, whatever its transfer."""
 
     model: SliceModel
     frequencies: Floats
