@@ -183,6 +183,14 @@ def test_only_a_frame_at_rest_in_which_nothing_tells_of_parallax_has_none(
     assert is_motionless(lean, patches) is motionless
 
 
+def test_a_thing_that_moves_before_a_scene_that_does_not_keeps_its_parallax() -> None:
+    """Two thirds of the frame have none; 44.7 dB where none of its patches may have any."""
+    scene = RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(0.0, 0.0, 4.5), apart=True, seed=1)
+    plane, true = scene.expose()
+    field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 45.7
+
+
 @pytest.mark.slow
 def test_a_thing_beyond_all_ranges_beside_others_within_is_not_smeared() -> None:
     found = _reached(RaySum(boards=(2.0, 100.0), finest=BAND, snr=100))

@@ -26,6 +26,7 @@ from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.lightfield.patch_model import (
     KINDS,
     LEAST_NOISE,
+    MOVES_NATS,
     RANGES,
     SIDE,
     WITHIN,
@@ -244,18 +245,23 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
     """The views of patches from their spectra (F, A, N), each of its most probable kind, in a frame that leans to no
     parallax by some nats, or has none at all."""
     frame, own, rests = looked.frame, looked.own, looked.rests
-    ranges = (frame.motionless, *frame.ranges[1:]) if motionless else frame.ranges
     chosen = looked.likely.chosen(lean)
+    motionless_alike = motionless & (looked.likely.moved < MOVES_NATS)
     made = np.empty((len(own), frame.alone.shape[1], spectra.shape[2]), dtype=np.complex64)
     variance = np.empty(made.shape[1:])
     for number in np.unique(chosen):
-        members = np.flatnonzero(chosen == number)
         kind = KINDS[number]
         background = _Background.of(rests[number], frame.alone, kind.alone * own)
-        found = _views(frame, ranges[kind.range], own, background, spectra[:, :, members])
-        of_alone, of_rest = _TOLD_MOTIONLESS if motionless and kind.range == 0 else _TOLD[number]
         left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
-        made[:, :, members], variance[:, members] = found[0], of_alone * left + of_rest * found[1]
+        at_rest = motionless_alike & (kind.range == 0)
+        for still in (False, True):
+            members = np.flatnonzero((chosen == number) & (at_rest == still))
+            if not len(members):
+                continue
+            some = frame.motionless if still else frame.ranges[kind.range]
+            of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
+            made[:, :, members], found = _views(frame, some, own, background, spectra[:, :, members])
+            variance[:, members] = of_alone * left + of_rest * found
     beyond = [number for number, kind in enumerate(KINDS) if kind.range == len(RANGES) - 1]
     return _Solved(made, variance, np.isin(chosen, beyond))
 
