@@ -12,8 +12,10 @@ import pytest
 from dappled.daemon.pipeline.decode_worker import DecodeWorker, nearest
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import Ranging
+from dappled.decode.lightfield.falloff import Falloff
 from dappled.drivers.child_process import ChannelMessage
 from dappled.drivers.raw import law_check
+from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.products.opened import with_ranging
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
@@ -111,6 +113,25 @@ def test_vignetting_of_the_first_frame_with_a_lens_is_a_doubt_about_all(
         for index, path in enumerate(frames):
             seen = ask(worker, path, index)["seen"]
             assert any("its corners have" in words for words in seen["doubts"]) is doubted
+
+
+def test_a_frame_that_tells_nothing_of_the_lens_does_not_tell_for_others(
+    flown: tuple[Recipe, list[Path]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A black one, as with the cap on; and each focal length is looked at once."""
+    near, far = (
+        dng_of(tmp_path / f"{f_mm:g}.dng", shot, shot.frame())
+        for f_mm in (60.0, 85.0)
+        for shot in [Shot(MASKS["mask-2"], QUARTER, f_mm, 22.0, scene="white")]
+    )
+    looked = iter((None, Falloff(0.0, 0.01, 4), Falloff(0.3, 0.01, 0)))
+    monkeypatch.setattr(Darkroom, "lost_at_corners", lambda *_: next(looked))
+    worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
+    doubted = [
+        any("its corners have" in words for words in ask(worker, path, index)["seen"]["doubts"])
+        for index, path in enumerate((far, far, far, near, near))
+    ]
+    assert doubted == [False, False, False, True, True]
 
 
 def test_a_search_that_fails_costs_no_frame_and_is_a_doubt_until_carriers_are_seen(

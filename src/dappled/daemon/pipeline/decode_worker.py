@@ -128,12 +128,18 @@ class DecodeWorker:
         return facts, (body.fd, blob.fd)
 
     def _lens_doubts(self, configured: Darkroom, done: DecodeResult) -> list[str]:
-        """What is strange about the lens, by the first frame at this focal length and f-number."""
+        """What is strange about the lens, by the first frame at this focal length and f-number that tells; without an
+        f-number each frame may be at another stop, and tells for itself."""
         lens = _lens(done)
-        if lens not in self._lens_seen:
-            lost = configured.lost_at_corners(done.light_field)
-            self._lens_seen[lens] = [lost.doubt] if lost is not None and lost.doubt is not None else []
-        return self._lens_seen[lens]
+        if lens in self._lens_seen:
+            return self._lens_seen[lens]
+        lost = configured.lost_at_corners(done.light_field)
+        if lost is None:
+            return []
+        doubts = [] if lost.doubt is None else [lost.doubt]
+        if None not in lens:
+            self._lens_seen[lens] = doubts
+        return doubts
 
     def _look(
         self, configured: Darkroom, path: str, known: Mapping[str, Any], index: int, done: DecodeResult
