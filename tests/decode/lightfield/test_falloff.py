@@ -92,6 +92,16 @@ def test_where_nothing_can_be_told_nothing_is() -> None:
     assert falloff(np.zeros(SHAPE)) is None
     assert falloff(np.ones((27, 200))) is None
     assert falloff(np.ones((28, 200))) is not None
+    assert falloff(np.full(SHAPE, np.inf)) is None
+
+
+def test_a_narrow_upright_picture_is_measured_as_a_lying_one() -> None:
+    lying = darker(texture(4, contrast=0.02), 0.4)[: 2 * SHAPE[0] // 3]
+    found, turned = falloff(lying), falloff(np.ascontiguousarray(lying.T))
+    assert found is not None
+    assert turned is not None
+    assert turned.lost == pytest.approx(found.lost, abs=0.02)
+    assert falloff(np.ones((2000, 28))) is not None
 
 
 def test_darker_sides_count_as_a_loss_only_where_the_other_strips_agree() -> None:

@@ -88,16 +88,22 @@ def in_colour(views: Singles, grey: Singles, colours: Singles, *, row_over_colum
 
 def _disparity(beyond: Singles, grey: Singles, places: tuple[Singles, Singles]) -> Singles:
     """(h, w) samples from view to view: the least squares of `beyond` (V, U, h, w) less disparity · place · slope."""
-    (down, across), (dy, dx) = places, np.gradient(grey)
+    (down, across), (dy, dx) = places, _slopes(grey)
     along = dy * np.tensordot(down, beyond.sum(axis=1), 1) + dx * np.tensordot(across, beyond.sum(axis=0), 1)
     squares = len(across) * (down @ down) * dy**2 + len(down) * (across @ across) * dx**2
     least = max(_STEADY * float(squares.mean()), 1e-12)
     return np.asarray(_around(along) / (_around(squares) + least), dtype=np.float32)
 
 
+def _slopes(image: Singles) -> tuple[Singles, Singles]:
+    """(h, w) each: the image's change a row and a column; 0 along an axis of one sample."""
+    dy, dx = (np.gradient(image, axis=a) if image.shape[a] > 1 else np.zeros_like(image) for a in (0, 1))
+    return dy, dx
+
+
 def _moved(image: Singles, disparity: Singles, places: tuple[Singles, Singles]) -> Singles:
     """(V, U, h, w): by how much each view of an image (h, w) differs from it where all of it moves."""
-    dy, dx = np.gradient(image)
+    dy, dx = _slopes(image)
     down, across = places
     rows = down[:, None, None] * (disparity * dy)
     columns = across[:, None, None] * (disparity * dx)

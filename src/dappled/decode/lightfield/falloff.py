@@ -55,16 +55,16 @@ class Falloff:
 
 
 def falloff(picture: NDArray[np.floating]) -> Falloff | None:
-    """The loss that a picture (h, w) shows, linear in the light; None where it is black or has fewer than 24 samples on
-    a side.
+    """The loss that a picture (h, w) shows, linear in the light; None where it is black, has fewer than 28 samples on a
+    side, or values that are not numbers.
 
     The standard error comes from the scatter between strips: 4 side by side and 4 one below the other, whose ends are
     compared with their middles each by itself.
     """
     inner = np.asarray(picture[_BORDER:-_BORDER, _BORDER:-_BORDER], dtype=np.float64)
-    if min(inner.shape) < _LEAST or not (level := float(inner.mean())) > 0:
+    if min(inner.shape) < _LEAST or not math.inf > (level := float(inner.mean())) > 0:
         return None
-    step = max(1, round(inner.shape[0] / _ROWS))
+    step = max(1, round(min(inner.shape) / _ROWS))
     rows, columns = (side // step for side in inner.shape)
     blocks = inner[: rows * step, : columns * step].reshape(rows, step, columns, step).mean(axis=(1, 3))
     bright = np.log(np.maximum(blocks, _DARK * level))
