@@ -219,6 +219,24 @@ def test_wrong_calls_are_told(act, words: str) -> None:  # type: ignore[no-untyp
         act(told)
 
 
+@pytest.mark.parametrize("grid", [(1, 2), (2, 2), (4, 4), (2, 5)])
+@pytest.mark.parametrize("between", [(0.0, 8.0), (-10.0, 0.0)])
+def test_an_even_number_of_views_is_looked_at_over_any_range(
+    grid: tuple[int, int], between: tuple[float, float]
+) -> None:
+    stack, _ = paint([Board(0.4)], (40, 44), 5)
+    rows, columns = (centred(n) for n in grid)
+    views = ViewStack(stack.views[: grid[0], : grid[1]], rows, columns)
+    assert estimate.estimate(evidence.of_views(views), between=between).disparity.shape == (40, 44)
+
+
+@pytest.mark.filterwarnings("error")
+def test_views_of_a_few_pixels_have_a_map() -> None:
+    views = np.random.default_rng(2).normal(0.4, 0.1, (5, 5, 2, 2)).astype(np.float32)
+    stack = ViewStack(views, centred(5), centred(5))
+    assert estimate.estimate(evidence.of_views(stack), between=(-1.0, 1.0)).disparity.shape == (2, 2)
+
+
 def test_one_view_and_views_that_are_no_numbers_are_told() -> None:
     with pytest.raises(DecodeError, match="depth needs views from several places"):
         evidence.of_views(ViewStack(np.ones((1, 1, 9, 9), np.float32), np.zeros(1), np.zeros(1)))

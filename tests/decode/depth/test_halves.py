@@ -145,6 +145,13 @@ def test_the_outermost_pixels_are_not_used() -> None:
     np.testing.assert_array_equal(made, known)
 
 
+@pytest.mark.parametrize("shape", [(1, 1), (2, 30)])
+def test_slices_of_a_pixel_or_two_are_used_whole(shape: tuple[int, int]) -> None:
+    evidence, _ = measured([Board(0.5)])
+    part = halves.whole(replace(evidence, images=evidence.images[..., : shape[0], : shape[1]]))
+    assert part.measured.shape[1:] == shape
+
+
 def test_what_is_left_beyond_noise_makes_it_less_sure() -> None:
     """The same measurements with a third of their noise told: three times as far from every disparity's picture."""
     evidence, _ = measured([Board(0.5)])

@@ -57,7 +57,7 @@ def agreement(stack: ViewStack, lines: Lines, disparities: NDArray[np.float64], 
     typical = max(float(np.median(least)), LEAST_VARIANCE)
     bend = bends(lines.middle)
     at = np.concatenate([bend[top : top + STRIP] for top in strips(height, every)])
-    classes = np.array_split(np.argsort(at, axis=None), _CLASSES)
+    classes = np.array_split(np.argsort(at, axis=None), min(_CLASSES, at.size))
     x, y = (np.array([np.median(a.ravel()[part]) for part in classes]) for a in (at, least))
     slope = max(0.0, float(np.polyfit(x, y, 1, w=1 / np.maximum(y, LEAST_VARIANCE))[0])) if np.ptp(x) > 0 else 0.0
     base = max(float(np.median(y - slope * x)), _LEAST_SHARE * typical)

@@ -58,15 +58,21 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
     noise = variance / max(_texture(stack), LEAST_VARIANCE)
     share = min(1.0, _CLEAN * noise + _NOISY * noise**2)
     if share < _NEGLIGIBLE:
-        found = clean.depth(stack, lines, search, told)
-        return replace(found, sigma=np.hypot(found.sigma, np.float32(evidence.shared / stack.reach)))
+        return _with_shared(clean.depth(stack, lines, search, told), evidence)
     cost = clean.unlikely(lines, search, variance)
     contrast = _by_contrast(evidence, search)
     # The evidence counted in variances of a guessed noise; now it is known how well views agree.
     weight = np.float32(share / contrast.samples * _guessed(evidence) / variance)
     both = np.subtract(np.multiply(contrast.likelihood, weight, out=contrast.likelihood), cost, out=cost)
     samples = contrast.samples * box(_NARROW) ** 2
-    return _decided(_Seen(both, contrast.spread, samples), search, _NARROW, widen=True)
+    return _with_shared(_decided(_Seen(both, contrast.spread, samples), search, _NARROW, widen=True), evidence)
+
+
+def _with_shared(found: DepthMap, evidence: Evidence) -> DepthMap:
+    """The map, with what whole neighbourhoods of the evidence share of its error."""
+    if not evidence.shared:
+        return found
+    return replace(found, sigma=np.hypot(found.sigma, np.float32(evidence.shared / evidence.stack.reach)))
 
 
 def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
@@ -80,7 +86,9 @@ def _of_slices(evidence: Evidence, search: Search) -> DepthMap:
     start = np.rint((np.where(known, rough.disparity, disparities[0]) - disparities[0]) / search.step).astype(np.intp)
     start = np.clip(start, 0, len(disparities) - 1)
     fine, curvature = peaked(likelihood, disparities, start)
-    left = -np.take_along_axis(likelihood, start[None], axis=0)[0] / np.float32(box(window) ** 2 * part.of_noise)
+    left = -np.take_along_axis(likelihood, start[None], axis=0)[0] / np.float32(
+        box(window) ** 2 * max(part.of_noise, 0.5)
+    )
     # Fine texture, bent surfaces and the frame's end leave what moves the peak, and is no noise.
     astray = 1 + _ALIKE * np.maximum(left - _NOT_NOISE, 0)
     # What a jump spreads over reaches farther than the window.

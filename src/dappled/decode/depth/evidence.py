@@ -44,7 +44,7 @@ class Evidence:
     display (grey): its edges are where they are in the scene. `shared`: by how much whole neighbourhoods are wrong,
     in pixels of the outermost view. `filled` (V·U, P): the views that light through each of P cells of a filled
     aperture adds to, where views are light through points; W·`filled` is then what the measurements have of it. None:
-    light comes through points.
+    light comes through points, or the views are of a round stop, whose cells `weights` has.
     """
 
     stack: ViewStack
@@ -97,7 +97,7 @@ def of_made(made: ViewStack) -> Evidence:
 
 
 def thinned(evidence: Evidence) -> Evidence:
-    """The same of every second row and column of many plain views; the outermost ones and the middle one stay."""
+    """The same of every second row and column of many plain views, the outermost ones among them."""
     stack = evidence.stack
     rows, columns = (2 if count >= _MANY and count % 2 else 1 for count in stack.views.shape[:2])
     images, views = evidence.images[::rows, ::columns], stack.views[::rows, ::columns]

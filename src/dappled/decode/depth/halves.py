@@ -83,8 +83,9 @@ def whole(evidence: Evidence) -> Part:
     matrix, views = root[:, None] * vectors.T, _grid(*axes)
     variance = max(float(np.var(evidence.picture())), 1e-9)
     measured = measured.reshape(-1, *shape[2:])
-    inside = slice(_CUT_OFF, -_CUT_OFF)
-    measured = np.pad(measured[:, inside, inside], ((0, 0), (_CUT_OFF,) * 2, (_CUT_OFF,) * 2), mode="edge")
+    if min(shape[2:]) > 2 * _CUT_OFF:
+        inside = slice(_CUT_OFF, -_CUT_OFF)
+        measured = np.pad(measured[:, inside, inside], ((0, 0), (_CUT_OFF,) * 2, (_CUT_OFF,) * 2), mode="edge")
     if evidence.filled is None:
         return Part(measured, matrix, views, variance)
     within = centred(CELLS) / CELLS

@@ -78,14 +78,17 @@ class Lines:
         `shade`: what is as coarse as a Gaussian of so many pixels is taken from the views (0: nothing).
         """
         v0, u0 = (int(np.argmin(np.abs(steps))) for steps in (stack.row_steps, stack.column_steps))
-        pad = math.ceil(float(np.abs(disparities).max()) * stack.reach) + 2 + window // 2
+        told = (
+            (1, stack.views[v0], _arms(stack.column_steps, u0)),
+            (0, stack.views[:, u0], _arms(stack.row_steps, v0)),
+        )
+        # Of an even number of views none is in the middle: steps from the one that is taken for it are larger.
+        farthest = max((abs(step) for *_, some in told for *_, step in some), default=0.0)
+        pad = math.ceil(float(np.abs(disparities).max()) * farthest) + 2 + window // 2
         arms = []
-        for axis, steps, views, at in (
-            (1, stack.column_steps, stack.views[v0], u0),
-            (0, stack.row_steps, stack.views[:, u0], v0),
-        ):
+        for axis, views, some in told:
             for side in (-1, 1):
-                chosen = [(k, step) for sign, k, step in _arms(steps, at) if sign == side]
+                chosen = [(k, step) for sign, k, step in some if sign == side]
                 arms.append(tuple(_Line.of(_smooth(views[k], shade), pad, axis, step) for k, step in chosen))
         return cls(_smooth(stack.views[v0, u0], shade), tuple(arm for arm in arms if arm), pad)
 
