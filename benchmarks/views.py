@@ -113,7 +113,7 @@ FAMILIES: Mapping[str, Family] = {
     "round-snr100": Family("round stop, in the band, SNR 100", options={"stop": "round"}),
     "round-1.3-snr100": Family("round stop, f^-1.3, SNR 100", 1.3, None, {"stop": "round"}),
     "photographs": Family(
-        "round stop, photographs, SNR 100 at white", options={"stop": "round", "level": 0.15}, photographs=True
+        "round stop, photographs, SNR 65", options={"stop": "round", "level": 0.15}, photographs=True
     ),
     "terrain": Family("round stop, terrain from the air, SNR 100", 1.3, None, {"stop": "round"}, largest_px=0.1),
     "half": Family("square stop, half the ideal aperture, SNR 100", f_number=2 * F_NUMBER),
