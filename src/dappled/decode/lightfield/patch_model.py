@@ -45,7 +45,8 @@ _USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
 _LEAN, _MOST_LEAN_NATS = 4.0, 800.0  # of a patch, times the median patch
 # Of the median patch: terrain from the air has less than 1, boards with parallax of 0.3 px and more 6 to 27.
 _MOVED_NATS = 2.0
-MOVES_NATS = 6.0  # of one patch: terrain from the air has at most 4, boards with parallax of 0.6 px 18 and more
+# Of one patch: straight edges at rest have up to 13, things that move by 0.9 px from view to view 24 and more.
+MOVES_NATS = 16.0
 _ALONE_NATS = 500.0  # edges between depths look like it, too
 # A patch with all its detail in the band, or without parallax, can be trusted further.
 KINDS: Sequence[PatchKind] = (
