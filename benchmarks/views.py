@@ -38,6 +38,7 @@ F_NUMBER, CALIBRATED_AT = 7.44, 29.76
 BAND = 0.063  # cycles/pixel: inside the band of a slice
 LARGEST_PX = 5.0  # from view to view
 BORDER = 8  # samples of a view
+INSIDE = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 SNR_100, SNR_50 = 28_600.0, 7_150.0  # electrons of a full well, whose 0.35 is the mean
 
 
@@ -194,8 +195,7 @@ def at_samples(views: NDArray[np.float32], field: LightField) -> NDArray[np.floa
 
 def psnr(found: NDArray[np.floating], truth: NDArray[np.floating]) -> float:
     """In dB, range 1, without the border and what has no truth (NaN)."""
-    cut = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
-    return float(-10 * np.log10(np.nanmean((found - truth)[cut] ** 2)))
+    return float(-10 * np.log10(np.nanmean((found - truth)[INSIDE] ** 2)))
 
 
 def at_every_sample(sigma: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -227,9 +227,8 @@ def reached(frame: Frame, f_number: float = F_NUMBER) -> Reached:
     if sigma is not None:
         there = at_every_sample(sigma, joint.views.shape)
         told = np.isfinite(there)
-        known = told & np.isfinite(truth)
-        known[..., :BORDER, :] = known[..., -BORDER:, :] = known[..., :BORDER] = known[..., -BORDER:] = False
-        within = float((np.abs(joint.views - truth) < there)[known].mean())
+        known = (told & np.isfinite(truth))[INSIDE]
+        within = float((np.abs(joint.views - truth) < there)[INSIDE][known].mean())
     where_told = np.where(told, truth, np.float32(np.nan))
     return Reached(
         psnr(joint.views, truth),

@@ -246,16 +246,15 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
     parallax by some nats, or has none at all."""
     frame, own, rests = looked.frame, looked.own, looked.rests
     chosen = looked.likely.chosen(lean)
-    motionless_alike = motionless & (looked.likely.moved < MOVES_NATS)
+    unmoved = motionless & (looked.likely.moved < MOVES_NATS)
     made = np.empty((len(own), frame.alone.shape[1], spectra.shape[2]), dtype=np.complex64)
     variance = np.empty(made.shape[1:])
     for number in np.unique(chosen):
         kind = KINDS[number]
         background = _Background.of(rests[number], frame.alone, kind.alone * own)
         left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
-        at_rest = motionless_alike & (kind.range == 0)
         for still in (False, True):
-            members = np.flatnonzero((chosen == number) & (at_rest == still))
+            members = np.flatnonzero((chosen == number) & ((unmoved & (kind.range == 0)) == still))
             if not len(members):
                 continue
             some = frame.motionless if still else frame.ranges[kind.range]
