@@ -91,6 +91,11 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     raise ValueError(f"the simulated autopilot has no message {message_id}")
 
 
+def utc_us(monotonic_ns: int) -> int:
+    """UTC at a moment of this machine's: an autopilot takes the UTC and the boot time of one message at one moment."""
+    return (time.time_ns() - time.monotonic_ns() + monotonic_ns) // 1000
+
+
 def heartbeat(*, armed: bool, personality: str = "ardupilot") -> MavlinkMessage:
     """The autopilot's heartbeat, in flight (armed) or on the ground."""
     make = mavlink.MAV_AUTOPILOT_PX4 if personality == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
@@ -203,11 +208,11 @@ class Flyer:
                     armed=armed, personality="ardupilot" if self.cameras is None else self.cameras.personality
                 )
             else:
-                message = telemetry_message(number, pose, boot_ns, time.time_ns() // 1000)
+                message = telemetry_message(number, pose, boot_ns, utc_us(now_ns))
             self._later(message, now_ns)
         if self.cameras is not None:
             with self.lock:
-                triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, time.time_ns() // 1000)
+                triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, utc_us(now_ns))
             self._triggered(triggered, now_ns)
         while self.contacts and self.contacts[0] <= now_ns:
             assert self.cameras is not None
@@ -238,7 +243,7 @@ class Flyer:
             if self.cameras is not None:
                 now_ns = time.monotonic_ns()
                 with self.lock:
-                    triggered = self.cameras.command(message, self.boot_ns(now_ns) // 1000, time.time_ns() // 1000)
+                    triggered = self.cameras.command(message, self.boot_ns(now_ns) // 1000, utc_us(now_ns))
                 self._triggered(triggered, now_ns)
             if message.command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or message.target_component not in (0, 1):
                 return
