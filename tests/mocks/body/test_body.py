@@ -85,12 +85,14 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
         def metered(self, f_number: float) -> tuple[float, float]:
             return f_number / 740, 0.5
 
+        def latency_s(self, shot_number: int) -> float:
+            return 0.055 if shot_number == 4 else 1.0
+
         def expose(self, trigger_t_s: float, shot_number: int, *, f_number: float | None) -> SimpleNamespace:
             asked.append((trigger_t_s, shot_number))
             truth = SimpleNamespace(save=lambda path: path.write_bytes(b"truth"))
-            return SimpleNamespace(
-                file=b"raw", name_suffix=".dng", truth=truth, mid_exposure_t_s=trigger_t_s + 0.06, latency_s=0.06
-            )
+            assert (tmp_path / "000004.json").exists()  # the shutter opens before the picture is made
+            return SimpleNamespace(file=b"raw", name_suffix=".dng", truth=truth)
 
     renderer = ModuleType("dappled.mocks.scene.masked_camera")
     renderer.__dict__["reference_camera"] = Camera
@@ -110,7 +112,7 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     assert asked[1] == (2.5, 4)
     assert (tmp_path / "000004.npz").read_bytes() == b"truth"
     times = json.loads((tmp_path / "000004.json").read_text())
-    assert times == {"trigger_t_s": 2.5, "mid_exposure_t_s": 2.56, "latency_s": 0.06}
+    assert times == {"trigger_t_s": 2.5, "mid_exposure_t_s": 2.56, "latency_s": 0.055}
 
 
 def test_a_file_is_shown_every_time(tmp_path: Path) -> None:

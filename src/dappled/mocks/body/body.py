@@ -263,16 +263,21 @@ def _simulated(options: BodyOptions) -> Pictures:
             real=options.real,
         )
 
+    exposure_s, _ = camera.metered(camera.optics.f_number if options.f_number is None else options.f_number)
+
     def expose(trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
         trigger_t_s = (trigger_monotonic_ns - start_ns) / 1e9
+        if options.truth is not None:  # told when the shutter opens, as a contact does: making the picture takes longer
+            latency_s = camera.latency_s(shot_number)
+            time.sleep(max(0.0, latency_s - (time.monotonic_ns() - trigger_monotonic_ns) / 1e9))
+            middle_t_s = trigger_t_s + latency_s + exposure_s / 2
+            times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": middle_t_s, "latency_s": latency_s}
+            (options.truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
         made = camera.expose(trigger_t_s, shot_number, f_number=options.f_number)
         if options.truth is not None:
             made.truth.save(options.truth / f"{shot_number:06d}.npz")
-            times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": made.mid_exposure_t_s, "latency_s": made.latency_s}
-            (options.truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
         return made.file, made.name_suffix.lstrip(".")
 
-    exposure_s, _ = camera.metered(camera.optics.f_number if options.f_number is None else options.f_number)
     return Pictures(expose, exposure_s)
 
 
