@@ -14,6 +14,26 @@ def test_patches_of_an_image_make_the_image_again(shape: tuple[int, int]) -> Non
     np.testing.assert_allclose(patches.joined(patches.images(spectra)), image.real, atol=1e-5)
 
 
+@pytest.mark.parametrize("shape", [(40, 53), (24, 24)])
+def test_patches_of_one_shade_are_not_apart_at_the_edges_of_their_images_either(shape: tuple[int, int]) -> None:
+    patches = Patches(shape, 24)
+    alike = np.broadcast_to(3 * patches.window.astype(np.float32), (len(patches.corners), 1, 24, 24))
+    np.testing.assert_allclose(patches.apart(alike, patches.joined(alike)), 0, atol=1e-9)
+
+
+def test_patches_are_apart_by_what_each_has_alone() -> None:
+    """White noise of variance 1 in each patch: where four overlap with weights w², each is (1 − w²)² of its own away
+    from what they are joined to, and the w⁴ of the others."""
+    patches = Patches((60, 72), 24)
+    chance = np.random.default_rng(2).normal(size=(len(patches.corners), 100, 24, 24))
+    noisy = (chance * patches.window).astype(np.float32)
+    apart = patches.apart(noisy, patches.joined(noisy))
+    share = patches.window**2
+    others = np.roll(share, 12, 0) ** 2 + np.roll(share, 12, 1) ** 2 + np.roll(share, 12, (0, 1)) ** 2
+    expected = (share * ((1 - share) ** 2 + others)).sum() / share.sum()
+    assert apart[:, ~patches.at_edges].mean() == pytest.approx(expected, rel=0.01)
+
+
 def test_spectra_keep_the_variance_of_white_noise_and_hold_conjugates_behind() -> None:
     rng = np.random.default_rng(1)
     images = (rng.normal(size=(3, 120, 120)) + 1j * rng.normal(size=(3, 120, 120))).astype(np.complex64)

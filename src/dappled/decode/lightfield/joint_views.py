@@ -50,15 +50,14 @@ _FEWEST = 12  # patches in a group
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 _ROUNDING = 1e-6  # of the strongest degree of freedom: a few of the last places of single precision
 _NEGLIGIBLE = 0.01  # of a patch's probability
-# Of the model's variance, one pair of each kind: of what views have alone, and of all else. 68 % of errors are within
-# the root of the sum. Views have less alone than is supposed for their sake: it lets the slices decide where they can.
-# Beside things that move, detail that folds into still patches is not as independent as the model has it.
+# Of a patch's mean square difference to the views that it and its neighbours were joined to, of the model's variance of
+# what views have alone, and of all else of it, for each kind: 68 % of errors are within the root of the sum.
 _TOLD = (
-    *((1.0, 2.4), *((1.0, 10.0),) * 4),
-    *((0.03, 2.2), *((0.0, 1.3),) * 2, *((0.0, 2.0),) * 3, (0.6, 0.6)),
-    *((0.6, 0.6), (0.85, 0.85), (1.0, 1.0)) * 2,
+    *((0.16, 0.47, 0.14), *((1.2, 0.85, 0.35),) * 4),
+    *((1.6, 0.04, 0.3), *((1.8, 0.01, 0.15),) * 2, *((0.25, 0.05, 1.2),) * 3, (0.45, 0.05, 0.4)),
+    *((1.0, 0.9, 1.0),) * 6,
 )
-_TOLD_MOTIONLESS = (1.0, 2.5)
+_TOLD_MOTIONLESS = (0.7, 0.86, 2.65)
 _ROUNDS = 3
 
 
@@ -112,7 +111,7 @@ def joint_views(
         for alike in (group == number for number in np.unique(group))
         for share in np.unique(shares[alike])
     ]
-    variance = np.empty((count * count, len(means)))
+    variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
     beyond = np.zeros(len(means), dtype=bool)
 
     looked: dict[int, _Looked] = {}
@@ -128,16 +127,17 @@ def joint_views(
         members = parts[part][1]
         found = _solve(looked[part], lean, motionless, patches.spectra(cut[:, members]))
         windowed[members] = patches.images(found.spectra)
-        variance[:, members], beyond[members] = found.variance, found.beyond
+        variance[:, members], of_apart[members], beyond[members] = found.variance, found.of_apart, found.beyond
 
     each(look, range(len(parts)), workers)
     lean = lean_of(np.concatenate([one.likely.gain for one in looked.values()]))
     motionless = is_motionless(lean, np.concatenate([one.likely.moved for one in looked.values()]))
     each(solve, range(len(parts)), workers)
     windowed += (means[:, None, None] * patches.window).astype(np.float32)[:, None]
-    views = patches.joined(windowed).reshape(count, count, *slices.shape[1:])
+    views = patches.joined(windowed)
+    variance += of_apart * patches.apart(windowed, views)
     sigma = np.sqrt(variance).astype(np.float32).reshape(count, count, *patches.grid)
-    return JointViews(views, sigma, float(beyond.mean()))
+    return JointViews(views.reshape(count, count, *slices.shape[1:]), sigma, float(beyond.mean()))
 
 
 def _texture(images: Singles, window: Floats) -> Floats:
@@ -214,10 +214,12 @@ def _gains(strength: Floats, projected: Doubles, weights: Singles) -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Solved:
-    """`spectra` (F, V·U, N) of the views, their `variance` (V·U, N) a pixel, and which patches are `beyond` (N,)."""
+    """`spectra` (F, V·U, N) of the views, their `variance` (V·U, N) a pixel by the model, how much `of_apart` (N,) from
+    the patches around is added to it, and which patches are `beyond` (N,)."""
 
     spectra: Complexes
     variance: Floats
+    of_apart: Floats
     beyond: NDArray[np.bool_]
 
 
@@ -248,7 +250,7 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
     chosen = looked.likely.chosen(lean)
     unmoved = motionless & (looked.likely.moved < MOVES_NATS)
     made = np.empty((len(own), frame.alone.shape[1], spectra.shape[2]), dtype=np.complex64)
-    variance = np.empty(made.shape[1:])
+    variance, of_apart = np.empty(made.shape[1:]), np.empty(made.shape[2])
     for number in np.unique(chosen):
         kind = KINDS[number]
         background = _Background.of(rests[number], frame.alone, kind.alone * own)
@@ -258,11 +260,11 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
             if not len(members):
                 continue
             some = frame.motionless if still else frame.ranges[kind.range]
-            of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
+            of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
             made[:, :, members], found = _views(frame, some, own, background, spectra[:, :, members])
             variance[:, members] = of_alone * left + of_rest * found
     beyond = [number for number, kind in enumerate(KINDS) if kind.range == len(RANGES) - 1]
-    return _Solved(made, variance, np.isin(chosen, beyond))
+    return _Solved(made, variance, of_apart, np.isin(chosen, beyond))
 
 
 def _views(

@@ -91,3 +91,15 @@ class Patches:
         for (top, left), patch in zip(self.corners, patches, strict=True):
             total[:, top : top + n, left : left + n] += patch * window
         return np.ascontiguousarray(total[:, n : n + height, n : n + width])
+
+    def apart(self, patches: Singles, images: Singles) -> Floats:
+        """(V, N) the mean squares by which windowed patches (N, V, side, side) are apart from the images (V, h, w) that
+        they and the patches beside them were joined to."""
+        n, window = self.side, self.window.astype(np.float32)
+        wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), constant_values=np.nan)
+        found = np.empty((patches.shape[1], len(patches)))
+        for number, (top, left) in enumerate(self.corners):
+            image = wide[:, top : top + n, left : left + n]
+            weight = (window**2)[np.isfinite(image[0])].sum()
+            found[:, number] = np.nansum((patches[number] - image * window) ** 2, axis=(1, 2)) / weight
+        return found
