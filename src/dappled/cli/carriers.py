@@ -20,12 +20,12 @@ from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.calibration.law_search import LawSearch
-from dappled.decode.decoder import CarriersFrom, doubt
+from dappled.decode.decoder import CarriersFrom
 from dappled.decode.optics import Carrier, Lattice, Mask, Order
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
 from dappled.decode.spectrum import Plane
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.peaks import Measured, measure
+from dappled.decode.spectrum.peaks import Measured, measure, stretch_doubt
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
@@ -328,7 +328,7 @@ def _summary(table: Table) -> str:
         orders = [(c.ky, c.kx) for c, _ in table.rows]
         if table.search is not None:
             sentence += f"; {table.search.sentence}"
-        strange = table.doubt or doubt(table.used.carriers(orders), [c for c, _ in table.rows])
+        strange = table.doubt or stretch_doubt(table.used.carriers(orders), [c for c, _ in table.rows])
         return f"{sentence}; {strange}" if strange else sentence
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
     if table.search is not None and table.search.found is None:

@@ -27,13 +27,14 @@ from dappled.decode.lightfield.aperture import (
     shown_aperture,
     transfer,
 )
-from dappled.decode.lightfield.clipping import clipped_shares
+from dappled.decode.lightfield.clipping import clipped_shares, unclipped
 from dappled.decode.lightfield.frame_views import TakenSlices, place_of, views_of
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.light_field import LightField, no_views
 from dappled.decode.lightfield.mask_place import MaskPlace, cycles_per_radian
 from dappled.decode.lightfield.views import Views
-from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
-from dappled.decode.optics.visibility import order_strengths
+from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Sensor
+from dappled.decode.optics.visibility import designs
+from dappled.decode.spectrum.lineariser import LinearRows
 from dappled.decode.spectrum.peaks import (
     ALONE_NATS,
     STRONG,
@@ -42,7 +43,7 @@ from dappled.decode.spectrum.peaks import (
     farther_lattice,
     measure,
     own_lattice,
-    stretch,
+    stretch_doubt,
     turn_between,
 )
 from dappled.decode.spectrum.slices import Slices, extract
@@ -50,7 +51,6 @@ from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers,
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
-_DOUBTED = 0.04  # of a carrier's frequency: a mask at its stated place is never so far off
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _UNKNOWN: Mapping[str, Any] = {
     "transfers": None,
@@ -98,23 +98,9 @@ class DecodeReport:
     @property
     def doubt(self) -> str | None:
         """What is unusual about carriers, mask, aperture and views, in a sentence; None where nothing is."""
-        place = doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
+        place = stretch_doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
         words = (place, self.mask_doubt, self.aperture_doubt, self.views_doubt)
         return "; ".join(one for one in words if one) or None
-
-
-def doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
-    """A sentence where carriers are too far from their prediction for a mask at its stated place; else None."""
-    off = stretch(used, predicted)
-    if abs(off) <= _DOUBTED:
-        return None
-    way = "farther out" if off > 0 else "farther in"
-    return f"they stand {abs(off):.1%} {way} than predicted: check mask distance and focal length, or calibrate"
-
-
-def no_views(slices: Slices) -> tuple[Views, NDArray[np.float64]]:
-    """The views (0, 0, h, w) and offsets (0, 0, 2) of slices alone."""
-    return np.zeros((0, 0, *slices.values.shape[1:]), dtype=np.float32), np.zeros((0, 0, 2))
 
 
 def light_field(
@@ -249,10 +235,16 @@ class MaskDecoder:
             noise = noise_rms(spectrum)
         if views:
             made, offsets, views_from, known = self.views(
-                slices, lattice, carriers_from, focal_length_mm=focal_length_mm, f_number=f_number, noise_rms=noise
+                slices,
+                lattice,
+                carriers_from,
+                focal_length_mm=focal_length_mm,
+                f_number=f_number,
+                noise_rms=noise,
+                plane=plane if self._clips else None,
             )
         else:
-            made, offsets, views_from, known = *no_views(slices), "none", _UNKNOWN
+            made, offsets, views_from, known = *no_views(slices.values.shape[1:]), "none", _UNKNOWN
         report = DecodeReport(
             tuple(predicted),
             tuple(measured),
@@ -281,6 +273,11 @@ class MaskDecoder:
             facts["view_sigma"] = np.sqrt(np.mean(sigma**2, axis=(2, 3))).tolist()
         field = light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts, view_sigma=sigma)
         return field, report
+
+    @property
+    def _clips(self) -> bool:
+        """Whether the joint model has clipped pixels to allow for."""
+        return self.joint_views and self.clipped is not None and bool(self.clipped.any())
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
         """The spectrum up to the largest frequency that slices and searches need at this focal length."""
@@ -375,11 +372,13 @@ class MaskDecoder:
         focal_length_mm: float,
         f_number: float | None,
         noise_rms: float,
+        plane: Source | None = None,
     ) -> tuple[Views, NDArray[np.float64], ViewsFrom, Mapping[str, Any]]:
         """Views of slices that were cut before, their offsets, where phases came from, and what each slice is of the
         light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used, and the `aperture` that
-        it was taken through (see `Aperture.shape`), with what is strange about that."""
-        none = no_views(slices)
+        it was taken through (see `Aperture.shape`), with what is strange about that. With their `plane`, its clipped
+        pixels count as what is around them tells."""
+        none = no_views(slices.values.shape[1:])
         if f_number is None:
             return *none, "none", _UNKNOWN
         printed = self.mask.frequency_per_mm
@@ -405,13 +404,19 @@ class MaskDecoder:
         width: UsedAperture | None = None
         place: MaskPlace | None = None
         if self.calibration is not None:
-            taken, width, place = self._calibrated(taken, lattice, self.calibration.nearest(focal_length_mm))
+            known = self.calibration.nearest(focal_length_mm)
+            taken, width, place = self._calibrated(taken, lattice, known)
+            if plane is not None and width.fits and not (place and place.turn_rad):
+                taken, width, place = self._calibrated(self._unclipped(taken, plane, lattice), lattice, known)
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
+            drawn = designs(
+                self.mask, self.sensor, lattice, self.mask_distance_mm, f_number=f_number, orders=taken.orders
+            )
             width = shown_aperture(
                 slices.values,
-                self._designs(lattice, taken.orders, f_number),
+                drawn,
                 taken.orders,
                 nominal_kappa=cycles,
                 rotation_rad=rotation,
@@ -446,14 +451,14 @@ class MaskDecoder:
         }
         return made.views, taken.aperture.offsets(), views_from, facts
 
-    def _designs(self, lattice: Lattice, orders: Sequence[Order], f_number: float) -> list[NDArray[np.float64]]:
-        """(K,) how strong each order is before the stop: as drawn, and less film, diffraction and pixels."""
-        made = order_strengths(
-            self.mask, self.sensor, lattice, mask_distance_mm=self.mask_distance_mm, f_number=f_number, orders=orders
-        )
-        drawn = np.array([1.0, *(one.pattern for one in made)])
-        left = np.array([1.0, *(one.film * one.diffraction * one.pixels for one in made)])
-        return [drawn, drawn * left]
+    def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> TakenSlices:
+        """The slices of a plane whose clipped pixels are as bright as what is around them tells."""
+        assert self.clipped is not None
+        whole = plane.plane(self.workers) if isinstance(plane, LinearRows) else plane
+        spectrum = transform(unclipped(whole, self.clipped, taken), workers=self.workers)
+        size = self.slice_size(lattice)
+        made = extract(spectrum, taken.carriers, size, taper=self.taper, workers=self.workers)
+        return replace(taken, values=made.values)
 
     def _calibrated(
         self, taken: TakenSlices, lattice: Lattice, known: LatticeFit

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.decoder import DecodeReport, light_field, no_views
+from dappled.decode.decoder import DecodeReport, light_field
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import Aperture, at_centre, at_corner, relative_transfer
-from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.lightfield.light_field import LightField, no_views
 from dappled.decode.lightfield.views import Views, from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
@@ -102,7 +102,7 @@ class LensletDecoder:
                 made = flattened(made, self.white.views)
             offsets = Aperture(count).offsets()
         else:
-            made, offsets = no_views(slices)
+            made, offsets = no_views(slices.values.shape[1:])
         seen = dict(zip(found.orders, found.measured, strict=True))
         report = DecodeReport(
             predicted=slices.carriers,

@@ -1,12 +1,15 @@
-"""Standard errors of views near clipped pixels: unknown, and elsewhere as they were."""
+"""What clipped pixels would hold; standard errors of views near them: unknown, and elsewhere as they were."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dappled.decode.lightfield import LightField
 from dappled.decode.lightfield.clipping import clipped_shares, unknown_where_clipped
+from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
 SHAPE, SIZE, STEP = (600, 720), (100, 120), 6.0  # of the frame, of a view, pixels a sample
 PATCHES = 10, 11
@@ -66,3 +69,42 @@ def test_the_share_of_each_patch_that_is_clipped() -> None:
     assert shares.shape == PATCHES
     assert shares.max() == pytest.approx(400 / 144**2)
     np.testing.assert_array_equal(np.argwhere(shares > 0), [[4, 2], [4, 3], [5, 2], [5, 3]])
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_what_clipped_between_the_masks_dark_places_is_told_by_the_pixels_around(seed: int) -> None:
+    """Half the ideal aperture, one pixel in a hundred at white. Views are nearly those of a sensor without a white."""
+    band = 0.4 * MASK.frequency_per_mm * 0.01
+    scene = RaySum(finest=band, snr=100, kappa=0.5, seed=seed, apart=True)
+    plane, true = scene.expose()
+    white = np.quantile(plane, 0.99)
+    clipped = (plane >= white).astype(np.float32)
+    decoder = scene.decoder(joint_views=True)
+    whole, lost, told = (
+        each.decode(seen, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+        for each, seen in (
+            (decoder, plane),
+            (decoder, np.minimum(plane, white)),
+            (replace(decoder, clipped=clipped), np.minimum(plane, white)),
+        )
+    )
+    truth = on_slices(true, whole.grid, whole.slices.shape[1:])
+    best, without, made = (psnr(field.views, truth) for field in (whole, lost, told))
+    assert made > without + 4, (best, without, made)
+    assert made > best - 2, (best, without, made)
+    np.testing.assert_array_equal(told.slices, lost.slices)  # they are the file's
+
+
+def test_a_highlight_that_clipped_as_a_whole_is_not_made_up() -> None:
+    """At the ideal aperture the mask lets the same light through to all pixels of an even scene."""
+    scene = RaySum(boards=(0.0,), exponent=2.0, finest=0.02, kappa=1.0, points=3)
+    plane, _ = scene.expose()
+    white = np.quantile(plane, 0.97)
+    cut = np.minimum(plane, white)
+    decoder = scene.decoder(joint_views=True)
+    clipped = (plane >= white).astype(np.float32)
+    plain = decoder.decode(cut, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+    told = replace(decoder, clipped=clipped).decode(cut, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+    highlight = on_slices(clipped, told.grid, told.slices.shape[1:]) > 0.9
+    assert highlight.any()
+    assert np.abs(told.views - plain.views)[:, :, highlight].max() < 0.02 * white

@@ -1,4 +1,4 @@
-"""Which patches of a frame's views hold clipped pixels, and their standard errors: unknown where these are many."""
+"""What clipped pixels would hold, which patches of views have them, and what is unknown where they are many."""
 
 from __future__ import annotations
 
@@ -6,11 +6,38 @@ import itertools
 from dataclasses import replace
 
 import numpy as np
+from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
+from dappled.decode.lightfield.frame_views import TakenSlices
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.patch_model import SIDE
 from dappled.decode.lightfield.patches import Patches
+
+_NEAR = 0.75  # of the mask's period: 1 σ of the window in which light is taken as even
+_LEAST_KNOWN = 1e-3  # of the window
+
+
+def unclipped(plane: Singles, clipped: Singles, taken: TakenSlices) -> Singles:
+    """A plane (H, W) with clipped pixels, where `clipped` (H, W) is above 0, as bright as what is around them tells.
+
+    The mask lets more light to some pixels than to their neighbours: m(x) = Σ_k T_k W(κk) e^{2πi f_k·x} of it, where a
+    scene is even over a few pixels. There the pixels that are not clipped tell the light Σ m·plane / Σ m² (Gaussian
+    window), and m times it is what a clipped one would hold. A stop of the ideal aperture and more evens m out to 1: a
+    highlight is clipped as a whole then, and nothing is changed.
+    """
+    pixels = [2j * np.pi * np.arange(side) for side in plane.shape]
+    frequencies = np.array([(c.fy, c.fx) for c in taken.carriers])
+    down, across = (np.exp(np.outer(at, f)).astype(np.complex64) for at, f in zip(pixels, frequencies.T, strict=True))
+    weights = taken.model().common()[: len(frequencies)] * np.where(frequencies.any(axis=1), 2, 1)
+    through = ((down * weights.astype(np.complex64)) @ across.T).real
+    known = clipped <= 0
+    sigma = [_NEAR * step for step in taken.samples_px]
+    told, there = (
+        ndimage.gaussian_filter(np.where(known, through * values, np.float32(0)), sigma) for values in (plane, through)
+    )
+    told *= through / np.maximum(there, _LEAST_KNOWN)
+    return np.where(known | (there < _LEAST_KNOWN), plane, np.maximum(plane, told))
 
 
 def unknown_where_clipped(field: LightField, clipped: Singles, most: float) -> LightField:

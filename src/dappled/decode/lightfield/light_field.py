@@ -222,3 +222,8 @@ def _signs(seed: int) -> NDArray[np.float32]:
         z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     z ^= z >> np.uint64(31)
     return (1.0 - 2.0 * (z >> np.uint64(63))).astype(np.float32).reshape(_BLOCK, PROJECTIONS)
+
+
+def no_views(shape: tuple[int, ...]) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    """The views (0, 0, h, w) and offsets (0, 0, 2) of slices (h, w) alone."""
+    return np.zeros((0, 0, *shape), dtype=np.float32), np.zeros((0, 0, 2))

@@ -122,6 +122,16 @@ def order_strengths(
     ]
 
 
+def designs(
+    mask: Mask, sensor: Sensor, lattice: Lattice, mask_distance_mm: float, *, f_number: float, orders: Sequence[Order]
+) -> list[NDArray[np.float64]]:
+    """(K,) how strong each order, the mean first, is before the stop: as drawn, and less film, diffraction, pixels."""
+    made = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number, orders=orders)
+    drawn = np.array([1.0, *(one.pattern for one in made)])
+    left = np.array([1.0, *(one.film * one.diffraction * one.pixels for one in made)])
+    return [drawn, drawn * left]
+
+
 def _on_the_way(
     mask: Mask, k: NDArray[np.float64], mask_distance_mm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -21,6 +21,7 @@ STRONGER = 0.1  # needed to override a calibration: parallax shifts weak peaks
 FARTHER = 0.12  # of a carrier's frequency: 2° of rotation and, under the fd law, 10 % of the mask's distance
 _ALIKE_BINS = 0.5  # rms from their lattice
 _STRICTLY_ALIKE_BINS = 0.1  # of a lattice that was searched for far and wide
+_DOUBTED = 0.04  # of a carrier's frequency: a mask at its stated place is never so far off
 _FRACTIONS = (1 / 2, 1 / 3, 1 / 4, 1 / 6, 1 / 8, 3 / 8)  # colour patterns, interpolation, JPEG blocks
 
 
@@ -236,6 +237,15 @@ def stretch(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> float:
     both = [(math.hypot(c.fy, c.fx), said[c.ky, c.kx]) for c in used if (c.ky, c.kx) in said]
     whole = sum(there for _, there in both)
     return sum(here for here, _ in both) / whole - 1 if whole else 0.0
+
+
+def stretch_doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
+    """A sentence where carriers are too far from their prediction for a mask at its stated place; else None."""
+    off = stretch(used, predicted)
+    if abs(off) <= _DOUBTED:
+        return None
+    way = "farther out" if off > 0 else "farther in"
+    return f"they stand {abs(off):.1%} {way} than predicted: check mask distance and focal length, or calibrate"
 
 
 def turn_between(lattice: Lattice, predicted: Lattice) -> float:
