@@ -4,6 +4,7 @@ Frames are simulated ray by ray (`RayCamera`), the camera is calibrated on a sto
 decoded twice: with the joint model, and with each spatial frequency alike, as before. "mean" is the mean of the true
 views taken for every view. PSNR in dB, 1.0 = sensor white. `--keep FOLDER` keeps frames and truth for the next run.
 `--picture FILE` draws an outer view of the last frame: true, before and joint, and below them 10 times the errors.
+`--known-depths` adds what the joint model reaches that is told the true disparities (see `known_depths`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from known_depths import views_given
 from limits import show
 from matplotlib import cbook
 from numpy.typing import NDArray
@@ -139,7 +141,8 @@ class Frame:
 class Reached:
     """PSNR in dB: joint, before, the mean of the true views, and `told` of the joint and of the mean where a standard
     error is told; the share of errors within 1 σ (NaN where none is told); processor seconds of the joint decode, the
-    model that was used, and `corner` (3, h, w): a view at the aperture's edge, true, before and joint."""
+    model that was used, `known_depths` the PSNR of the one that is told them (NaN: not asked for), and `corner`
+    (3, h, w): a view at the aperture's edge, true, before and joint."""
 
     joint: float
     before: float
@@ -148,6 +151,7 @@ class Reached:
     within: float
     seconds: float
     model: str
+    known_depths: float
     corner: NDArray[np.floating]
 
 
@@ -211,8 +215,8 @@ def at_every_sample(sigma: NDArray[np.float32], shape: tuple[int, ...]) -> NDArr
     return np.asarray(np.where(down @ ~told @ across.T > 0, np.nan, np.sqrt(variance)), dtype=np.float32)
 
 
-def reached(frame: Frame, f_number: float = F_NUMBER) -> Reached:
-    """Decode a frame both ways."""
+def reached(frame: Frame, f_number: float, disparity: NDArray[np.float32] | None = None) -> Reached:
+    """Decode a frame both ways, and told its true `disparity` (H, W), dx/dθ, if that is given."""
     calibration = calibrated(frame)
     clipped = (frame.plane >= WHITE_SHARE).astype(np.float32)
     decoder = MaskDecoder(calibration.sensor, MASK, "geometric", DISTANCE_MM, calibration, clipped=clipped)
@@ -229,6 +233,7 @@ def reached(frame: Frame, f_number: float = F_NUMBER) -> Reached:
         told = np.isfinite(there)
         known = (told & np.isfinite(truth))[INSIDE]
         within = float((np.abs(joint.views - truth) < there)[INSIDE][known].mean())
+    reach = FOCAL_MM / f_number / PITCH_MM  # columns of the sensor over the aperture
     where_told = np.where(told, truth, np.float32(np.nan))
     return Reached(
         psnr(joint.views, truth),
@@ -238,6 +243,7 @@ def reached(frame: Frame, f_number: float = F_NUMBER) -> Reached:
         within,
         took,
         str(joint.attributes["views_model"]),
+        float("nan") if disparity is None else psnr(views_given(joint, disparity * reach), truth),
         np.stack([truth[1, 0], before.views[1, 0], joint.views[1, 0]]),
     )
 
@@ -265,6 +271,7 @@ def chosen(parser: argparse.ArgumentParser, families: Collection[str]) -> tuple[
 def main() -> None:
     parser = options(__doc__ or "", FAMILIES, seeds=1)
     parser.add_argument("--keep", type=Path, help="folder of simulated frames, used again if they are there")
+    parser.add_argument("--known-depths", action="store_true", help="also with the true disparities (slow)")
     arguments, families = chosen(parser, FAMILIES)
     high, wide = arguments.shape
     figures: dict[str, float] = {}
@@ -272,7 +279,9 @@ def main() -> None:
         rows = []
         for seed in range(arguments.first, arguments.first + arguments.seeds):
             kept = arguments.keep and arguments.keep / f"{name}-{seed}-{high}x{wide}.npz"
-            rows.append(reached(frame_of(FAMILIES[name].camera(seed, (high, wide)), kept), FAMILIES[name].f_number))
+            camera = FAMILIES[name].camera(seed, (high, wide))
+            disparity = camera.disparity() if arguments.known_depths else None
+            rows.append(reached(frame_of(camera, kept), camera.f_number, disparity))
             if not arguments.json:
                 print(f"{name} {seed}: {line(rows[-1])}", flush=True)
         if not arguments.json:
@@ -300,6 +309,7 @@ def line(row: Reached) -> str:
     return (
         f"joint {row.joint:.1f}, before {row.before:.1f}, mean {row.mean:.1f} dB; told: joint {row.told[0]:.1f}, "
         f"mean {row.told[1]:.1f} dB; {row.within:.0%} within 1 σ, {row.seconds:.1f} CPU-s, {row.model}"
+        + ("" if np.isnan(row.known_depths) else f"; depths known {row.known_depths:.1f} dB")
     )
 
 

@@ -200,7 +200,7 @@ class RayCamera:
             camera=self,
             views=np.moveaxis(views, 1, -1).reshape(n, n, *self.shape, colours),
             view_weights=self.open_stop.view_weights(n),
-            disparity=self._disparity(),
+            disparity=self.disparity(),
             clipped=clipped,
         )
         return RayFrame(np.clip(plane, 0, 1).astype(np.float32), truth)
@@ -290,7 +290,7 @@ class RayCamera:
             reach = np.hypot(theta[0] + shift * y[:, None], theta[1] + shift * x[None, :])
             light *= reach <= self.aperture_mm / 2
 
-    def _disparity(self) -> Singles:
+    def disparity(self) -> Singles:
         """(H, W) dx/dθ as the middle of the stop sees it."""
         out = np.zeros(self.shape, dtype=np.float32)
         for board in self.boards:
