@@ -65,6 +65,7 @@ _UNKNOWN: Mapping[str, Any] = {
     "mask_place": None,
     "mask_doubt": None,
 }
+_LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
 
@@ -234,6 +235,7 @@ class MaskDecoder:
             slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
             noise = noise_rms(spectrum)
         if views:
+            clips = self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
             made, offsets, views_from, known = self.views(
                 slices,
                 lattice,
@@ -241,7 +243,7 @@ class MaskDecoder:
                 focal_length_mm=focal_length_mm,
                 f_number=f_number,
                 noise_rms=noise,
-                plane=plane if self._clips else None,
+                plane=plane if clips else None,
             )
         else:
             made, offsets, views_from, known = *no_views(slices.values.shape[1:]), "none", _UNKNOWN
@@ -273,11 +275,6 @@ class MaskDecoder:
             facts["view_sigma"] = np.sqrt(np.mean(sigma**2, axis=(2, 3))).tolist()
         field = light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts, view_sigma=sigma)
         return field, report
-
-    @property
-    def _clips(self) -> bool:
-        """Whether the joint model has clipped pixels to allow for."""
-        return self.joint_views and self.clipped is not None and bool(self.clipped.any())
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
         """The spectrum up to the largest frequency that slices and searches need at this focal length."""
@@ -377,7 +374,7 @@ class MaskDecoder:
         """Views of slices that were cut before, their offsets, where phases came from, and what each slice is of the
         light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used, and the `aperture` that
         it was taken through (see `Aperture.shape`), with what is strange about that. With their `plane`, its clipped
-        pixels count as what is around them tells."""
+        pixels count as what is around them tells, if there is a calibration and the mask hasn't turned since."""
         none = no_views(slices.values.shape[1:])
         if f_number is None:
             return *none, "none", _UNKNOWN
@@ -405,9 +402,12 @@ class MaskDecoder:
         place: MaskPlace | None = None
         if self.calibration is not None:
             known = self.calibration.nearest(focal_length_mm)
-            taken, width, place = self._calibrated(taken, lattice, known)
-            if plane is not None and width.fits and not (place and place.turn_rad):
-                taken, width, place = self._calibrated(self._unclipped(taken, plane, lattice), lattice, known)
+            found = self._calibrated(taken, lattice, known)
+            if plane is not None and found[1].fits and not (found[2] and found[2].turn_rad):
+                taken = replace(taken, values=self._unclipped(found[0], plane, lattice))
+                again = self._calibrated(taken, lattice, known)
+                found = again if again[1].fits else found
+            taken, width, place = found
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
@@ -451,14 +451,14 @@ class MaskDecoder:
         }
         return made.views, taken.aperture.offsets(), views_from, facts
 
-    def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> TakenSlices:
+    def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:
         """The slices of a plane whose clipped pixels are as bright as what is around them tells."""
         assert self.clipped is not None
         whole = plane.plane(self.workers) if isinstance(plane, LinearRows) else plane
-        spectrum = transform(unclipped(whole, self.clipped, taken), workers=self.workers)
-        size = self.slice_size(lattice)
-        made = extract(spectrum, taken.carriers, size, taper=self.taper, workers=self.workers)
-        return replace(taken, values=made.values)
+        with self.buffers.lend(self.sensor.shape) as tiles:
+            spectrum = transform(unclipped(whole, self.clipped, taken), tiles=tiles, workers=self.workers)
+            size = self.slice_size(lattice)
+            return extract(spectrum, taken.carriers, size, taper=self.taper, workers=self.workers).values
 
     def _calibrated(
         self, taken: TakenSlices, lattice: Lattice, known: LatticeFit

@@ -2,17 +2,53 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
+from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lightfield import LightField
-from dappled.decode.lightfield.clipping import clipped_shares, unknown_where_clipped
+from dappled.decode.lightfield.aperture import Aperture
+from dappled.decode.lightfield.clipping import clipped_shares, unclipped, unknown_where_clipped
+from dappled.decode.lightfield.frame_views import TakenSlices
+from dappled.decode.spectrum.lineariser import lineariser
 from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
+BAND = 0.4 * MASK.frequency_per_mm * 0.01  # cycles/pixel: inside a slice's band
 SHAPE, SIZE, STEP = (600, 720), (100, 120), 6.0  # of the frame, of a view, pixels a sample
 PATCHES = 10, 11
+
+
+@dataclass(frozen=True)
+class HalfOpen:
+    """A frame as a sensor without a white has it (`whole`), as it is, which pixels are `clipped`, its true views."""
+
+    scene: RaySum
+    whole: np.ndarray
+    plane: np.ndarray
+    clipped: np.ndarray
+    views: np.ndarray
+
+    def decoders(self) -> tuple[MaskDecoder, MaskDecoder]:
+        """One that doesn't know what is clipped, one that does."""
+        decoder = self.scene.decoder(joint_views=True)
+        return decoder, replace(decoder, clipped=self.clipped)
+
+
+def _taken(decoder: MaskDecoder, frame: HalfOpen) -> TakenSlices:
+    """The slices as they were taken through the known aperture."""
+    made = decoder.decode(frame.plane, focal_length_mm=FOCAL_MM, f_number=frame.scene.f_number)
+    down, across, real, imaginary = np.array(made.attributes["transfers"]).T
+    carriers = decoder.predict(FOCAL_MM)
+    assert [(c.ky, c.kx) for c in carriers] == [(ky, kx) for ky, kx in made.carriers[:, :2]]
+    aperture = Aperture(5, made.attributes["aperture"])
+    steps = float(made.grid[0, 0]), float(made.grid[1, 1])
+    taken = TakenSlices(
+        made.slices, carriers, real + 1j * imaginary, frame.scene.kappa, 0.0, aperture, steps, 1.0, 0.0, colours=False
+    )
+    np.testing.assert_allclose(taken.angular, np.stack([down, across], axis=1), atol=0.05)
+    return taken
 
 
 def field(*, told: bool = True) -> LightField:
@@ -71,33 +107,72 @@ def test_the_share_of_each_patch_that_is_clipped() -> None:
     np.testing.assert_array_equal(np.argwhere(shares > 0), [[4, 2], [4, 3], [5, 2], [5, 3]])
 
 
-@pytest.mark.parametrize("seed", [0, 1])
-def test_what_clipped_between_the_masks_dark_places_is_told_by_the_pixels_around(seed: int) -> None:
-    """Half the ideal aperture, one pixel in a hundred at white. Views are nearly those of a sensor without a white."""
-    band = 0.4 * MASK.frequency_per_mm * 0.01
-    scene = RaySum(finest=band, snr=100, kappa=0.5, seed=seed, apart=True)
+@pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.slow)])
+def half_open(request: pytest.FixtureRequest) -> HalfOpen:
+    """Half the ideal aperture, one pixel in a hundred at white."""
+    scene = RaySum(finest=BAND, snr=100, kappa=0.5, seed=request.param, apart=True, shape=(240, 280))
     plane, true = scene.expose()
-    white = np.quantile(plane, 0.99)
-    clipped = (plane >= white).astype(np.float32)
-    decoder = scene.decoder(joint_views=True)
+    white = float(np.quantile(plane, 0.99))
+    return HalfOpen(scene, plane, np.minimum(plane, np.float32(white)), (plane >= white).astype(np.float32), true)
+
+
+def test_what_clipped_beside_the_masks_dark_places_is_told_by_these(half_open: HalfOpen) -> None:
+    """Views are nearly those of a sensor without a white, and slices those of the file."""
+    decoder, knows = half_open.decoders()
     whole, lost, told = (
-        each.decode(seen, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
-        for each, seen in (
-            (decoder, plane),
-            (decoder, np.minimum(plane, white)),
-            (replace(decoder, clipped=clipped), np.minimum(plane, white)),
-        )
+        each.decode(seen, focal_length_mm=FOCAL_MM, f_number=half_open.scene.f_number)
+        for each, seen in ((decoder, half_open.whole), (decoder, half_open.plane), (knows, half_open.plane))
     )
-    truth = on_slices(true, whole.grid, whole.slices.shape[1:])
+    truth = on_slices(half_open.views, whole.grid, whole.slices.shape[1:])
     best, without, made = (psnr(field.views, truth) for field in (whole, lost, told))
-    assert made > without + 4, (best, without, made)
+    assert made > without + 2.5, (best, without, made)
     assert made > best - 2, (best, without, made)
-    np.testing.assert_array_equal(told.slices, lost.slices)  # they are the file's
+    np.testing.assert_array_equal(told.slices, lost.slices)
+
+
+def test_a_wrong_f_number_is_told_of_frames_with_clipped_pixels_too(half_open: HalfOpen) -> None:
+    _, knows = half_open.decoders()
+    _, report = knows.decode_reported(
+        half_open.plane, focal_length_mm=FOCAL_MM, f_number=1.3 * half_open.scene.f_number
+    )
+    assert report.aperture_doubt is not None
+    assert "told is f/19" in report.aperture_doubt
+
+
+def test_a_mosaic_gives_the_same_as_its_plane(half_open: HalfOpen) -> None:
+    _, knows = half_open.decoders()
+    counts = np.rint(half_open.plane * 20_000).astype(np.uint16)
+    rows = lineariser(counts.shape, black=0.0, white=20_000.0, cfa=None).apply(counts)
+    given = {"focal_length_mm": FOCAL_MM, "f_number": half_open.scene.f_number}
+    np.testing.assert_allclose(knows.decode(rows, **given).views, knows.decode(rows.plane(), **given).views, atol=1e-5)
+
+
+def test_places_without_a_sample_tell_nothing(half_open: HalfOpen) -> None:
+    """A staggered sensor spread on a square: every other place holds a sample, twice as bright, the others nothing."""
+    decoder, _ = half_open.decoders()
+    taken = _taken(decoder, half_open)
+    there = np.indices(half_open.plane.shape).sum(axis=0) % 2 == 0
+    spread, clipped = np.where(there, 2 * half_open.plane, 0), np.where(there, half_open.clipped, 0)
+    made = unclipped(spread, clipped, taken)
+    lost = clipped > 0
+    np.testing.assert_array_equal(made[~lost], spread[~lost])
+    off, before = (np.sqrt(np.mean((one - 2 * half_open.whole)[lost] ** 2)) for one in (made, spread))
+    assert off < 0.6 * before
+
+
+def test_a_wide_highlight_keeps_its_white_inside(half_open: HalfOpen) -> None:
+    decoder, _ = half_open.decoders()
+    clipped = half_open.clipped.copy()
+    clipped[60:180, 80:200] = 1
+    plane = np.where(clipped > 0, half_open.plane.max(), half_open.plane)
+    made = unclipped(plane, clipped, _taken(decoder, half_open))
+    assert np.isfinite(made).all()
+    np.testing.assert_array_equal(made[100:140, 120:160], plane[100:140, 120:160])
 
 
 def test_a_highlight_that_clipped_as_a_whole_is_not_made_up() -> None:
     """At the ideal aperture the mask lets the same light through to all pixels of an even scene."""
-    scene = RaySum(boards=(0.0,), exponent=2.0, finest=0.02, kappa=1.0, points=3)
+    scene = RaySum(boards=(0.0,), exponent=2.0, finest=0.02, kappa=1.0, points=3, shape=(240, 280))
     plane, _ = scene.expose()
     white = np.quantile(plane, 0.97)
     cut = np.minimum(plane, white)

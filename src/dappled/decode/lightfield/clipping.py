@@ -16,6 +16,7 @@ from dappled.decode.lightfield.patches import Patches
 
 _NEAR = 0.75  # of the mask's period: 1 σ of the window in which light is taken as even
 _LEAST_KNOWN = 1e-3  # of the window
+_ROWS = 64  # at a time: complex waves take twice the plane's memory
 
 
 def unclipped(plane: Singles, clipped: Singles, taken: TakenSlices) -> Singles:
@@ -30,14 +31,16 @@ def unclipped(plane: Singles, clipped: Singles, taken: TakenSlices) -> Singles:
     frequencies = np.array([(c.fy, c.fx) for c in taken.carriers])
     down, across = (np.exp(np.outer(at, f)).astype(np.complex64) for at, f in zip(pixels, frequencies.T, strict=True))
     weights = taken.model().common()[: len(frequencies)] * np.where(frequencies.any(axis=1), 2, 1)
-    through = ((down * weights.astype(np.complex64)) @ across.T).real
-    known = clipped <= 0
+    through = np.empty(plane.shape, dtype=np.float32)
+    for rows in np.array_split(np.arange(len(plane)), max(1, len(plane) // _ROWS)):
+        through[rows] = ((down[rows] * weights.astype(np.complex64)) @ across.T).real
+    known = (clipped <= 0) & (plane != 0)  # staggered sensors have places without a sample
     sigma = [_NEAR * step for step in taken.samples_px]
     told, there = (
         ndimage.gaussian_filter(np.where(known, through * values, np.float32(0)), sigma) for values in (plane, through)
     )
     told *= through / np.maximum(there, _LEAST_KNOWN)
-    return np.where(known | (there < _LEAST_KNOWN), plane, np.maximum(plane, told))
+    return np.where((clipped <= 0) | (there < _LEAST_KNOWN), plane, np.maximum(plane, told))
 
 
 def unknown_where_clipped(field: LightField, clipped: Singles, most: float) -> LightField:
