@@ -33,16 +33,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folders", nargs="*", type=Path, metavar="FOLDER", help="light fields in HCI's format")
     parser.add_argument("--held-out", action="store_true", help="other seeds, which nothing was tuned on")
+    parser.add_argument("--seeds", type=int, nargs="+", help="of the scenes, instead of either")
     parser.add_argument("--masked", action="store_true", help="the same scenes through a mask, decoded: 5 × 5 views")
     parser.add_argument("--side", type=int, default=256, help="height and width of the scenes, px (default: 256)")
     parser.add_argument("--json", action="store_true", help="figures as JSON")
     arguments = parser.parse_args()
+    seeds = arguments.seeds or (HELD_OUT if arguments.held_out else SEEDS)
     if arguments.folders:
         found = {folder.name: scored(*_plain(*of_folder(folder))) for folder in arguments.folders}
     elif arguments.masked:
-        found = on_masked(HELD_OUT if arguments.held_out else SEEDS, arguments.side)
+        found = on_masked(seeds, arguments.side)
     else:
-        found = on_scenes(HELD_OUT if arguments.held_out else SEEDS, arguments.side)
+        found = on_scenes(seeds, arguments.side)
     show("depth", found, as_json=arguments.json)
 
 

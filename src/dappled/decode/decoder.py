@@ -53,17 +53,12 @@ CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _UNKNOWN: Mapping[str, Any] = {
-    "transfers": None,
-    "aperture": None,
-    "aperture_doubt": None,
-    "f_number_shown": None,
-    "f_number_shown_sigma": None,
-    "views_doubt": None,
-    "views_model": None,
+    **dict.fromkeys(("transfers", "aperture", "aperture_doubt", "f_number_shown", "f_number_shown_sigma")),
+    **dict.fromkeys(("views_doubt", "views_model")),
     "views_reason": "",
     "view_sigma": None,
-    "mask_place": None,
-    "mask_doubt": None,
+    "views_unclipped": False,
+    **dict.fromkeys(("mask_place", "mask_doubt")),
 }
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
@@ -399,14 +394,14 @@ class MaskDecoder:
             else clipped_shares(self.clipped, slices.values.shape[1:], slices.grid) > 0,
         )
         width: UsedAperture | None = None
-        place: MaskPlace | None = None
+        place, told = None, False
         if self.calibration is not None:
             known = self.calibration.nearest(focal_length_mm)
             found = self._calibrated(taken, lattice, known)
             if plane is not None and found[1].fits and not (found[2] and found[2].turn_rad):
                 taken = replace(taken, values=self._unclipped(found[0], plane, lattice))
                 again = self._calibrated(taken, lattice, known)
-                found = again if again[1].fits else found
+                found, told = (again, True) if again[1].fits else (found, False)
             taken, width, place = found
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
@@ -446,6 +441,7 @@ class MaskDecoder:
             "views_model": made.model,
             "views_reason": made.reason or ("" if fits else "its carriers agree with no aperture"),
             "view_sigma": made.sigma,
+            "views_unclipped": told,
             "mask_place": place.to_dict() if place is not None else None,
             "mask_doubt": place.doubt(self.mask.frequency_per_mm) if place is not None else None,
         }

@@ -128,6 +128,7 @@ def test_what_clipped_beside_the_masks_dark_places_is_told_by_these(half_open: H
     assert made > without + 2.5, (best, without, made)
     assert made > best - 2, (best, without, made)
     np.testing.assert_array_equal(told.slices, lost.slices)
+    assert [field.attributes["views_unclipped"] for field in (whole, lost, told)] == [False, False, True]
 
 
 def test_a_wrong_f_number_is_told_of_frames_with_clipped_pixels_too(half_open: HalfOpen) -> None:
