@@ -4,7 +4,8 @@ Frames are simulated ray by ray (`RayCamera`), the camera is calibrated on a sto
 decoded twice: with the joint model, and with each spatial frequency alike, as before. "mean" is the mean of the true
 views taken for every view. PSNR in dB, 1.0 = sensor white. `--keep FOLDER` keeps frames and truth for the next run.
 `--picture FILE` draws an outer view of the last frame: true, before and joint, and below them 10 times the errors.
-`--known-depths` adds what the joint model reaches that is told the true disparities (see `known_depths`).
+`--known-depths` adds what the joint model reaches that is told the true disparities (see `known_depths`; not for
+clipped frames and turned masks, whose slices it takes as they are).
 """
 
 from __future__ import annotations
@@ -233,7 +234,10 @@ def reached(frame: Frame, f_number: float, disparity: NDArray[np.float32] | None
         told = np.isfinite(there)
         known = (told & np.isfinite(truth))[INSIDE]
         within = float((np.abs(joint.views - truth) < there)[INSIDE][known].mean())
-    reach = FOCAL_MM / f_number / PITCH_MM  # columns of the sensor over the aperture
+    given, place = float("nan"), joint.attributes["mask_place"]
+    if disparity is not None and not clipped.any() and not (place and place["turn_rad"]):
+        reach = FOCAL_MM / f_number / PITCH_MM  # columns of the sensor over the aperture
+        given = psnr(views_given(joint, disparity * reach), truth)
     where_told = np.where(told, truth, np.float32(np.nan))
     return Reached(
         psnr(joint.views, truth),
@@ -243,7 +247,7 @@ def reached(frame: Frame, f_number: float, disparity: NDArray[np.float32] | None
         within,
         took,
         str(joint.attributes["views_model"]),
-        float("nan") if disparity is None else psnr(views_given(joint, disparity * reach), truth),
+        given,
         np.stack([truth[1, 0], before.views[1, 0], joint.views[1, 0]]),
     )
 
