@@ -31,10 +31,7 @@ def views_given(field: LightField, disparity: NDArray[np.floating]) -> NDArray[n
     patches = Patches((field.slices.shape[1], field.slices.shape[2]), SIDE)
     frame, used = _model(field, patches)
     slices = field.slices[used]
-    cut = patches.cut(slices)
-    weights = patches.window**2
-    means = np.einsum("nyx,yx->n", cut[0].real, weights) / weights.sum()
-    cut -= (frame.model.common()[: len(slices), None] * means).astype(np.complex64)[:, :, None, None]
+    cut, means = patches.less_means(patches.cut(slices), frame.model.common()[: len(slices)])
     spectra = patches.spectra(cut)
     texture = np.log(np.abs(spectra[:, 0]) ** 2 + 1e-12).mean(axis=0)
     group = np.searchsorted(np.quantile(texture, np.arange(1, GROUPS) / GROUPS), texture)
@@ -47,7 +44,7 @@ def views_given(field: LightField, disparity: NDArray[np.floating]) -> NDArray[n
         own = spectrum.at(frame.radius(frame.frequencies))
         rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[alike] ** 2))), KINDS)
         for one in alike:
-            there = _disparities(disparity, field.grid, patches.corners[one])
+            there = _disparities(disparity, field.grid, patches, int(one))
             made[:, :, one] = _views(frame, own, rests, spectra[:, :, one], there)
     windowed = patches.images(made) + (means[:, None, None] * patches.window).astype(np.float32)[:, None]
     return patches.joined(windowed).reshape(count, count, *slices.shape[1:])
@@ -69,15 +66,14 @@ def _model(field: LightField, patches: Patches) -> tuple[FrameModel, NDArray[np.
     return FrameModel.of(patches, model, steps, noise, reach=aperture.views * steps[1]), used
 
 
-def _disparities(disparity: NDArray[np.floating], grid: Floats, corner: tuple[int, int]) -> tuple[Floats, Floats]:
+def _disparities(disparity: NDArray[np.floating], grid: Floats, patches: Patches, number: int) -> tuple[Floats, Floats]:
     """The disparities that occur in a patch, and their shares of it, less at its edges."""
-    pixels = []
+    pixels, corner = [], patches.corners[number]
     for begin, (step, first), side in zip(corner, (grid[0, [0, 2]], grid[1, [1, 2]]), disparity.shape, strict=True):
         samples = begin - SIDE + np.arange(SIDE)
         pixels.append(np.clip(np.rint(samples * step + first), 0, side - 1).astype(int))
-    along = np.sin(np.pi * (np.arange(SIDE) + 0.5) / SIDE) ** 2
     there, at = np.unique(disparity[np.ix_(*pixels)].astype(np.float64), return_inverse=True)
-    sums = np.bincount(at.ravel(), weights=np.outer(along, along).ravel())
+    sums = np.bincount(at.ravel(), weights=(patches.window**2).ravel())
     shares = np.asarray(sums / sums.sum())
     kept = shares >= LEAST_SHARE
     return there[kept], shares[kept] / shares[kept].sum()

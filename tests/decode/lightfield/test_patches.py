@@ -14,6 +14,15 @@ def test_patches_of_an_image_make_the_image_again(shape: tuple[int, int]) -> Non
     np.testing.assert_allclose(patches.joined(patches.images(spectra)), image.real, atol=1e-5)
 
 
+def test_an_even_light_is_taken_out_of_every_image_as_each_holds_it() -> None:
+    light = np.array([1.0, 0.5j, -0.25], dtype=np.complex128)
+    patches = Patches((40, 53), 24)
+    even = np.broadcast_to(3 * light[:, None, None], (3, 40, 53)).astype(np.complex64)
+    left, means = patches.less_means(patches.cut(even), light)
+    np.testing.assert_allclose(means, 3, rtol=1e-6)
+    np.testing.assert_allclose(left, 0, atol=1e-6)
+
+
 @pytest.mark.parametrize("shape", [(40, 53), (24, 24)])
 def test_patches_of_one_shade_are_not_apart_at_the_edges_of_their_images_either(shape: tuple[int, int]) -> None:
     patches = Patches(shape, 24)

@@ -91,10 +91,7 @@ def joint_views(
     a patch's light that gets into each slice but the first, whatever its transfer, row by row of `sigma`; None: none.
     """
     patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
-    cut = patches.cut(slices)
-    weights = patches.window**2
-    means = np.einsum("nyx,yx->n", cut[0].real, weights) / weights.sum()
-    cut -= (model.common()[: len(slices), None] * means).astype(np.complex64)[:, :, None, None]
+    cut, means = patches.less_means(patches.cut(slices), model.common()[: len(slices)])
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)
     texture = _texture(cut[0].real, patches.window)
     groups = max(1, min(_TEXTURES, len(means) // _FEWEST))

@@ -140,11 +140,8 @@ def _terms(
     reach: float,
 ) -> tuple[NDArray[np.int64], NDArray[np.complex128], NDArray[np.intp]]:
     """The differences m (M, 2) of orders, the terms c (N, M) of each patch, and which patches these are."""
-    cut = patches.cut(slices)[:, inner]
-    weights = patches.window**2
-    means = np.einsum("nyx,yx->n", cut[0].real, weights) / weights.sum()
-    cut -= (model.common()[: len(slices), None] * means).astype(np.complex64)[:, :, None, None]
-    contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, weights)
+    cut, means = patches.less_means(patches.cut(slices)[:, inner], model.common()[: len(slices)])
+    contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, patches.window**2)
     best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
     spectra = patches.spectra(cut[:, best])
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)

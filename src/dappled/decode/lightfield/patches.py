@@ -67,6 +67,14 @@ class Patches:
         wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), mode="symmetric")
         return np.stack([wide[:, top : top + n, left : left + n] for top, left in self.corners], axis=1)
 
+    def less_means(self, patches: Complexes, common: NDArray[np.complex128]) -> tuple[Complexes, Floats]:
+        """The patches (K, N, side, side), in their place, without their means (N,) by the window: those of the first
+        image, times what each image holds of what is `common` (K,)."""
+        weights = self.window**2
+        means = np.einsum("nyx,yx->n", patches[0].real, weights) / weights.sum()
+        patches -= (common[:, None] * means).astype(np.complex64)[:, :, None, None]
+        return patches, means
+
     def spectra(self, patches: Complexes) -> Complexes:
         """(F, 2K − 1, N) the spectra of patches (K, N, side, side), of the slices and then of their conjugates but the
         first's, scaled so that white noise keeps its variance."""

@@ -269,6 +269,7 @@ def _simulated(options: BodyOptions) -> Pictures:
         trigger_t_s = (trigger_monotonic_ns - start_ns) / 1e9
         if options.truth is not None:  # told when the shutter opens, as a contact does: making the picture takes longer
             latency_s = camera.latency_s(shot_number)
+            # The body's own latency, which the renderer has no need to wait for: no contact closes before it is over.
             time.sleep(max(0.0, latency_s - (time.monotonic_ns() - trigger_monotonic_ns) / 1e9))
             middle_t_s = trigger_t_s + latency_s + exposure_s / 2
             times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": middle_t_s, "latency_s": latency_s}
