@@ -1,6 +1,6 @@
 """Views of the joint model that is told the true disparities: what is left to gain by finding them better.
 
-As `dappled.decode.lightfield.joint_views` has it, each patch of the slices is a sum of the band's own detail at some
+As `dappled.decode.joint.joint_views` has it, each patch of the slices is a sum of the band's own detail at some
 disparities, of detail that folds in, of what views have alone, and of noise. Here each patch is told which share of it
 lies at which disparity. The strength of its texture, and how much detail there is beyond the band, are the most
 probable ones of a few.
@@ -11,11 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.decode.joint.patch_model import SIDE, FrameModel, PatchKind, TexturePower, rests_of
+from dappled.decode.joint.patches import Patches
+from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.patch_model import SIDE, FrameModel, PatchKind, TexturePower, rests_of
-from dappled.decode.lightfield.patches import Patches
-from dappled.decode.lightfield.slice_model import SliceModel
 
 Floats = NDArray[np.float64]
 STRENGTHS = (0.1, 0.3, 1.0, 3.0, 10.0)

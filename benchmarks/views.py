@@ -27,7 +27,7 @@ from scipy import fft, ndimage
 from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.lightfield.clipping import unknown_where_clipped
+from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.optics import Mask, Sensor
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from dappled.decode import decoder
-from dappled.decode.lightfield import frame_views
-from dappled.decode.lightfield.frame_views import FrameViews
+from dappled.decode.joint import frame_views
+from dappled.decode.joint.frame_views import FrameViews
 from tests import shared
 from tests.products import flown
 from tests.products.flown import Flown

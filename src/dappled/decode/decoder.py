@@ -17,6 +17,9 @@ from numpy.typing import NDArray
 from dappled.decode.array_types import Singles
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.errors import DecodeError
+from dappled.decode.joint.clipping import clipped_shares, unclipped
+from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of
+from dappled.decode.joint.mask_place import MaskPlace, cycles_per_radian
 from dappled.decode.lightfield.aperture import (
     Aperture,
     UsedAperture,
@@ -27,10 +30,7 @@ from dappled.decode.lightfield.aperture import (
     shown_aperture,
     transfer,
 )
-from dappled.decode.lightfield.clipping import clipped_shares, unclipped
-from dappled.decode.lightfield.frame_views import TakenSlices, place_of, views_of
 from dappled.decode.lightfield.light_field import LightField, no_views
-from dappled.decode.lightfield.mask_place import MaskPlace, cycles_per_radian
 from dappled.decode.lightfield.views import Views
 from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Sensor
 from dappled.decode.optics.visibility import designs

@@ -21,9 +21,9 @@ from dappled.decode.calibration import Calibration
 from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
+from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
-from dappled.decode.lightfield.clipping import unknown_where_clipped
 from dappled.decode.lightfield.colour_views import dc_views, in_colour
 from dappled.decode.lightfield.falloff import Falloff, falloff
 from dappled.decode.optics import LAWS

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dappled.decode.array_types import Complexes
+from dappled.decode.joint.mask_place import MaskPlace, cycles_per_radian, mask_place
+from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
-from dappled.decode.lightfield.mask_place import MaskPlace, cycles_per_radian, mask_place
-from dappled.decode.lightfield.slice_model import SliceModel
 from dappled.decode.optics import Lattice, Sensor
 
 ORDERS = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) >= (0, 0)]

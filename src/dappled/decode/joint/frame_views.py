@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
+from dappled.decode.joint.joint_views import joint_views
+from dappled.decode.joint.mask_place import MaskPlace, mask_place
+from dappled.decode.joint.patch_model import FARTHEST, SIDE
+from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, UsedAperture, angular_frequencies, used_aperture
-from dappled.decode.lightfield.joint_views import joint_views
-from dappled.decode.lightfield.mask_place import MaskPlace, mask_place
-from dappled.decode.lightfield.patch_model import FARTHEST, SIDE
-from dappled.decode.lightfield.slice_model import SliceModel
 from dappled.decode.lightfield.views import Views, chroma_noise, from_slices
 from dappled.decode.optics import Carrier, Order
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
-from dappled.decode.lightfield.patch_model import (
+from dappled.decode.joint.patch_model import (
     KINDS,
     LEAST_NOISE,
     MOVES_NATS,
@@ -38,8 +38,8 @@ from dappled.decode.lightfield.patch_model import (
     lean_of,
     rests_of,
 )
-from dappled.decode.lightfield.patches import Patches
-from dappled.decode.lightfield.slice_model import SliceModel
+from dappled.decode.joint.patches import Patches
+from dappled.decode.joint.slice_model import SliceModel
 from dappled.workers import each
 
 Doubles = NDArray[np.complex128]

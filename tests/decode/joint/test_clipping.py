@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.joint.clipping import clipped_shares, unclipped, unknown_where_clipped
+from dappled.decode.joint.frame_views import TakenSlices
 from dappled.decode.lightfield import LightField
 from dappled.decode.lightfield.aperture import Aperture
-from dappled.decode.lightfield.clipping import clipped_shares, unclipped, unknown_where_clipped
-from dappled.decode.lightfield.frame_views import TakenSlices
 from dappled.decode.spectrum.lineariser import lineariser
-from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
+from tests.decode.joint.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
 BAND = 0.4 * MASK.frequency_per_mm * 0.01  # cycles/pixel: inside a slice's band
 SHAPE, SIZE, STEP = (600, 720), (100, 120), 6.0  # of the frame, of a view, pixels a sample

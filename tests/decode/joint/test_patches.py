@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dappled.decode.lightfield.patches import Patches
+from dappled.decode.joint.patches import Patches
 
 
 @pytest.mark.parametrize("shape", [(40, 53), (24, 24)])

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from dappled.decode.joint.joint_views import joint_views
+from dappled.decode.joint.patch_model import is_motionless
+from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
-from dappled.decode.lightfield.joint_views import joint_views
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.patch_model import is_motionless
-from dappled.decode.lightfield.slice_model import SliceModel
-from tests.decode.lightfield.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
+from tests.decode.joint.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
 BAND = 0.4 * MASK.frequency_per_mm * 0.01  # cycles/pixel: inside a slice's band
 

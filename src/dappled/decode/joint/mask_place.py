@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats
-from dappled.decode.lightfield.patch_model import (
+from dappled.decode.joint.patch_model import (
     KINDS,
     SIDE,
     USUAL,
@@ -30,8 +30,8 @@ from dappled.decode.lightfield.patch_model import (
     rests_of,
     wholes_of,
 )
-from dappled.decode.lightfield.patches import Patches
-from dappled.decode.lightfield.slice_model import SliceModel
+from dappled.decode.joint.patches import Patches
+from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.optics import Lattice, Order, Sensor
 
 _MOST_PATCHES = 400  # those with the most texture

@@ -9,10 +9,10 @@ import numpy as np
 from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
-from dappled.decode.lightfield.frame_views import TakenSlices
-from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.lightfield.patch_model import SIDE
-from dappled.decode.lightfield.patches import Patches
+from dappled.decode.joint.frame_views import TakenSlices
+from dappled.decode.joint.patch_model import SIDE
+from dappled.decode.joint.patches import Patches
+from dappled.decode.lightfield import LightField
 
 _NEAR = 0.75  # of the mask's period: 1 σ of the window in which light is taken as even
 _LEAST_KNOWN = 1e-3  # of the window

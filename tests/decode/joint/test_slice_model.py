@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 import pytest
 
+from dappled.decode.joint.slice_model import SliceModel, folded
 from dappled.decode.lightfield.aperture import SHAPES, Aperture, Shape, angular_frequencies, transfer
-from dappled.decode.lightfield.slice_model import SliceModel, folded
 from dappled.decode.optics.carriers import Mask
 
 ORDERS = Mask(15.5, 2).half_orders()

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
-from dappled.decode.lightfield.patches import Patches
-from dappled.decode.lightfield.slice_model import Fold, SliceModel, folded
+from dappled.decode.joint.patches import Patches
+from dappled.decode.joint.slice_model import Fold, SliceModel, folded
 
 SIDE = 24  # samples: a patch is wide against parallax, and small against things at one disparity
 STEP = SIDE // 2  # from one patch to the next
