@@ -3,16 +3,12 @@
 Views of a scene are not independent of each other at a spatial frequency f: where disparities are spread as p(D), views
 i and j covary as S(f)·∫ p(D) exp(−2πi D f·(θ_i − θ_j)) dD. Here p(D) is estimated patch by patch. Slices are linear
 measurements of the light field (`slice_model`): the band's own detail, detail that folds in from beyond the band, and
-noise. In each patch and at each frequency the views are the most probable ones (Wiener), averaged over hypotheses of
-the patch: one disparity out of a range, or all disparities of the frame at once, with one of several strengths of
-texture. A hypothesis weighs what its likelihood and its share in the whole frame say. Patches of similar texture share
-a spectrum. Likelihood decides in each patch, too, how much detail there is beyond the band, whether disparities lie in
+noise. In each patch and at each frequency the views are the most probable ones (Wiener). Patches of similar texture
+share a spectrum. Likelihood decides in each patch how much detail there is beyond the band, whether disparities lie in
 the usual range or farther, and whether views have more alone than in common: a thing out of all ranges, or an edge.
 
-For a hypothesis the band's own detail has few degrees of freedom. With the rest, folded detail and noise, made white
-(y = L⁻¹ slices) it is y = H s + n; HᴴH is diagonalised, and the most probable s and the likelihood follow for any
-strength a of the texture: s = a/(1 + aλ)·Hᴴy. Each view also has a little alone, which is part of the rest and
-estimated from what s leaves of the slices: without noise and folded detail the slices decide, whatever the model.
+Patches are looked at twice: at first any disparity may be there (`any_disparity`); a depth map of these first views
+tells the disparities of each patch, and its views are made again (`told_disparity`).
 """
 
 from __future__ import annotations
@@ -23,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
+from dappled.decode.depth.estimate import estimate
+from dappled.decode.depth.evidence import of_views
+from dappled.decode.joint.any_disparity import PatchBackground, views_at_any
 from dappled.decode.joint.patch_model import (
     KINDS,
-    LEAST_NOISE,
     MOVES_NATS,
     RANGES,
     SIDE,
-    WITHIN,
-    DisparityRange,
+    USUAL,
     FrameModel,
     LikelyKinds,
     TexturePower,
@@ -40,16 +37,18 @@ from dappled.decode.joint.patch_model import (
 )
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
+from dappled.decode.joint.told_disparity import TOLD_KINDS, shares_of, views_told
+from dappled.decode.lightfield import ViewStack
+from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each
 
-Doubles = NDArray[np.complex128]
-_ALL = 12  # degrees of freedom a frequency where all disparities are there at once
-_STRENGTHS = np.array([0.01, 0.1, 0.3, 1.0, 3.0, 10.0], dtype=np.float32)
 _TEXTURES = 3  # groups of patches of similar texture, each with its own spectrum
+_FEWEST_VIEWS = 3  # along an axis that have a middle one
 _FEWEST = 12  # patches in a group
+# Of views whose patches a depth map tells their disparities; the rest are their first views. With all of it, views of
+# boards with hard edges gain 0.1 to 0.3 dB more, and those of boards that blend lose 0.4 dB instead of 0.2.
+_TRUST = np.float32(0.75)
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
-_ROUNDING = 1e-6  # of the strongest degree of freedom: a few of the last places of single precision
-_NEGLIGIBLE = 0.01  # of a patch's probability
 # Of a patch's mean square difference to the views that it and its neighbours were joined to, of the model's variance of
 # what views have alone, and of all else of it, for each kind: 68 % of errors are within the root of the sum.
 _TOLD = (
@@ -57,8 +56,18 @@ _TOLD = (
     *((1.6, 0.04, 0.3), *((1.8, 0.01, 0.15),) * 2, *((0.25, 0.05, 1.2),) * 3, (0.45, 0.05, 0.4)),
     *((1.0, 0.9, 1.0),) * 6,
 )
+# The same for patches that a depth map tells their disparities, and last of the mean square difference to their first
+# views. With `RaySum`'s frames of soft edges, half of errors are within the root.
+_TWICE = (
+    (0.45, 0.03, 0.6, 2.1),
+    (0.4, 0.02, 0.64, 1.2),
+    (0.5, 0.01, 1.2, 0.2),
+    (0.44, 0.05, 1.04, 0.05),
+    (0.52, 0.0, 0.86, 0.12),
+    (0.42, 0.02, 1.32, 0.07),
+)
+_TOLD_TWICE = dict(zip(TOLD_KINDS, _TWICE, strict=True))
 _TOLD_MOTIONLESS = (0.7, 0.86, 2.65)
-_ROUNDS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,12 +102,8 @@ def joint_views(
     patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
     cut, means = patches.less_means(patches.cut(slices), model.common()[: len(slices)])
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)
-    texture = _texture(cut[0].real, patches.window)
-    groups = max(1, min(_TEXTURES, len(means) // _FEWEST))
-    group = np.searchsorted(np.quantile(texture, np.arange(1, groups) / groups), texture)
-    group[patches.at_edges] = groups
-    rings = _RING * np.abs(model.common())
-    rings[0] = 0
+    group = _groups(cut[0].real, patches)
+    rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
     count = model.aperture.views
     windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
     shares = np.zeros(len(means)) if astray is None else astray
@@ -116,7 +121,7 @@ def joint_views(
     def look(part: int) -> None:
         alike, members = parts[part]
         mean = float(np.sqrt(np.mean(means[alike] ** 2)))
-        ringing = rings * mean if group[members][0] == groups else np.zeros(len(rings))
+        ringing = rings * mean if group[members][0] == _TEXTURES else np.zeros(len(rings))
         here = replace(frame, noise=frame.noise + ringing**2, astray=float(shares[members][0]))
         looked[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, members[alike])
 
@@ -130,83 +135,50 @@ def joint_views(
     lean = lean_of(np.concatenate([one.likely.gain for one in looked.values()]))
     motionless = is_motionless(lean, np.concatenate([one.likely.moved for one in looked.values()]))
     each(solve, range(len(parts)), workers)
-    windowed += (means[:, None, None] * patches.window).astype(np.float32)[:, None]
+    lit = (means[:, None, None] * patches.window).astype(np.float32)[:, None]
+    windowed += lit
     views = patches.joined(windowed)
-    variance += of_apart * patches.apart(windowed, views)
+    apart = patches.apart(windowed, views)
+    if not motionless and count >= _FEWEST_VIEWS:
+        depths = _depths(views, model.aperture, samples_px, workers)
+        told = shares_of(depths, frame.ranges[USUAL].disparities, patches)
+
+        def look_again(part: int) -> None:
+            one, members = looked[part], np.flatnonzero(parts[part][1])
+            again = np.isin(one.likely.chosen(lean), TOLD_KINDS) & told[members].any(axis=1)
+            if not again.any():
+                return
+            members = members[again]
+            found = views_told(one.frame, one.own, one.rests, patches.spectra(cut[:, members]), told[members])
+            change = patches.images(found.spectra) - (windowed[members] - lit[members])
+            windowed[members] += _TRUST * change
+            of_apart[members], *factors = np.array([_TOLD_TWICE[kind] for kind in found.kinds]).T
+            squares = np.mean(change**2, axis=(2, 3)).T
+            variance[:, members] = sum(map(np.multiply, factors, (found.alone, found.rest, squares)))
+
+        each(look_again, range(len(parts)), workers)
+        views = patches.joined(windowed)
+    variance += of_apart * apart
     sigma = np.sqrt(variance).astype(np.float32).reshape(count, count, *patches.grid)
     return JointViews(views.reshape(count, count, *slices.shape[1:]), sigma, float(beyond.mean()))
 
 
-def _texture(images: Singles, window: Floats) -> Floats:
-    """(N,) how much fine detail each patch (N, side, side) has."""
+def _depths(views: Singles, aperture: Aperture, samples_px: tuple[float, float], workers: int) -> Floats:
+    """(h, w) disparities in sensor columns over the aperture, by views (V·U, h, w); NaN where unknown."""
+    count, (rows_px, columns_px) = aperture.views, samples_px
+    steps = count * np.unique(aperture.points()[:, 0])
+    stack = ViewStack(views.reshape(count, count, *views.shape[1:]), steps * columns_px / rows_px, steps)
+    return estimate(of_views(stack), workers=workers).disparity.astype(np.float64) * (count * columns_px)
+
+
+def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
+    """(N,) which patches (N, side, side) are alike, by how much fine detail they have: `_TEXTURES` for those at the
+    edges, fewer for others."""
     rows, columns = np.diff(images, axis=1)[:, :, 1:], np.diff(images, axis=2)[:, 1:, :]
-    return np.asarray(np.einsum("nyx,yx->n", rows**2 + columns**2, window[1:, 1:]), dtype=np.float64)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Background:
-    """What is not the band's own detail at one disparity: `whitener` L⁻¹ (F, A, A) of its covariance, `unmixed`
-    (F, V·U, A) what views have alone, of the slices, and `left` (F, V·U) its variance that is left."""
-
-    whitener: Doubles
-    unmixed: Complexes
-    left: Floats
-
-    @classmethod
-    def of(cls, covariance: Complexes, alone: Complexes, power: Floats) -> _Background:
-        """From `alone` (F, A, V·U), how the slices hold what each view has alone, of `power` (F,)."""
-        # In double precision: odds of hypotheses are exponentials of numbers in the thousands.
-        lower = np.linalg.cholesky(covariance.astype(np.complex128))
-        whitener = np.asarray(np.linalg.inv(lower), dtype=np.complex128)
-        white = whitener @ alone
-        unmixed = (white.conj().transpose(0, 2, 1) @ whitener * power[:, None, None]).astype(np.complex64)
-        explained = power[:, None] * (np.abs(white) ** 2).sum(axis=1)
-        return cls(whitener, unmixed, power[:, None] * np.maximum(1 - explained, 0))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Hypothesis:
-    """The band's own detail under a hypothesis, diagonalised: `strength` λ (F, R), `viewed` (F, R, V·U) of each degree
-    of freedom, less what the slices' view alone would hold of it, `projected` Hᴴy (F, R, N), and the log
-    likelihoods `gains` (strengths, N) over that of no detail at all."""
-
-    strength: Floats
-    viewed: Complexes
-    projected: Complexes
-    gains: Floats
-
-    @classmethod
-    def of(
-        cls, seen: Complexes, viewed: Complexes, white: Doubles, background: _Background, *, weights: Singles, most: int
-    ) -> _Hypothesis:
-        """From `seen` (F, R, A) and `viewed`, for whitened spectra (F, A, N); at most `most` degrees of freedom, and
-        `weights` (F,) of frequencies in the likelihood."""
-        rows = seen.astype(np.complex128) @ background.whitener.transpose(0, 2, 1)
-        if rows.shape[1] <= most:
-            strength, turn = np.linalg.eigh(rows.conj() @ rows.transpose(0, 2, 1))
-        else:
-            strength, left = np.linalg.eigh(rows.transpose(0, 2, 1) @ rows.conj())
-            strength, left = strength[:, -most:], left[:, :, -most:]
-            # What few slices don't see is rounding, not a direction.
-            seen_well = strength > _ROUNDING * strength[:, -1:]
-            strength = np.where(seen_well, strength, 0)
-            scale = np.where(seen_well, 1 / np.sqrt(np.maximum(strength, LEAST_NOISE)), 0)
-            turn = rows.conj() @ left * scale[:, None, :]
-        turned = turn.transpose(0, 2, 1)
-        beside = viewed - seen @ background.unmixed.transpose(0, 2, 1)
-        strength = np.maximum(strength, 0)
-        projected = (turned @ rows).conj() @ white  # in double precision for the likelihood, then no more
-        gains = _gains(strength, projected, weights)
-        return cls(strength, (turned @ beside).astype(np.complex64), projected.astype(np.complex64), gains)
-
-
-def _gains(strength: Floats, projected: Doubles, weights: Singles) -> Floats:
-    """(strengths, N) log likelihoods over that of no detail at all."""
-    scaled = _STRENGTHS[:, None, None]
-    shrunk = weights[:, None] * scaled / (1 + scaled * strength)
-    power = (projected.real**2 + projected.imag**2).reshape(-1, projected.shape[2])
-    volume = (weights[:, None] * np.log1p(scaled * strength)).sum(axis=(1, 2))
-    return np.asarray(shrunk.reshape(len(_STRENGTHS), -1) @ power - volume[:, None], dtype=np.float64)
+    texture = np.einsum("nyx,yx->n", rows**2 + columns**2, patches.window[1:, 1:])
+    count = max(1, min(_TEXTURES, len(images) // _FEWEST))
+    group = np.searchsorted(np.quantile(texture, np.arange(1, count) / count), texture)
+    return np.asarray(np.where(patches.at_edges, _TEXTURES, group))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -250,7 +222,7 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
     variance, of_apart = np.empty(made.shape[1:]), np.empty(made.shape[2])
     for number in np.unique(chosen):
         kind = KINDS[number]
-        background = _Background.of(rests[number], frame.alone, kind.alone * own)
+        background = PatchBackground.of(rests[number], frame.alone, kind.alone * own)
         left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
         for still in (False, True):
             members = np.flatnonzero((chosen == number) & ((unmoved & (kind.range == 0)) == still))
@@ -258,78 +230,7 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
                 continue
             some = frame.motionless if still else frame.ranges[kind.range]
             of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
-            made[:, :, members], found = _views(frame, some, own, background, spectra[:, :, members])
+            made[:, :, members], found = views_at_any(frame, some, own, background, spectra[:, :, members])
             variance[:, members] = of_alone * left + of_rest * found
     beyond = [number for number, kind in enumerate(KINDS) if kind.range == len(RANGES) - 1]
     return _Solved(made, variance, of_apart, np.isin(chosen, beyond))
-
-
-def _views(
-    frame: FrameModel, some: DisparityRange, own: Floats, background: _Background, spectra: Complexes
-) -> tuple[Complexes, Floats]:
-    """The views' spectra (F, V·U, N), and their variance (V·U, N) a pixel but for what each has alone, of patches in a
-    range and before a background."""
-    size = np.sqrt(own / len(WITHIN)).astype(np.float32)[:, None, None, None]
-    seen, viewed = some.seen * size, some.viewed * size
-    white = background.whitener @ spectra
-    single = [
-        _Hypothesis.of(seen[:, d], viewed[:, d], white, background, weights=frame.weights, most=len(WITHIN))
-        for d in range(seen.shape[1])
-    ]
-    gains = np.concatenate([one.gains for one in single])
-    _, prior = _weighed(gains, np.full(len(gains), 1 / len(gains)))
-    histogram = prior.reshape(len(single), -1).sum(axis=1)
-    share = np.sqrt(0.98 * histogram + 0.02 / len(histogram)).astype(np.float32)[None, :, None, None]
-    flat = [(part * share).reshape(len(part), -1, part.shape[-1]) for part in (seen, viewed)]
-    together = _Hypothesis.of(flat[0], flat[1], white, background, weights=frame.weights, most=_ALL)
-    del white
-    gains = np.concatenate([gains, together.gains])
-    count = len(together.gains)
-    odds, _ = _weighed(gains, np.concatenate([0.8 * prior, np.full(count, 0.2 / count)]))
-    return _expected(frame, [*single, together], odds, background, spectra)
-
-
-def _weighed(gains: Floats, prior: Floats) -> tuple[Floats, Floats]:
-    """(odds (C, N), prior (C,)) of hypotheses with log likelihoods (C, N): the prior that explains all patches best.
-
-    The prior of a few patches counts their likelihood more than once, and is the better for it: tied to the prior (C,)
-    that it starts from by the weight of 2, 5 or 20 patches, views of boards lose 1.2 to 3.1 dB."""
-    for _ in range(_ROUNDS):
-        total = gains + np.log(prior)[:, None]
-        odds = np.exp(total - total.max(axis=0))
-        odds /= odds.sum(axis=0)
-        prior = odds.mean(axis=1) + 1e-5
-        prior /= prior.sum()
-    return odds, prior
-
-
-def _expected(
-    frame: FrameModel, hypotheses: list[_Hypothesis], odds: Floats, background: _Background, spectra: Complexes
-) -> tuple[Complexes, Floats]:
-    """The views' spectra (F, V·U, N), averaged over hypotheses, and their variance (V·U, N) a pixel, with that between
-    hypotheses, but for what each view has alone."""
-    count = len(_STRENGTHS)
-    patches = odds.shape[1]
-    probable = odds.reshape(len(hypotheses), count, patches)
-    probable = np.where(probable.sum(axis=1, keepdims=True) > _NEGLIGIBLE, probable, 0)
-    probable /= probable.sum(axis=(0, 1))
-    multiplicity = frame.multiplicity.astype(np.float32)
-    moved = np.zeros((len(spectra), frame.alone.shape[1], patches), dtype=np.complex64)
-    variance = np.zeros(moved.shape[1:])
-    for one, some in zip(hypotheses, probable, strict=True):
-        odd = some.astype(np.float32)
-        used = np.flatnonzero(odd.sum(axis=0))
-        if not len(used):
-            continue
-        scaled = _STRENGTHS[:, None, None]
-        shares = scaled / (1 + scaled * one.strength)  # (strengths, F, R)
-        shrunk = np.tensordot(shares, odd[:, used], axes=(0, 0))
-        part = one.viewed.transpose(0, 2, 1) @ (shrunk * one.projected[:, :, used])
-        moved[:, :, used] += part
-        squares = np.einsum("fvn,f->vn", part.real**2 + part.imag**2, multiplicity)
-        variance[:, used] += squares / odd[:, used].sum(axis=0)
-        weighted = (np.abs(one.viewed) ** 2 * multiplicity[:, None, None]).reshape(-1, moved.shape[1])
-        variance += (shares.reshape(count, -1) @ weighted).T @ odd
-    spread = np.einsum("fvn,f->vn", moved.real**2 + moved.imag**2, multiplicity)
-    # All hypotheses but one are negligible in most patches: there the two cancel but for rounding.
-    return background.unmixed @ spectra + moved, np.maximum(variance - spread, 0) / SIDE**2

@@ -67,9 +67,10 @@ _MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each sl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DisparityRange:
-    """Disparities that a patch may have: `seen` (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, R of them
-    within each of D steps."""
+    """Disparities that a patch may have, `disparities` (D·R,) in sensor columns over the aperture, ascending: `seen`
+    (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, R of them within each of D steps."""
 
+    disparities: Floats
     seen: Complexes
     viewed: Complexes
 
@@ -85,6 +86,7 @@ class DisparityRange:
         within = (disparities[:, None] + np.array(WITHIN) * step).ravel()
         shape = (len(disparities), len(WITHIN), len(frequencies), -1)
         return cls(
+            within,
             np.ascontiguousarray(model.seen(frequencies, within).reshape(shape).transpose(2, 0, 1, 3)),
             np.ascontiguousarray(model.viewed(frequencies, within).reshape(shape).transpose(2, 0, 1, 3)),
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +62,7 @@ class Patches:
         at = np.arange(self.side * columns) % columns
         return np.where((at == 0) | (2 * at == self.side), 1.0, 2.0)
 
-    def cut(self, images: Complexes) -> Complexes:
+    def cut(self, images: NDArray[Any]) -> NDArray[Any]:
         """(K, N, side, side) the patches of images (K, h, w), continued at their edges by reflection."""
         n = self.side
         wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), mode="symmetric")

@@ -24,6 +24,7 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
+from numpy.polynomial.chebyshev import chebval
 from numpy.typing import NDArray
 from scipy import special
 
@@ -90,9 +91,10 @@ class Aperture:
     def transform(self, angular: NDArray[np.float64]) -> NDArray[np.complex128]:
         """(K,) the same over the whole aperture; 1 at 0."""
         if self.shape != "round":
-            axis = (np.arange(self.views) - (self.views - 1) / 2) / self.views
             frequencies = np.asarray(angular)
-            along = np.cos(2 * np.pi * frequencies[..., None] * axis).mean(axis=-1)
+            # The mean of cos(2πω(j − (N − 1)/2)/N) over the cells j, as a Chebyshev series of cos(πω/N).
+            multiples = np.abs(2 * np.arange(self.views) - self.views + 1)
+            along = chebval(np.cos(np.pi / self.views * frequencies), np.bincount(multiples) / self.views)
             if self.shape == "filled":
                 along *= np.sinc(frequencies / self.views)
             return np.asarray(along.prod(axis=-1), dtype=np.complex128)

@@ -1,0 +1,166 @@
+"""Views of patches that a depth map tells which disparities they have, and how much of each.
+
+One disparity, or all of the frame at once, explains a patch at an edge badly: it has two or three, in shares of its
+own. A map of depth made from first views tells them. What a patch has beyond the band, and how strong its texture is,
+is then chosen anew. The shares are not weighed against other hypotheses by their likelihood: more disparities than
+there are explain the slices of a patch better, and its views worse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.decode.array_types import Complexes, Floats, Singles
+from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackground
+from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, FrameModel
+from dappled.decode.joint.patches import Patches
+
+TOLD_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
+_SMOOTH_PX = 5  # the window of a median: folded detail scatters the depth of single samples
+_LEAST_SHARE = 0.02  # of a patch: less is left out
+_MOST = 8  # disparities in a patch
+_LEAST_TOLD = 0.5  # of a patch
+_TRIED = 5  # of so many frequencies one is looked at to choose the kind
+
+
+def shares_of(disparity: Floats, levels: Floats, patches: Patches) -> Floats:
+    """(N, D) the shares of each patch that lie at each of the `levels` (D,), ascending; 0 for all where the `disparity`
+    (h, w), in the levels' unit, NaN where unknown, doesn't tell half of a patch."""
+    apart = levels[-1] - levels[-2]
+    known = (disparity > levels[0] - apart) & (disparity < levels[-1] + apart)
+    near = np.where(known, np.searchsorted((levels[1:] + levels[:-1]) / 2, disparity), len(levels))
+    at = patches.cut(ndimage.median_filter(near, _SMOOTH_PX)[None])[0]
+    at += np.arange(len(at))[:, None, None] * (len(levels) + 1)
+    weights = np.broadcast_to(patches.window**2, at.shape)
+    found = np.bincount(at.ravel(), weights=weights.ravel(), minlength=len(at) * (len(levels) + 1))
+    shares = found.reshape(len(at), -1)[:, :-1] / weights[0].sum()
+    told = shares.sum(axis=1, keepdims=True) >= _LEAST_TOLD
+    least = np.maximum(_LEAST_SHARE, np.sort(shares, axis=1)[:, -_MOST, None])
+    shares = np.where(told & (shares >= least), shares, 0)
+    return np.asarray(shares / np.maximum(shares.sum(axis=1, keepdims=True), _LEAST_SHARE))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldViews:
+    """`spectra` (F, V·U, N) of the views of N patches, the variance (V·U, N) a pixel of what views have `alone` and of
+    the `rest`, and the `kinds` (N,) of the patches."""
+
+    spectra: Complexes
+    alone: Floats
+    rest: Floats
+    kinds: NDArray[np.intp]
+
+
+def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes, shares: Floats) -> ToldViews:
+    """The views of patches (F, A, N) with the power `own` (F,) and the `rests_of` their group, which have these
+    `shares` (N, D) of the usual range's disparities."""
+    usual = frame.ranges[USUAL]
+    size = np.sqrt(own).astype(np.float32)[:, None, None]
+    seen, viewed = (part.reshape(len(own), -1, part.shape[3]) * size for part in (usual.seen, usual.viewed))
+    nats = np.empty((len(TOLD_KINDS), len(shares)))
+    few = slice(None, None, _TRIED)
+    for number, one in zip(TOLD_KINDS, nats, strict=True):
+        background = PatchBackground.of(rests[number][few], frame.alone, KINDS[number].alone * own[few])
+        there = _Whitened.of(seen[few], background, spectra[few])
+        one[:] = frame.weights[few] @ there.without
+        for members, mix in _mixes(there, shares):
+            one[members] += mix.gains(frame.weights[few]).max(axis=0)
+    kinds = np.array(TOLD_KINDS)[nats.argmax(axis=0)]
+    made = np.empty((len(own), viewed.shape[2], len(kinds)), dtype=np.complex64)
+    alone, rest = np.empty(made.shape[1:]), np.empty(made.shape[1:])
+    for number in np.unique(kinds):
+        chosen = np.flatnonzero(kinds == number)
+        background = PatchBackground.of(rests[number], frame.alone, KINDS[number].alone * own)
+        there = _Whitened.of(seen, background, spectra[:, :, chosen])
+        beside = (viewed - seen @ background.unmixed.transpose(0, 2, 1)).astype(np.complex64)
+        coefficients = np.zeros((len(own), seen.shape[1], len(chosen)), dtype=np.complex64)
+        for members, mix in _mixes(there, shares[chosen]):
+            gains = mix.gains(frame.weights)
+            odds = np.exp(gains - gains.max(axis=0))
+            odds /= odds.sum(axis=0)
+            coefficients[:, mix.at, members[:, None]] = mix.coefficients(odds)
+            rest[:, chosen[members]] = mix.variance(odds, beside, frame.multiplicity) / SIDE**2
+        moved = beside.transpose(0, 2, 1) @ coefficients
+        made[:, :, chosen] = background.unmixed @ spectra[:, :, chosen] + moved
+        alone[:, chosen] = (frame.multiplicity @ background.left)[:, None] / SIDE**2
+    return ToldViews(made, alone, rest, kinds)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Whitened:
+    """Detail at D disparities before a background, which was made white: `gram` (F, D, D) HᴴH, `projected` (F, D, N)
+    Hᴴy of patches, and their log likelihoods `without` (F, N) detail."""
+
+    gram: Doubles
+    projected: Doubles
+    without: Floats
+
+    @classmethod
+    def of(cls, seen: Complexes, background: PatchBackground, spectra: Complexes) -> _Whitened:
+        rows = seen.astype(np.complex128) @ background.whitener.transpose(0, 2, 1)
+        white = background.whitener @ spectra
+        volume = 2 * np.log(np.abs(np.diagonal(background.whitener, axis1=1, axis2=2))).sum(axis=1)
+        without = volume[:, None] - (white.real**2 + white.imag**2).sum(axis=1)
+        return cls(rows.conj() @ rows.transpose(0, 2, 1), rows.conj() @ white, without)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Mix:
+    """Detail of n patches that have R disparities each, diagonalised: `at` (n, R) which ones, `sizes` (n, R) of each,
+    `strength` λ (F, n, R), `turn` (F, n, R, R) from the degrees of freedom to the disparities, and `projected`
+    (F, n, R)."""
+
+    at: NDArray[np.intp]
+    sizes: Floats
+    strength: Floats
+    turn: Doubles
+    projected: Doubles
+
+    def gains(self, weights: Singles) -> Floats:
+        """(strengths, n) log likelihoods over that of no detail."""
+        power = self.projected.real**2 + self.projected.imag**2
+        found = np.empty((len(STRENGTHS), len(self.at)))
+        for scale, one in zip(STRENGTHS.astype(np.float64), found, strict=True):
+            scaled = 1 + scale * self.strength
+            one[:] = np.einsum("f,fnr->n", weights, scale * power / scaled - np.log(scaled))
+        return found
+
+    def coefficients(self, odds: Floats) -> Doubles:
+        """(F, n, R) of each disparity, by the odds (strengths, n)."""
+        found = self.turn @ (self._shares(odds) * self.projected)[..., None]
+        return np.asarray(found[..., 0] * self.sizes)
+
+    def variance(self, odds: Floats, beside: Complexes, multiplicity: Floats) -> Floats:
+        """(V·U, n) sums over all frequencies of the views `beside` (F, D, V·U) what is known of the detail."""
+        shares = self._shares(odds) * multiplicity[:, None, None]
+        total = np.zeros((beside.shape[2], len(self.at)))
+        turned = (self.turn * self.sizes[:, :, None]).astype(np.complex64).transpose(0, 1, 3, 2)
+        for number, at in enumerate(self.at):
+            viewed = turned[:, number] @ beside[:, at]
+            total[:, number] = np.einsum("frv,fr->v", viewed.real**2 + viewed.imag**2, shares[:, number])
+        return total
+
+    def _shares(self, odds: Floats) -> Floats:
+        """(F, n, R) a/(1 + aλ), by the odds of each strength a."""
+        scaled = STRENGTHS.astype(np.float64)[:, None, None, None]
+        return np.asarray(np.einsum("sn,sfnr->fnr", odds, scaled / (1 + scaled * self.strength)))
+
+
+def _mixes(there: _Whitened, shares: Floats) -> list[tuple[NDArray[np.intp], _Mix]]:
+    """Which patches have one disparity, two …, and their detail."""
+    counts = np.count_nonzero(shares, axis=1)
+    made = []
+    for count in np.unique(counts):
+        members = np.flatnonzero(counts == count)
+        at = np.nonzero(shares[members])[1].reshape(-1, count)
+        sizes = np.sqrt(np.take_along_axis(shares[members], at, axis=1))
+        few = there.gram[:, at[:, :, None], at[:, None, :]] * (sizes[:, :, None] * sizes[:, None, :])
+        strength, turn = np.linalg.eigh(few)
+        projected = there.projected[:, at, members[:, None]] * sizes
+        projected = (turn.conj().swapaxes(2, 3) @ projected[..., None])[..., 0]
+        made.append((members, _Mix(at, sizes, np.maximum(strength, 0), turn, projected)))
+    return made
