@@ -48,12 +48,24 @@ def test_what_is_unknown_or_beyond_the_levels_tells_nothing() -> None:
     np.testing.assert_array_equal(_shares(single), [_only(1)] * 25)
 
 
+def test_samples_that_are_unknown_here_and_there_move_no_level() -> None:
+    chance = np.random.default_rng(2)
+    disparity = np.where(np.arange(48) < 24, -3.0, 3.0)[None, :] * np.ones((48, 1))
+    disparity[chance.uniform(size=disparity.shape) < 0.4] = np.nan
+    one, mirrored = _shares(disparity), _shares(-disparity)[:, ::-1]
+    np.testing.assert_array_equal(one, mirrored)
+    middle = one.reshape(5, 5, -1)[2, 2]
+    assert middle[LEVELS == 3] == pytest.approx(0.5, abs=0.06)
+    assert middle[np.abs(LEVELS) == 3].sum() == pytest.approx(1)
+
+
 def test_a_patch_has_no_more_than_eight_disparities() -> None:
     levels = np.linspace(-10, 10, 21)
-    slope = np.broadcast_to(np.linspace(-10, 10, 48), (48, 48)).copy()
-    found = shares_of(slope, levels, Patches((48, 48), SIDE))
-    assert (np.count_nonzero(found, axis=1) <= 8).all()
-    np.testing.assert_allclose(found.sum(axis=1), 1)
+    for wide in (1.0, 0.7, 0.45):
+        slope = np.broadcast_to(np.linspace(-10, 10, 48) * wide, (48, 48)).copy()
+        found = shares_of(slope, levels, Patches((48, 48), SIDE))
+        assert (np.count_nonzero(found, axis=1) <= 8).all()
+        np.testing.assert_allclose(found.sum(axis=1), 1)
 
 
 def _frame(noise: float) -> FrameModel:

@@ -8,6 +8,7 @@ there are explain the slices of a patch better, and its views worse.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,6 +25,7 @@ _SMOOTH_PX = 5  # the window of a median: folded detail scatters the depth of si
 _LEAST_SHARE = 0.02  # of a patch: less is left out
 _MOST = 8  # disparities in a patch
 _LEAST_TOLD = 0.5  # of a patch
+_AT_A_TIME = 64  # patches: what is worked on stays small
 _TRIED = 5  # of so many frequencies one is looked at to choose the kind
 
 
@@ -32,15 +34,21 @@ def shares_of(disparity: Floats, levels: Floats, patches: Patches) -> Floats:
     (h, w), in the levels' unit, NaN where unknown, doesn't tell half of a patch."""
     apart = levels[-1] - levels[-2]
     known = (disparity > levels[0] - apart) & (disparity < levels[-1] + apart)
-    near = np.where(known, np.searchsorted((levels[1:] + levels[:-1]) / 2, disparity), len(levels))
-    at = patches.cut(ndimage.median_filter(near, _SMOOTH_PX)[None])[0]
-    at += np.arange(len(at))[:, None, None] * (len(levels) + 1)
-    weights = np.broadcast_to(patches.window**2, at.shape)
-    found = np.bincount(at.ravel(), weights=weights.ravel(), minlength=len(at) * (len(levels) + 1))
-    shares = found.reshape(len(at), -1)[:, :-1] / weights[0].sum()
+    if not known.any():
+        return np.zeros((len(patches.corners), len(levels)))
+    near = np.searchsorted((levels[1:] + levels[:-1]) / 2, disparity)
+    # The median is that of what is known: elsewhere the nearest known sample stands.
+    row, column = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    at = patches.cut(ndimage.median_filter(near[row, column], _SMOOTH_PX)[None])[0]
+    weights = np.where(patches.cut(known[None])[0], patches.window**2, 0)
+    at += np.arange(len(at))[:, None, None] * len(levels)
+    found = np.bincount(at.ravel(), weights=weights.ravel(), minlength=len(at) * len(levels))
+    shares = found.reshape(len(at), -1) / (patches.window**2).sum()
     told = shares.sum(axis=1, keepdims=True) >= _LEAST_TOLD
-    least = np.maximum(_LEAST_SHARE, np.sort(shares, axis=1)[:, -_MOST, None])
-    shares = np.where(told & (shares >= least), shares, 0)
+    largest = np.argsort(-shares, axis=1, kind="stable")[:, :_MOST]
+    kept = np.zeros(shares.shape, dtype=bool)
+    np.put_along_axis(kept, largest, True, axis=1)
+    shares = np.where(told & kept & (shares >= _LEAST_SHARE), shares, 0)
     return np.asarray(shares / np.maximum(shares.sum(axis=1, keepdims=True), _LEAST_SHARE))
 
 
@@ -57,7 +65,7 @@ class ToldViews:
 
 def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes, shares: Floats) -> ToldViews:
     """The views of patches (F, A, N) with the power `own` (F,) and the `rests_of` their group, which have these
-    `shares` (N, D) of the usual range's disparities."""
+    `shares` (N, D), of sum 1, of the usual range's disparities."""
     usual = frame.ranges[USUAL]
     size = np.sqrt(own).astype(np.float32)[:, None, None]
     seen, viewed = (part.reshape(len(own), -1, part.shape[3]) * size for part in (usual.seen, usual.viewed))
@@ -150,17 +158,17 @@ class _Mix:
         return np.asarray(np.einsum("sn,sfnr->fnr", odds, scaled / (1 + scaled * self.strength)))
 
 
-def _mixes(there: _Whitened, shares: Floats) -> list[tuple[NDArray[np.intp], _Mix]]:
-    """Which patches have one disparity, two …, and their detail."""
+def _mixes(there: _Whitened, shares: Floats) -> Iterator[tuple[NDArray[np.intp], _Mix]]:
+    """Which patches have one disparity, two …, a few at a time, and their detail."""
     counts = np.count_nonzero(shares, axis=1)
-    made = []
     for count in np.unique(counts):
-        members = np.flatnonzero(counts == count)
-        at = np.nonzero(shares[members])[1].reshape(-1, count)
-        sizes = np.sqrt(np.take_along_axis(shares[members], at, axis=1))
-        few = there.gram[:, at[:, :, None], at[:, None, :]] * (sizes[:, :, None] * sizes[:, None, :])
-        strength, turn = np.linalg.eigh(few)
-        projected = there.projected[:, at, members[:, None]] * sizes
-        projected = (turn.conj().swapaxes(2, 3) @ projected[..., None])[..., 0]
-        made.append((members, _Mix(at, sizes, np.maximum(strength, 0), turn, projected)))
-    return made
+        alike = np.flatnonzero(counts == count)
+        for first in range(0, len(alike), _AT_A_TIME):
+            members = alike[first : first + _AT_A_TIME]
+            at = np.nonzero(shares[members])[1].reshape(-1, count)
+            sizes = np.sqrt(np.take_along_axis(shares[members], at, axis=1))
+            few = there.gram[:, at[:, :, None], at[:, None, :]] * (sizes[:, :, None] * sizes[:, None, :])
+            strength, turn = np.linalg.eigh(few)
+            projected = there.projected[:, at, members[:, None]] * sizes
+            projected = (turn.conj().swapaxes(2, 3) @ projected[..., None])[..., 0]
+            yield members, _Mix(at, sizes, np.maximum(strength, 0), turn, projected)
