@@ -126,7 +126,7 @@ def test_what_clipped_beside_the_masks_dark_places_is_told_by_these(half_open: H
     truth = on_slices(half_open.views, whole.grid, whole.slices.shape[1:])
     best, without, made = (psnr(field.views, truth) for field in (whole, lost, told))
     assert made > without + 2.5, (best, without, made)
-    assert made > best - 2, (best, without, made)
+    assert made > best - 3.5, (best, without, made)
     np.testing.assert_array_equal(told.slices, lost.slices)
     assert [field.attributes["views_unclipped"] for field in (whole, lost, told)] == [False, False, True]
 

@@ -175,22 +175,26 @@ def test_a_scene_without_parallax_has_its_mean_picture_for_every_view() -> None:
     assert psnr(field.views, np.broadcast_to(field.slices[0].real, field.views.shape)) > 55
 
 
-@pytest.mark.parametrize(("lean", "moved", "motionless"), [(5.0, 0.5, True), (5.0, 6.0, False), (-5.0, 0.5, False)])
-def test_only_a_frame_at_rest_in_which_nothing_tells_of_parallax_has_none(
-    lean: float, moved: float, motionless: bool
-) -> None:
+@pytest.mark.parametrize(("moved", "motionless"), [(0.5, True), (6.0, False)])
+def test_only_a_frame_in_which_nothing_tells_of_parallax_has_none(moved: float, motionless: bool) -> None:
     """By most of its patches: a few that move, or seem to, are not asked."""
     patches = np.full(40, moved)
     patches[:15] += np.where(np.arange(15) % 2, 500.0, -500.0)
-    assert is_motionless(lean, patches) is motionless
+    assert is_motionless(patches) is motionless
 
 
 def test_a_thing_that_moves_before_a_scene_that_does_not_keeps_its_parallax() -> None:
-    """Two thirds of the frame have none; 44.7 dB where none of its patches may have any."""
+    """Two thirds of the frame have none; 46.6 dB where patches lean to what most of a frame has."""
     scene = RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(0.0, 0.0, 4.5), apart=True, seed=1)
     plane, true = scene.expose()
     field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
-    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 45.7
+    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 48.2
+
+
+def test_a_thing_before_a_background_near_the_focus_keeps_its_parallax() -> None:
+    """Most of the frame moves by a tenth of a sample from view to view, and was taken as at rest with all of it."""
+    found = _reached(RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(3.2, 3.2, 12.0), apart=True, seed=1))
+    assert found.joint > 44.8, found
 
 
 @pytest.mark.slow

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats
 from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, FrameModel, TexturePower, rests_of
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
-from dappled.decode.joint.told_disparity import TOLD_KINDS, shares_of, views_told
+from dappled.decode.joint.told_disparity import TOLD_KINDS, at_rest, shares_of, views_told
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from tests.decode.joint.ray_sums import MASK
 
@@ -46,6 +47,26 @@ def test_what_is_unknown_or_beyond_the_levels_tells_nothing() -> None:
     single = np.ones((48, 48))
     single[20, 20] = np.nan
     np.testing.assert_array_equal(_shares(single), [_only(1)] * 25)
+
+
+def _at_rest(disparity: Floats) -> NDArray[np.bool_]:
+    patches = Patches((disparity.shape[0], disparity.shape[1]), SIDE)
+    return at_rest(disparity, 1.0, patches).reshape(patches.grid)
+
+
+def test_a_patch_is_at_rest_where_none_of_it_moves_and_in_a_frame_at_rest_where_little_of_it_moves_far() -> None:
+    half = np.where(np.arange(96) < 48, 0.8, 1.2)[None, :] * np.ones((96, 1))
+    np.testing.assert_array_equal(_at_rest(half), np.broadcast_to(np.arange(9) < 4, (9, 9)))
+    np.testing.assert_array_equal(_at_rest(-half), _at_rest(half))
+    small = np.zeros((96, 96))
+    small[30:54, 30:54] = 2.5  # 6 % of the frame, as folded edges of terrain have it
+    assert _at_rest(small).all()
+    small[30:54, 30:54] = 3.5  # a thing nearer than the rest
+    assert not _at_rest(small)[3, 3]  # samples 24 to 47
+    assert _at_rest(small)[:, 6:].all()
+    small[:, 40:] = np.nan
+    assert _at_rest(small)[:2].all()
+    assert not _at_rest(np.full((96, 96), np.nan)).any()
 
 
 def test_samples_that_are_unknown_here_and_there_move_no_level() -> None:

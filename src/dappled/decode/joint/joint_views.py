@@ -8,7 +8,8 @@ share a spectrum. Likelihood decides in each patch how much detail there is beyo
 the usual range or farther, and whether views have more alone than in common: a thing out of all ranges, or an edge.
 
 Patches are looked at twice: at first any disparity may be there (`any_disparity`); a depth map of these first views
-tells the disparities of each patch, and its views are made again (`told_disparity`).
+tells which patches have hardly any parallax, and the disparities of the others, and views are made again
+(`told_disparity`).
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ from dappled.decode.joint.patch_model import (
     MOVES_NATS,
     RANGES,
     SIDE,
+    STILL,
     USUAL,
     FrameModel,
     LikelyKinds,
     TexturePower,
     is_motionless,
-    lean_of,
     rests_of,
 )
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
-from dappled.decode.joint.told_disparity import TOLD_KINDS, shares_of, views_told
+from dappled.decode.joint.told_disparity import MOST_STILL, TOLD_KINDS, at_rest, shares_of, views_told
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each
@@ -104,8 +105,6 @@ def joint_views(
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)
     group = _groups(cut[0].real, patches)
     rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
-    count = model.aperture.views
-    windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
     shares = np.zeros(len(means)) if astray is None else astray
     # Patches that light goes astray in are apart, but have the spectrum of their group.
     parts = [
@@ -113,9 +112,6 @@ def joint_views(
         for alike in (group == number for number in np.unique(group))
         for share in np.unique(shares[alike])
     ]
-    variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
-    beyond = np.zeros(len(means), dtype=bool)
-
     looked: dict[int, _Looked] = {}
 
     def look(part: int) -> None:
@@ -123,44 +119,91 @@ def joint_views(
         mean = float(np.sqrt(np.mean(means[alike] ** 2)))
         ringing = rings * mean if group[members][0] == _TEXTURES else np.zeros(len(rings))
         here = replace(frame, noise=frame.noise + ringing**2, astray=float(shares[members][0]))
-        looked[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, members[alike])
-
-    def solve(part: int) -> None:
-        members = parts[part][1]
-        found = _solve(looked[part], lean, motionless, patches.spectra(cut[:, members]))
-        windowed[members] = patches.images(found.spectra)
-        variance[:, members], of_apart[members], beyond[members] = found.variance, found.of_apart, found.beyond
+        looked[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, np.flatnonzero(members), members[alike])
 
     each(look, range(len(parts)), workers)
-    lean = lean_of(np.concatenate([one.likely.gain for one in looked.values()]))
-    motionless = is_motionless(lean, np.concatenate([one.likely.moved for one in looked.values()]))
-    each(solve, range(len(parts)), workers)
-    lit = (means[:, None, None] * patches.window).astype(np.float32)[:, None]
-    windowed += lit
-    views = patches.joined(windowed)
-    apart = patches.apart(windowed, views)
-    if not motionless and count >= _FEWEST_VIEWS:
-        depths = _depths(views, model.aperture, samples_px, workers)
+    made = _PatchViews.empty(patches, cut, means, model.aperture.views)
+    each(made.solve, looked.values(), workers)
+    if model.aperture.views >= _FEWEST_VIEWS:
+        depths = _depths(made.views(), model.aperture, samples_px, workers)
+        still = at_rest(depths, STILL * reach, patches)
+        moved = np.concatenate([one.likely.moved for one in looked.values()])
+        motionless = bool(still.mean() > MOST_STILL) and is_motionless(moved)
+        each(lambda one: made.solve_at_rest(one, still, motionless), looked.values(), workers)
         told = shares_of(depths, frame.ranges[USUAL].disparities, patches)
+        told[still] = 0
+        apart = made.apart()
+        each(lambda one: made.tell(one, told), looked.values(), workers)
+    else:
+        apart = made.apart()
+    sigma = np.sqrt(made.variance + made.of_apart * apart).astype(np.float32)
+    shape = model.aperture.views, model.aperture.views
+    views = made.views().reshape(*shape, *slices.shape[1:])
+    return JointViews(views, sigma.reshape(*shape, *patches.grid), float(made.beyond.mean()))
 
-        def look_again(part: int) -> None:
-            one, members = looked[part], np.flatnonzero(parts[part][1])
-            again = np.isin(one.likely.chosen(lean), TOLD_KINDS) & told[members].any(axis=1)
-            if not again.any():
-                return
-            members = members[again]
-            found = views_told(one.frame, one.own, one.rests, patches.spectra(cut[:, members]), told[members])
-            change = patches.images(found.spectra) - (windowed[members] - lit[members])
-            windowed[members] += _TRUST * change
-            of_apart[members], *factors = np.array([_TOLD_TWICE[kind] for kind in found.kinds]).T
-            squares = np.mean(change**2, axis=(2, 3)).T
-            variance[:, members] = sum(map(np.multiply, factors, (found.alone, found.rest, squares)))
 
-        each(look_again, range(len(parts)), workers)
-        views = patches.joined(windowed)
-    variance += of_apart * apart
-    sigma = np.sqrt(variance).astype(np.float32).reshape(count, count, *patches.grid)
-    return JointViews(views.reshape(count, count, *slices.shape[1:]), sigma, float(beyond.mean()))
+@dataclass(frozen=True, slots=True, eq=False)
+class _PatchViews:
+    """The views of all patches while they are made: `windowed` (N, V·U, side, side) with `lit` (N, 1, side, side) of
+    their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, and which are `beyond` (N,). Each call writes
+    the patches of its part."""
+
+    patches: Patches
+    cut: Complexes
+    lit: Singles
+    windowed: Singles
+    variance: Floats
+    of_apart: Floats
+    beyond: NDArray[np.bool_]
+
+    @classmethod
+    def empty(cls, patches: Patches, cut: Complexes, means: Floats, count: int) -> _PatchViews:
+        """Of patches cut from slices without their means, for `count` views an axis."""
+        lit = (means[:, None, None] * patches.window).astype(np.float32)[:, None]
+        windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
+        variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
+        return cls(patches, cut, lit, windowed, variance, of_apart, np.zeros(len(means), dtype=bool))
+
+    def solve(self, one: _Looked) -> None:
+        """With any disparity."""
+        self._solve(one, one.members, one.likely.with_parallax, np.ones(len(one.members), dtype=bool))
+
+    def solve_at_rest(self, one: _Looked, still: NDArray[np.bool_], motionless: bool) -> None:
+        """With hardly any parallax where patches are `still` (N,), and with none that a patch could tell where the
+        frame is `motionless`."""
+        here = still[one.members]
+        moved = (one.likely.moved >= MOVES_NATS) | (not motionless)
+        if here.any():
+            self._solve(one, one.members[here], one.likely.at_rest[here], moved[here])
+
+    def _solve(
+        self, one: _Looked, members: NDArray[np.intp], kinds: NDArray[np.intp], moved: NDArray[np.bool_]
+    ) -> None:
+        found = _solve(one, kinds, moved, self.patches.spectra(self.cut[:, members]))
+        self.windowed[members] = self.patches.images(found.spectra) + self.lit[members]
+        self.variance[:, members], self.of_apart[members] = found.variance, found.of_apart
+        self.beyond[members] = found.beyond
+
+    def tell(self, one: _Looked, told: Floats) -> None:
+        """With the shares `told` (N, D) of each patch: none where all are 0."""
+        members = one.members[np.isin(one.likely.with_parallax, TOLD_KINDS) & told[one.members].any(axis=1)]
+        if not len(members):
+            return
+        spectra = self.patches.spectra(self.cut[:, members])
+        found = views_told(one.frame, one.own, one.rests, spectra, told[members])
+        change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
+        self.windowed[members] += _TRUST * change
+        self.of_apart[members], *factors = np.array([_TOLD_TWICE[kind] for kind in found.kinds]).T
+        squares = np.mean(change**2, axis=(2, 3)).T
+        self.variance[:, members] = sum(map(np.multiply, factors, (found.alone, found.rest, squares)))
+
+    def views(self) -> Singles:
+        """(V·U, h, w)"""
+        return self.patches.joined(self.windowed)
+
+    def apart(self) -> Floats:
+        """(V·U, N), see `Patches.apart`."""
+        return self.patches.apart(self.windowed, self.views())
 
 
 def _depths(views: Singles, aperture: Aperture, samples_px: tuple[float, float], workers: int) -> Floats:
@@ -194,30 +237,31 @@ class _Solved:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """Patches of similar texture: their `frame`, the power `own` (F,) of their texture, the `rests` of each kind, and
-    which kinds they are likely to be."""
+    """Patches of similar texture, the `members` (M,) of all: their `frame`, the power `own` (F,) of their texture, the
+    `rests` of each kind, and which kinds they are likely to be."""
 
+    members: NDArray[np.intp]
     frame: FrameModel
     own: Floats
     rests: list[Complexes]
     likely: LikelyKinds
 
     @classmethod
-    def of(cls, frame: FrameModel, spectra: Complexes, mean: float, members: NDArray[np.bool_]) -> _Looked:
-        """From the spectra (F, A, M) and mean of the patches that look like them, and which of these they are (M,)."""
+    def of(
+        cls, frame: FrameModel, spectra: Complexes, mean: float, members: NDArray[np.intp], which: NDArray[np.bool_]
+    ) -> _Looked:
+        """From the spectra (F, A, L) and mean of patches that look alike, and `which` (L,) of them the members are."""
         power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
         spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
         own = spectrum.at(frame.radius(frame.frequencies))
         rests = rests_of(frame, spectrum, own, mean)
-        return cls(frame, own, rests, LikelyKinds.of(frame, own, rests, spectra[:, :, members]))
+        return cls(members, frame, own, rests, LikelyKinds.of(frame, own, rests, spectra[:, :, which]))
 
 
-def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -> _Solved:
-    """The views of patches from their spectra (F, A, N), each of its most probable kind, in a frame that leans to no
-    parallax by some nats, or has none at all."""
+def _solve(looked: _Looked, chosen: NDArray[np.intp], moved: NDArray[np.bool_], spectra: Complexes) -> _Solved:
+    """The views of patches from their spectra (F, A, N), of the `chosen` kinds (N,); those at rest that have not
+    `moved` (N,) have no parallax that a patch could tell."""
     frame, own, rests = looked.frame, looked.own, looked.rests
-    chosen = looked.likely.chosen(lean)
-    unmoved = motionless & (looked.likely.moved < MOVES_NATS)
     made = np.empty((len(own), frame.alone.shape[1], spectra.shape[2]), dtype=np.complex64)
     variance, of_apart = np.empty(made.shape[1:]), np.empty(made.shape[2])
     for number in np.unique(chosen):
@@ -225,7 +269,7 @@ def _solve(looked: _Looked, lean: float, motionless: bool, spectra: Complexes) -
         background = PatchBackground.of(rests[number], frame.alone, kind.alone * own)
         left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
         for still in (False, True):
-            members = np.flatnonzero((chosen == number) & ((unmoved & (kind.range == 0)) == still))
+            members = np.flatnonzero((chosen == number) & (moved != still))
             if not len(members):
                 continue
             some = frame.motionless if still else frame.ranges[kind.range]

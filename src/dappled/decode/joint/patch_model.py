@@ -42,7 +42,6 @@ _BEYOND = (0.1, 1.0, 4.0, 16.0, 64.0)
 _FAR_NATS = 12.0  # few things are beyond a range
 # Of detail that folds in where nothing moves: usual amounts, and those of few frequencies.
 _USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
-_LEAN, _MOST_LEAN_NATS = 4.0, 800.0  # of a patch, times the median patch
 # Of the median patch: terrain from the air has less than 1, boards with parallax of 0.3 px and more 6 to 27.
 _MOVED_NATS = 2.0
 # Of one patch: straight edges at rest have up to 13, things that move by 0.9 px from view to view 24 and more.
@@ -219,12 +218,12 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes) -> Singles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LikelyKinds:
-    """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, by how many nats `gain` the latter is
-    more probable, and by how many `moved` hardly any parallax is more probable than none."""
+    """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats hardly any parallax
+    is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods don't tell: of small
+    parallax folded detail in free amounts explains more."""
 
     with_parallax: NDArray[np.intp]
     at_rest: NDArray[np.intp]
-    gain: Floats
     moved: Floats
 
     @classmethod
@@ -232,34 +231,17 @@ class LikelyKinds:
         """Of patches (F, A, N) with these `rests_of` their group."""
         found = likelihoods(wholes_of(frame, own, rests), spectra)
         nats = np.einsum("f,bfn->bn", frame.weights, found) - np.array([[kind.nats] for kind in KINDS])
-        still = [number for number, kind in enumerate(KINDS) if kind.range == 0]
-        others = [number for number, kind in enumerate(KINDS) if kind.range != 0]
-        best = np.array(others)[nats[others].argmax(axis=0)]
+        still = np.array([number for number, kind in enumerate(KINDS) if kind.range == 0])
+        others = np.array([number for number, kind in enumerate(KINDS) if kind.range != 0])
         hardly, not_at_all = (
             at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[0], frame.motionless)
         )
-        at_rest = np.maximum(frame.weights @ _mean_of_odds(found[still]), hardly)
-        usual = [n for n, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
-        here = np.isin(best, usual)
-        gain = nats[still].max(axis=0) - nats[others].max(axis=0)
-        gain[here] = at_rest[here] - frame.weights @ _mean_of_odds(found[usual][:, :, here])
-        return cls(best, np.array(still)[nats[still].argmax(axis=0)], gain, hardly - not_at_all)
-
-    def chosen(self, lean: float) -> NDArray[np.intp]:
-        """(N,) the most probable of `KINDS`, where the frame as a whole leans to no parallax by some nats."""
-        made: NDArray[np.intp] = np.where(self.gain + lean > 0, self.at_rest, self.with_parallax)
-        return made
+        return cls(others[nats[others].argmax(axis=0)], still[nats[still].argmax(axis=0)], hardly - not_at_all)
 
 
-def lean_of(gains: Floats) -> float:
-    """By how many nats a frame leans to no parallax, by the gains of all its patches: what holds for most of a frame
-    is more probable in each of its patches."""
-    return float(np.clip(_LEAN * np.median(gains), -_MOST_LEAN_NATS, _MOST_LEAN_NATS))
-
-
-def is_motionless(lean: float, moved: Floats) -> bool:
+def is_motionless(moved: Floats) -> bool:
     """Whether a frame without parallax has none that any patch could tell: by `LikelyKinds.moved` of all patches."""
-    return lean > 0 and float(np.median(moved)) < _MOVED_NATS
+    return float(np.median(moved)) < _MOVED_NATS
 
 
 def at_rest_nats(
