@@ -61,6 +61,19 @@ def boards(
     return tuple(made)
 
 
+def before_background(seed: int, background_px: float, near_px: float) -> tuple[SharpBoard, ...]:
+    """A board before a backdrop, at these disparities from view to view; its place and shade are the seed's."""
+    chance = np.random.default_rng([seed, 21])
+    far, near = (px * PITCH_MM * 5 / STOP_MM for px in (background_px, near_px))
+    top, left = chance.uniform(-0.3, 0.0, 2)
+    high, wide = chance.uniform(0.25, 0.45, 2)
+    shade = float(chance.uniform(0.3, 0.55))
+    board = SharpBoard(
+        near, (top, top + high, left, left + wide), (shade,) * 3, exponent=1.3, finest=None, contrast=0.2
+    )
+    return SharpBoard(far, exponent=1.3, finest=None, contrast=0.2), board
+
+
 def photographs(
     made: tuple[SharpBoard, ...], chance: np.random.Generator, *, darkest: float, grey: bool
 ) -> tuple[SharpBoard, ...]:
@@ -89,11 +102,14 @@ class Family:
     options: Mapping[str, object] | None = None
     largest_px: float = LARGEST_PX
     photographs: bool = False
+    before_background: tuple[float, float] | None = None
     f_number: float = F_NUMBER
 
     def camera(self, seed: int, shape: tuple[int, int]) -> RayCamera:
         """The camera before the scene of a seed."""
         scene = boards(seed, exponent=self.exponent, finest=self.finest, largest_px=self.largest_px)
+        if self.before_background:
+            scene = before_background(seed, *self.before_background)
         if self.photographs:
             scene = photographs(scene, np.random.default_rng([seed, 20]), darkest=0.05, grey=True)
         plain = RayCamera(
@@ -120,6 +136,9 @@ FAMILIES: Mapping[str, Family] = {
         "round stop, photographs, SNR 65", options={"stop": "round", "level": 0.15}, photographs=True
     ),
     "terrain": Family("round stop, terrain from the air, SNR 100", 1.3, None, {"stop": "round"}, largest_px=0.1),
+    "before-background": Family(
+        "square stop, a board before a background near the focus, f^-1.3, SNR 100", before_background=(0.65, 2.3)
+    ),
     "half": Family("square stop, half the ideal aperture, SNR 100", f_number=2 * F_NUMBER),
     "vignetting": Family("square stop, 40 % lost at the corners, SNR 100", options={"falloff": 0.4}),
     "clipped": Family("square stop, 5 % clipped", options={"level": 0.73, "full_well_e": SNR_100 * 0.35 / 0.73}),
