@@ -178,6 +178,7 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         noise=taken.noise(),
         reach=taken.reach,
         astray=taken.astray(),
+        chroma=taken.colours,
         workers=workers,
     )
     doubt = None

@@ -219,12 +219,13 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes) -> Singles:
 @dataclass(frozen=True, slots=True, eq=False)
 class LikelyKinds:
     """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats hardly any parallax
-    is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods don't tell: of small
-    parallax folded detail in free amounts explains more."""
+    is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods tell badly: small
+    parallax, too, is explained better by folded detail in free amounts, by `folds` nats (N,)."""
 
     with_parallax: NDArray[np.intp]
     at_rest: NDArray[np.intp]
     moved: Floats
+    folds: Floats
 
     @classmethod
     def of(cls, frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> LikelyKinds:
@@ -236,7 +237,13 @@ class LikelyKinds:
         hardly, not_at_all = (
             at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[0], frame.motionless)
         )
-        return cls(others[nats[others].argmax(axis=0)], still[nats[still].argmax(axis=0)], hardly - not_at_all)
+        best = others[nats[others].argmax(axis=0)]
+        folds = nats[still].max(axis=0) - nats[others].max(axis=0)
+        usual = np.flatnonzero([(kind.range, kind.nats) == (USUAL, 0) for kind in KINDS])
+        here = np.isin(best, usual)
+        free = np.maximum(frame.weights @ _mean_of_odds(found[still]), hardly)
+        folds[here] = free[here] - frame.weights @ _mean_of_odds(found[usual][:, :, here])
+        return cls(best, still[nats[still].argmax(axis=0)], hardly - not_at_all, folds)
 
 
 def is_motionless(moved: Floats) -> bool:
