@@ -220,12 +220,14 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes) -> Singles:
 class LikelyKinds:
     """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats hardly any parallax
     is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods tell badly: small
-    parallax, too, is explained better by folded detail in free amounts, by `folds` nats (N,)."""
+    parallax, too, is explained better by folded detail in free amounts, by `folds` nats (N,). `nats` (N,) is the log
+    likelihood of the kind with parallax."""
 
     with_parallax: NDArray[np.intp]
     at_rest: NDArray[np.intp]
     moved: Floats
     folds: Floats
+    nats: Floats
 
     @classmethod
     def of(cls, frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> LikelyKinds:
@@ -243,7 +245,7 @@ class LikelyKinds:
         here = np.isin(best, usual)
         free = np.maximum(frame.weights @ _mean_of_odds(found[still]), hardly)
         folds[here] = free[here] - frame.weights @ _mean_of_odds(found[usual][:, :, here])
-        return cls(best, still[nats[still].argmax(axis=0)], hardly - not_at_all, folds)
+        return cls(best, still[nats[still].argmax(axis=0)], hardly - not_at_all, folds, nats[others].max(axis=0))
 
 
 def is_motionless(moved: Floats) -> bool:

@@ -82,12 +82,13 @@ def _smoothed(values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
 @dataclass(frozen=True, slots=True, eq=False)
 class ToldViews:
     """`spectra` (F, V·U, N) of the views of N patches, the variance (V·U, N) a pixel of what views have `alone` and of
-    the `rest`, and the `kinds` (N,) of the patches."""
+    the `rest`, the `kinds` (N,) of the patches, and their log likelihoods `nats` (N,)."""
 
     spectra: Complexes
     alone: Floats
     rest: Floats
     kinds: NDArray[np.intp]
+    nats: Floats
 
 
 def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes, shares: Floats) -> ToldViews:
@@ -107,6 +108,7 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
     kinds = np.array(TOLD_KINDS)[nats.argmax(axis=0)]
     made = np.empty((len(own), viewed.shape[2], len(kinds)), dtype=np.complex64)
     alone, rest = np.empty(made.shape[1:]), np.empty(made.shape[1:])
+    likely = np.empty(len(kinds))
     for number in np.unique(kinds):
         chosen = np.flatnonzero(kinds == number)
         background = PatchBackground.of(rests[number], frame.alone, KINDS[number].alone * own)
@@ -115,6 +117,7 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
         coefficients = np.zeros((len(own), seen.shape[1], len(chosen)), dtype=np.complex64)
         for members, mix in _mixes(there, shares[chosen]):
             gains = mix.gains(frame.weights)
+            likely[chosen[members]] = gains.max(axis=0) + frame.weights @ there.without[:, members]
             odds = np.exp(gains - gains.max(axis=0))
             odds /= odds.sum(axis=0)
             coefficients[:, mix.at, members[:, None]] = mix.coefficients(odds)
@@ -122,7 +125,7 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
         moved = beside.transpose(0, 2, 1) @ coefficients
         made[:, :, chosen] = background.unmixed @ spectra[:, :, chosen] + moved
         alone[:, chosen] = (frame.multiplicity @ background.left)[:, None] / SIDE**2
-    return ToldViews(made, alone, rest, kinds)
+    return ToldViews(made, alone, rest, kinds, likely)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
