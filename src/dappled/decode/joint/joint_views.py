@@ -161,8 +161,8 @@ def joint_views(
 class _PatchViews:
     """The views of all patches while they are made: `windowed` (N, V·U, side, side) with `lit` (N, 1, side, side) of
     their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, which are `beyond` (N,), and by how many nats
-    what was told is more probable than all disparities at once: `gained` (N,), NaN where nothing was told. Each call writes
-    the patches of its part."""
+    what was told is more probable than all disparities at once: `gained` (N,), NaN where nothing was told. Each call
+    writes the patches of its part."""
 
     patches: Patches
     cut: Complexes
