@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats
-from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, FrameModel, TexturePower, rests_of
+from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, TexturePower, rests_of
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
-from dappled.decode.joint.told_disparity import TOLD_KINDS, at_rest, shares_of, views_told
+from dappled.decode.joint.told_disparity import at_rest, shares_of, views_told
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from tests.decode.joint.ray_sums import MASK
 
@@ -104,7 +104,7 @@ def _complex_normal(chance: np.random.Generator, shape: tuple[int, ...]) -> Comp
     return np.asarray(made / np.sqrt(2), dtype=np.complex64)
 
 
-@pytest.mark.parametrize("kind", [TOLD_KINDS[1], TOLD_KINDS[3]])
+@pytest.mark.parametrize("kind", [USUAL_KINDS[1], USUAL_KINDS[3]])
 def test_errors_of_views_are_those_of_the_model_that_the_patches_were_drawn_from(kind: int) -> None:
     chance = np.random.default_rng(5)
     frame = _frame(1e-5)

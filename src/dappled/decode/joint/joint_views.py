@@ -31,6 +31,7 @@ from dappled.decode.joint.patch_model import (
     SIDE,
     STILL,
     USUAL,
+    USUAL_KINDS,
     FrameModel,
     LikelyKinds,
     TexturePower,
@@ -39,7 +40,7 @@ from dappled.decode.joint.patch_model import (
 )
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
-from dappled.decode.joint.told_disparity import MOST_STILL, TOLD_KINDS, at_rest, shares_of, views_told
+from dappled.decode.joint.told_disparity import MOST_STILL, at_rest, shares_of, views_told
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each
@@ -76,7 +77,7 @@ _TWICE = (
     (0.52, 0.0, 0.86, 0.12),
     (0.42, 0.02, 1.32, 0.07),
 )
-_TOLD_TWICE = dict(zip(TOLD_KINDS, _TWICE, strict=True))
+_TOLD_TWICE = dict(zip(USUAL_KINDS, _TWICE, strict=True))
 _TOLD_MOTIONLESS = (0.7, 0.86, 2.65)
 
 
@@ -212,14 +213,15 @@ class _PatchViews:
 
     def tell(self, one: _Looked, told: Floats) -> None:
         """With the shares `told` (N, D) of each patch: none where all are 0."""
-        members = one.members[np.isin(one.likely.with_parallax, TOLD_KINDS) & told[one.members].any(axis=1)]
-        if not len(members):
+        here = np.isin(one.likely.with_parallax, USUAL_KINDS) & told[one.members].any(axis=1)
+        if not here.any():
             return
+        members = one.members[here]
         spectra = self.patches.spectra(self.cut[:, members])
         found = views_told(one.frame, one.own, one.rests, spectra, told[members])
         change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
         self.windowed[members] += _TRUST * change
-        self.gained[members] = found.nats - one.likely.nats[np.searchsorted(one.members, members)]
+        self.gained[members] = found.nats - one.likely.nats[here]
         self.of_apart[members], *factors = np.array([_TOLD_TWICE[kind] for kind in found.kinds]).T
         squares = np.mean(change**2, axis=(2, 3)).T
         self.variance[:, members] = sum(map(np.multiply, factors, (found.alone, found.rest, squares)))

@@ -55,6 +55,7 @@ KINDS: Sequence[PatchKind] = (
     PatchKind(USUAL, 1.0, 1.0, _ALONE_NATS),
     *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (2, 3) for beyond in (0.1, 1.0, 4.0)),
 )
+USUAL_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
 LEAST_NOISE = 1e-12
 WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
 _HYPOTHESES = 17  # disparities over a range
@@ -241,10 +242,9 @@ class LikelyKinds:
         )
         best = others[nats[others].argmax(axis=0)]
         folds = nats[still].max(axis=0) - nats[others].max(axis=0)
-        usual = np.flatnonzero([(kind.range, kind.nats) == (USUAL, 0) for kind in KINDS])
-        here = np.isin(best, usual)
+        here = np.isin(best, USUAL_KINDS)
         free = np.maximum(frame.weights @ _mean_of_odds(found[still]), hardly)
-        folds[here] = free[here] - frame.weights @ _mean_of_odds(found[usual][:, :, here])
+        folds[here] = free[here] - frame.weights @ _mean_of_odds(found[USUAL_KINDS][:, :, here])
         return cls(best, still[nats[still].argmax(axis=0)], hardly - not_at_all, folds, nats[others].max(axis=0))
 
 

@@ -18,10 +18,9 @@ from scipy import ndimage
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackground
-from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, FrameModel
+from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel
 from dappled.decode.joint.patches import Patches
 
-TOLD_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
 _SMOOTH_PX = 5  # the window of a median: folded detail scatters the depth of single samples
 _LEAST_SHARE = 0.02  # of a patch: less is left out
 _MOST = 8  # disparities in a patch
@@ -97,15 +96,15 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
     usual = frame.ranges[USUAL]
     size = np.sqrt(own).astype(np.float32)[:, None, None]
     seen, viewed = (part.reshape(len(own), -1, part.shape[3]) * size for part in (usual.seen, usual.viewed))
-    nats = np.empty((len(TOLD_KINDS), len(shares)))
+    nats = np.empty((len(USUAL_KINDS), len(shares)))
     few = slice(None, None, _TRIED)
-    for number, one in zip(TOLD_KINDS, nats, strict=True):
+    for number, one in zip(USUAL_KINDS, nats, strict=True):
         background = PatchBackground.of(rests[number][few], frame.alone, KINDS[number].alone * own[few])
         there = _Whitened.of(seen[few], background, spectra[few])
         one[:] = frame.weights[few] @ there.without
         for members, mix in _mixes(there, shares):
             one[members] += mix.gains(frame.weights[few]).max(axis=0)
-    kinds = np.array(TOLD_KINDS)[nats.argmax(axis=0)]
+    kinds = np.array(USUAL_KINDS)[nats.argmax(axis=0)]
     made = np.empty((len(own), viewed.shape[2], len(kinds)), dtype=np.complex64)
     alone, rest = np.empty(made.shape[1:]), np.empty(made.shape[1:])
     likely = np.empty(len(kinds))
