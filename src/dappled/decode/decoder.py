@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -54,7 +54,7 @@ ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _UNKNOWN: Mapping[str, Any] = {
     **dict.fromkeys(("transfers", "aperture", "aperture_doubt", "f_number_shown", "f_number_shown_sigma")),
-    **dict.fromkeys(("views_doubt", "views_model")),
+    **dict.fromkeys(("views_doubt", "views_model", "views_shares")),
     "views_reason": "",
     "view_sigma": None,
     "views_unclipped": False,
@@ -440,6 +440,7 @@ class MaskDecoder:
             "views_doubt": made.doubt,
             "views_model": made.model,
             "views_reason": made.reason or ("" if fits else "its carriers agree with no aperture"),
+            "views_shares": asdict(made.shares) if made.shares else None,
             "view_sigma": made.sigma,
             "views_unclipped": told,
             "mask_place": place.to_dict() if place is not None else None,
@@ -470,7 +471,7 @@ class MaskDecoder:
         if not self.joint_views:
             return found, width, None
         turned = cycles_per_radian(lattice, self.sensor)
-        place = place_of(found.used(), turned, taken.samples_px)
+        place = place_of(found.used(), turned, taken.samples_px, workers=self.workers)
         if place is None or not place.moved:
             return found, width, place
         moved = replace(

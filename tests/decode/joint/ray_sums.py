@@ -44,6 +44,7 @@ class RaySum:
     seed: int = 0
     views: int = 5
     apart: bool = False
+    shining_through: bool = False
 
     @property
     def f_number(self) -> float:
@@ -76,6 +77,8 @@ class RaySum:
         covers = [(0.5 - 0.5 * wave) ** (len(self.boards) - 1) for wave in waves]
         if self.apart:
             covers = [np.exp(8 * wave) / sum(np.exp(8 * other) for other in waves) for wave in waves]
+        if self.shining_through:
+            covers = [np.full_like(waves[0], 1 / len(waves)) for _ in waves]
         made = []
         for disparity, cover in zip(self.boards, covers, strict=True):
             texture = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(high, wide))) * size, s=(high, wide))

@@ -74,7 +74,7 @@ def test_two_thirds_of_errors_are_within_the_standard_error(scene: RaySum) -> No
     assert found.field.view_sigma is not None
     there = np.array([[ndimage.map_coordinates(one, at, order=1) for one in line] for line in found.field.view_sigma])
     off = (np.abs(found.field.views - found.truth) / there)[..., 5:-5, 5:-5]
-    assert 0.5 < float(np.mean(off < 1)) < 0.8
+    assert 0.53 < float(np.mean(off < 1)) < 0.76
     assert 0.8 < float(np.mean(off < 2)) < 0.99
 
 
@@ -171,6 +171,21 @@ def test_a_scene_without_parallax_has_its_mean_picture_for_every_view() -> None:
     field = camera.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=camera.f_number)
     assert field.attributes["views_model"] == "joint"
     assert psnr(field.views, np.broadcast_to(field.slices[0].real, field.views.shape)) > 55
+    assert field.attributes["views_shares"]["at_rest"] > 0.9
+
+
+def test_a_frame_whose_slices_contradict_the_depth_of_its_views_is_doubted() -> None:
+    """Two textures, far from each other, shine through each other all over: a depth map has one of them."""
+    scene = RaySum(finest=BAND, snr=100, boards=(-16.0, 20.0), shining_through=True)
+    plane, true = scene.expose()
+    field, report = scene.decoder(joint_views=True).decode_reported(
+        plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number
+    )
+    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 43
+    shares = field.attributes["views_shares"]
+    assert (shares["told"], shares["at_rest"]) == (0, 0)
+    assert report.views_doubt is not None
+    assert report.views_doubt.startswith(f"in {shares['contradict']:.0%} of the picture the slices contradict")
 
 
 @pytest.mark.parametrize(("moved", "motionless"), [(0.5, True), (6.0, False)])

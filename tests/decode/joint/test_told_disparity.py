@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats
+from dappled.decode.joint.any_disparity import PatchBackground
 from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, TexturePower, rests_of
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
@@ -127,7 +128,9 @@ def test_errors_of_views_are_those_of_the_model_that_the_patches_were_drawn_from
     found = views_told(frame, own, rests, slices.astype(np.complex64), shares)
     assert (found.kinds == kind).mean() > 0.9
     squares = np.einsum("fvn,f->vn", np.abs(found.spectra - views) ** 2, frame.multiplicity) / SIDE**2
-    np.testing.assert_allclose(squares.mean(axis=1), (found.alone + found.rest).mean(axis=1), rtol=0.15)
+    background = PatchBackground.of(rests[kind], frame.alone, KINDS[kind].alone * own)
+    alone = frame.multiplicity @ background.left / SIDE**2
+    np.testing.assert_allclose(squares.mean(axis=1), alone + found.rest.mean(axis=1), rtol=0.15)
     # Told other disparities the views are worse: this test can fail.
     other = np.zeros_like(shares)
     other[:, 26] = 1

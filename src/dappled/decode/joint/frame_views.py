@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
-from dappled.decode.joint.joint_views import joint_views
+from dappled.decode.joint.joint_views import PatchShares, joint_views
 from dappled.decode.joint.mask_place import MaskPlace, mask_place
 from dappled.decode.joint.patch_model import FARTHEST, SIDE
 from dappled.decode.joint.slice_model import SliceModel
@@ -23,6 +23,7 @@ _REACH = 1.0  # samples of a slice from view to view: a carrier's order further,
 _LEAST_TRANSFER = 1e-3
 _MOST_BEYOND = 0.1  # of a frame may be beyond the widest range
 _TOLD_BEYOND = 0.005  # of a frame is told
+_TOLD_CONTRADICTED = 0.1  # frames of opaque boards with fine detail have up to 0.065
 _MOST_VIEWS = 5  # along an axis: with more, the outer ones move by more than a patch can tell, and nobody measured it
 # Clipping bends the mask's waves, so that light gets into other orders: in clipped patches as much as in the mean of
 # the frame. Measured at half the ideal aperture, where weak orders decide: without it views lose up to 4.5 dB there.
@@ -35,7 +36,8 @@ _CLEANER = 0.35
 class FrameViews:
     """`views` float32 (V, U, h, w), by which model they were made, and their standard errors `sigma` float32
     (V, U, m, n), see `JointViews`, in the plane's unit; None where the model tells none. `doubt` says in a sentence
-    what may be wrong with them, `reason` why the joint model did not make them: "" where it did, or was not asked to.
+    what may be wrong with them, `reason` why the joint model did not make them: "" where it did, or was not asked to;
+    `shares` how it made which patches, None where it did not.
     """
 
     views: Views
@@ -43,6 +45,7 @@ class FrameViews:
     sigma: Singles | None
     doubt: str | None = None
     reason: str = ""
+    shares: PatchShares | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,7 +137,9 @@ class TakenSlices:
         return white + chroma_noise(self.values, self.transfers * self.aperture.transform(self.angular))
 
 
-def place_of(taken: TakenSlices, turned: Floats, steps_px: tuple[float, float]) -> MaskPlace | None:
+def place_of(
+    taken: TakenSlices, turned: Floats, steps_px: tuple[float, float], *, workers: int = 1
+) -> MaskPlace | None:
     """Where the slices place the mask (see `mask_place`); None where the joint model is not for them."""
     if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
         return None
@@ -146,6 +151,7 @@ def place_of(taken: TakenSlices, turned: Floats, steps_px: tuple[float, float]) 
         reach=taken.reach,
         turned=turned,
         steps_px=steps_px,
+        workers=workers,
     )
 
 
@@ -181,21 +187,27 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         chroma=taken.colours,
         workers=workers,
     )
+    shares = found.shares
     doubt = None
-    if found.beyond > _TOLD_BEYOND:
+    if shares.beyond > _TOLD_BEYOND:
         doubt = (
-            f"{found.beyond:.0%} of the picture is so near or far that neighbouring views differ there by more than "
+            f"{shares.beyond:.0%} of the picture is so near or far that neighbouring views differ there by more than "
             f"{FARTHEST * taken.samples_px[1]:.0f} px of the sensor, and {taken.aperture.views} views can't tell by "
             "how much: don't trust parallax there, focus on it, or stop down"
         )
-    if found.beyond > _MOST_BEYOND:  # inverting supposes no range
-        reason = f"{found.beyond:.0%} of the picture is nearer or farther than the model of the light field reaches"
+    if shares.beyond > _MOST_BEYOND:  # inverting supposes no range
+        reason = f"{shares.beyond:.0%} of the picture is nearer or farther than the model of the light field reaches"
         return replace(independent, doubt=doubt, reason=reason)
     total = float(np.mean(found.sigma**2))
     if np.mean(noise) < _CLEANER**2 * total:
         reason = "the frame has so little noise that the model of the light field would add errors"
         return replace(independent, doubt=doubt, reason=reason)
-    return FrameViews(found.views, "joint", found.sigma, doubt)
+    if doubt is None and shares.contradict > _TOLD_CONTRADICTED:
+        doubt = (
+            f"in {shares.contradict:.0%} of the picture the slices contradict the depth that the views show, as where "
+            "things shine through each other: don't trust depth there"
+        )
+    return FrameViews(found.views, "joint", found.sigma, doubt, shares=shares)
 
 
 def _unfit(orders: int, shape: tuple[int, int], views: int) -> str:

@@ -25,9 +25,10 @@ from dappled.decode.depth.estimate import estimate
 from dappled.decode.depth.evidence import of_views
 from dappled.decode.joint.any_disparity import PatchBackground, views_at_any
 from dappled.decode.joint.patch_model import (
+    BEYOND,
     KINDS,
     MOVES_NATS,
-    RANGES,
+    NONE,
     SIDE,
     STILL,
     USUAL,
@@ -67,17 +68,10 @@ _TOLD = (
     *((1.6, 0.04, 0.3), *((1.8, 0.01, 0.15),) * 2, *((0.25, 0.05, 1.2),) * 3, (0.45, 0.05, 0.4)),
     *((1.0, 0.9, 1.0),) * 6,
 )
-# The same for patches that a depth map tells their disparities, and last of the mean square of the change of windowed
-# patches from their first views. Of `RaySum`'s frames, with soft edges, 51 to 62 % of errors are within the root.
-_TWICE = (
-    (0.45, 0.03, 0.6, 2.1),
-    (0.4, 0.02, 0.64, 1.2),
-    (0.5, 0.01, 1.2, 0.2),
-    (0.44, 0.05, 1.04, 0.05),
-    (0.52, 0.0, 0.86, 0.12),
-    (0.42, 0.02, 1.32, 0.07),
-)
-_TOLD_TWICE = dict(zip(USUAL_KINDS, _TWICE, strict=True))
+# Of patches that a depth map tells their disparities, for each kind: 68 % of errors are within the root of so many
+# times the geometric mean of two variances, by how much the patch and its neighbours were apart after the first look,
+# and what the model leaves to the median patch. The first misses errors that neighbours share, the second the model's.
+_TOLD_TWICE = dict(zip(USUAL_KINDS, (1.8, 1.04, 2.76, 1.24, 1.49, 1.51), strict=True))
 _TOLD_MOTIONLESS = (0.7, 0.86, 2.65)
 
 
@@ -86,12 +80,24 @@ class JointViews:
     """`views` float32 (V, U, h, w), and their standard errors `sigma` float32 (V, U, m, n), one for each patch: in the
     view's samples patch (i, j) lies around (STEP·i − 0.5, STEP·j − 0.5).
 
-    `beyond` is the share of the frame whose disparity is beyond `FARTHEST` times the reach: views are smeared there.
+    `shares` of its patches say how views were made.
     """
 
     views: Singles
     sigma: Singles
+    shares: PatchShares
+
+
+@dataclass(frozen=True, slots=True)
+class PatchShares:
+    """Shares of a frame's patches: with disparities `told` by a depth map, `at_rest`, and of the rest those whose
+    disparity is `beyond` `FARTHEST` times the reach, where views are smeared, and those in which slices `contradict`
+    the depth map, as where things shine through each other."""
+
+    told: float
+    at_rest: float
     beyond: float
+    contradict: float
 
 
 def joint_views(
@@ -114,7 +120,7 @@ def joint_views(
     """
     patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
     cut, means = patches.less_means(patches.cut(slices), model.common()[: len(slices)])
-    frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)
+    frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach, workers=workers)
     group = _groups(cut[0].real, patches)
     rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
     shares = np.zeros(len(means)) if astray is None else astray
@@ -136,6 +142,8 @@ def joint_views(
     each(look, range(len(parts)), workers)
     made = _PatchViews.empty(patches, cut, means, model.aperture.views)
     each(made.solve, looked.values(), workers)
+    still = likely = np.zeros(len(means), dtype=bool)
+    told: list[_Told] = []
     if model.aperture.views >= _FEWEST_VIEWS:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
@@ -144,26 +152,31 @@ def joint_views(
         moved = np.concatenate([one.likely.moved for one in looked.values()])
         motionless = bool(still.mean() > MOST_STILL) and is_motionless(moved)
         each(lambda one: made.solve_at_rest(one, still, motionless), looked.values(), workers)
-        told = shares_of(depths, frame.ranges[USUAL].disparities, patches)
-        told[still] = 0
-        apart = made.apart()
-        twice = made.copy()
-        each(lambda one: twice.tell(one, told), looked.values(), workers)
-        made = twice.where_likely(made)
-    else:
-        apart = made.apart()
-    sigma = np.sqrt(made.variance + made.of_apart * apart).astype(np.float32)
+        shares = shares_of(depths, frame.ranges[USUAL].disparities, patches)
+        shares[still] = 0
+        each(lambda one: told.extend(made.told(one, shares)), looked.values(), workers)
+        likely = _likely(told, patches)
+    apart = made.apart()
+    variance = made.variance + made.of_apart * apart
+    made.take(told, likely, apart, variance)
+    sigma = np.sqrt(variance).astype(np.float32)
     shape = model.aperture.views, model.aperture.views
     views = made.views().reshape(*shape, *slices.shape[1:])
-    return JointViews(views, sigma.reshape(*shape, *patches.grid), float(made.beyond.mean()))
+    tried = sum(len(part.members) for part in told) / len(means)
+    how = PatchShares(
+        told=float(likely.mean()),
+        at_rest=float(still.mean()),
+        beyond=float(made.beyond.mean()),
+        contradict=tried - float(likely.mean()),
+    )
+    return JointViews(views, sigma.reshape(*shape, *patches.grid), how)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _PatchViews:
     """The views of all patches while they are made: `windowed` (N, V·U, side, side) with `lit` (N, 1, side, side) of
-    their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, which are `beyond` (N,), and by how many nats
-    what was told is more probable than all disparities at once: `gained` (N,), NaN where nothing was told. Each call
-    writes the patches of its part."""
+    their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, and which are `beyond` (N,). Each call writes
+    the patches of its part."""
 
     patches: Patches
     cut: Complexes
@@ -172,7 +185,6 @@ class _PatchViews:
     variance: Floats
     of_apart: Floats
     beyond: NDArray[np.bool_]
-    gained: Floats
 
     @classmethod
     def empty(cls, patches: Patches, cut: Complexes, means: Floats, count: int) -> _PatchViews:
@@ -180,16 +192,7 @@ class _PatchViews:
         lit = (means[:, None, None] * patches.window).astype(np.float32)[:, None]
         windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
         variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
-        return cls(
-            patches,
-            cut,
-            lit,
-            windowed,
-            variance,
-            of_apart,
-            np.zeros(len(means), dtype=bool),
-            np.full(len(means), np.nan),
-        )
+        return cls(patches, cut, lit, windowed, variance, of_apart, np.zeros(len(means), dtype=bool))
 
     def solve(self, one: _Looked) -> None:
         """With any disparity."""
@@ -211,38 +214,29 @@ class _PatchViews:
         self.variance[:, members], self.of_apart[members] = found.variance, found.of_apart
         self.beyond[members] = found.beyond
 
-    def tell(self, one: _Looked, told: Floats) -> None:
-        """With the shares `told` (N, D) of each patch: none where all are 0."""
-        here = np.isin(one.likely.with_parallax, USUAL_KINDS) & told[one.members].any(axis=1)
+    def told(self, one: _Looked, shares: Floats) -> list[_Told]:
+        """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
+        here = np.isin(one.likely.with_parallax, USUAL_KINDS) & shares[one.members].any(axis=1)
         if not here.any():
-            return
+            return []
         members = one.members[here]
-        spectra = self.patches.spectra(self.cut[:, members])
-        found = views_told(one.frame, one.own, one.rests, spectra, told[members])
+        found = views_told(one.frame, one.own, one.rests, self.patches.spectra(self.cut[:, members]), shares[members])
         change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
-        self.windowed[members] += _TRUST * change
-        self.gained[members] = found.nats - one.likely.nats[here]
-        self.of_apart[members], *factors = np.array([_TOLD_TWICE[kind] for kind in found.kinds]).T
-        squares = np.mean(change**2, axis=(2, 3)).T
-        self.variance[:, members] = sum(map(np.multiply, factors, (found.alone, found.rest, squares)))
+        windowed = np.asarray(self.windowed[members] + _TRUST * change, dtype=np.float32)
+        times = np.array([_TOLD_TWICE[kind] for kind in found.kinds])
+        return [_Told(members, windowed, times, found.rest, found.nats - one.likely.nats[here])]
 
-    def copy(self) -> _PatchViews:
-        """The same, to be changed."""
-        return replace(
-            self, windowed=self.windowed.copy(), variance=self.variance.copy(), of_apart=self.of_apart.copy()
-        )
-
-    def where_likely(self, before: _PatchViews) -> _PatchViews:
-        """These, and those `before` they were told where the patches around are far less probable as told."""
-        told = np.isfinite(self.gained)
-        nats, count = (
-            ndimage.uniform_filter(each.reshape(self.patches.grid).astype(np.float64), _AROUND, mode="constant")
-            for each in (np.where(told, self.gained, 0), told)
-        )
-        back = told & (nats < -_TRANSPARENT_NATS * count).ravel()
-        self.windowed[back], self.of_apart[back] = before.windowed[back], before.of_apart[back]
-        self.variance[:, back] = before.variance[:, back]
-        return self
+    def take(self, told: list[_Told], likely: NDArray[np.bool_], apart: Floats, variance: Floats) -> None:
+        """Take the views of `likely` (N,) patches as told, and write their `variance` (V·U, N), from how far patches
+        were `apart` (V·U, N) before."""
+        if not likely.any():
+            return
+        typical = np.median(np.concatenate([part.rest[:, likely[part.members]] for part in told], axis=1), axis=1)
+        for part in told:
+            kept = likely[part.members]
+            members = part.members[kept]
+            self.windowed[members] = part.windowed[kept]
+            variance[:, members] = part.times[kept] * np.sqrt(apart[:, members] * typical[:, None])
 
     def views(self) -> Singles:
         """(V·U, h, w)"""
@@ -261,6 +255,18 @@ def _depths(views: Singles, aperture: Aperture, samples_px: tuple[float, float],
     return estimate(of_views(stack), workers=workers).disparity.astype(np.float64) * (count * columns_px)
 
 
+def _likely(told: list[_Told], patches: Patches) -> NDArray[np.bool_]:
+    """(N,) which patches were told disparities, and are not far less probable so, with those around."""
+    gained, count = np.zeros((2, len(patches.corners)))
+    for part in told:
+        gained[part.members], count[part.members] = part.gained, 1
+    around, there = (
+        ndimage.uniform_filter(values.reshape(patches.grid), _AROUND, mode="constant").ravel()
+        for values in (gained, count)
+    )
+    return np.asarray((count > 0) & (around >= -_TRANSPARENT_NATS * there))
+
+
 def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
     """(N,) which patches (N, side, side) are alike, by how much fine detail they have: `_TEXTURES` for those at the
     edges, fewer for others."""
@@ -269,6 +275,19 @@ def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
     count = max(1, min(_TEXTURES, len(images) // _FEWEST))
     group = np.searchsorted(np.quantile(texture, np.arange(1, count) / count), texture)
     return np.asarray(np.where(patches.at_edges, _TEXTURES, group))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Told:
+    """Patches, the `members` (M,) of all, as a depth map tells them: `windowed` (M, V·U, side, side), how many `times`
+    (M,) the mean of variances counts, the variance of the `rest` (V·U, M), and by how many nats they are more probable
+    than with all disparities at once: `gained` (M,)."""
+
+    members: NDArray[np.intp]
+    windowed: Singles
+    times: Floats
+    rest: Floats
+    gained: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -319,9 +338,9 @@ def _solve(looked: _Looked, chosen: NDArray[np.intp], moved: NDArray[np.bool_], 
             members = np.flatnonzero((chosen == number) & (moved != still))
             if not len(members):
                 continue
-            some = frame.motionless if still else frame.ranges[kind.range]
+            some = frame.ranges[NONE if still else kind.range]
             of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
             made[:, :, members], found = views_at_any(frame, some, own, background, spectra[:, :, members])
             variance[:, members] = of_alone * left + of_rest * found
-    beyond = [number for number, kind in enumerate(KINDS) if kind.range == len(RANGES) - 1]
+    beyond = [number for number, kind in enumerate(KINDS) if kind.range == BEYOND]
     return _Solved(made, variance, of_apart, np.isin(chosen, beyond))

@@ -33,9 +33,11 @@ from dappled.decode.joint.patch_model import (
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.optics import Lattice, Order, Sensor
+from dappled.workers import each, spans
 
 _MOST_PATCHES = 400  # those with the most texture
 _FEWEST = 12  # patches, for an answer at all
+_AT_A_TIME = 50  # patches
 _FAINT = 0.3  # of the mean texture: fainter patches are not scaled up to it, noise and all
 _STEPS = 48  # of a period: how finely moves are tried, up to half a period
 _MOST_TURN, _TURNS = 0.007, 81  # radians to either side, and how many are tried
@@ -113,6 +115,7 @@ def mask_place(
     reach: float,
     turned: Floats,
     steps_px: tuple[float, float],
+    workers: int = 1,
 ) -> MaskPlace | None:
     """The mask's place by slices complex64 (K, h, w), the half plane of `model`, DC first; None for too small ones.
 
@@ -123,7 +126,9 @@ def mask_place(
     inner = np.flatnonzero(~patches.at_edges)
     if len(inner) < _FEWEST:
         return None
-    differences, terms, used = _terms(slices, model, patches, inner, samples_px=samples_px, noise=noise, reach=reach)
+    differences, terms, used = _terms(
+        slices, model, patches, inner, samples_px=samples_px, noise=noise, reach=reach, workers=workers
+    )
     corners = np.array(patches.corners)[used] - SIDE
     middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
     return _Likelihood(differences, terms, (middles * np.array(steps_px)) @ turned.T).place()
@@ -138,13 +143,15 @@ def _terms(
     samples_px: tuple[float, float],
     noise: Floats,
     reach: float,
+    workers: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.complex128], NDArray[np.intp]]:
     """The differences m (M, 2) of orders, the terms c (N, M) of each patch, and which patches these are."""
     cut, means = patches.less_means(patches.cut(slices)[:, inner], model.common()[: len(slices)])
     contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, patches.window**2)
     best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
     spectra = patches.spectra(cut[:, best])
-    frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach)
+    both = np.concatenate([noise, noise[1:]])
+    frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=(USUAL,), workers=workers)
     power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
     spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
     own = spectrum.at(frame.radius(frame.frequencies))
@@ -152,17 +159,22 @@ def _terms(
     spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
     rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), _USUAL)
     wholes = wholes_of(frame, own, rests, _USUAL)
-    whole = wholes[int(np.einsum("f,bfn->b", frame.weights, likelihoods(wholes, spectra)).argmax())]
+    whole = wholes[int(np.einsum("f,bfn->b", frame.weights, likelihoods(wholes, spectra, workers)).argmax())]
     inverse = np.linalg.inv(whole.astype(np.complex128)) * frame.weights[:, None, None]
     apart = model.orders[:, None] - model.orders[None, :]
     differences, place = np.unique(apart.reshape(-1, 2), axis=0, return_inverse=True)
     place = place.reshape(apart.shape[:2])
     terms = np.zeros((spectra.shape[2], len(differences)), dtype=np.complex128)
-    conjugate = spectra.conj()
-    for b in range(len(model.orders)):
-        column = inverse[:, :, b].astype(np.complex64)[:, :, None] * conjugate
-        products = np.einsum("fan,fn->na", column, spectra[:, b])
-        terms[:, place[:, b]] -= products  # for one b every a has a difference of its own
+
+    def add(some: slice) -> None:
+        here = spectra[:, :, some]
+        conjugate = here.conj()
+        for b in range(len(model.orders)):
+            column = inverse[:, :, b].astype(np.complex64)[:, :, None] * conjugate
+            products = np.einsum("fan,fn->na", column, here[:, b])
+            terms[some, place[:, b]] -= products  # for one b every a has a difference of its own
+
+    each(add, spans(len(terms), _AT_A_TIME), workers)
     return differences, terms, inner[best]
 
 

@@ -6,8 +6,9 @@ All are covariances of the slices at one spatial frequency, and the patches of a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +16,16 @@ from numpy.typing import NDArray
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import Fold, SliceModel, folded
+from dappled.workers import each
 
 SIDE = 24  # samples: a patch is wide against parallax, and small against things at one disparity
 STEP = SIDE // 2  # from one patch to the next
 FARTHEST = 2.0  # times the reach: nothing that moves farther is told from other things
 STILL = 1 / 16  # of the reach: hardly any parallax
 MOTIONLESS = STILL / 4  # of the reach: what a patch by itself can't tell from none
-# Of |disparity|, in reaches: hardly any, the usual ones, far ones, and what is beyond all.
-RANGES = ((0.0, STILL), (0.0, 1.0), (1.0, FARTHEST), (FARTHEST, 4.0))
-USUAL = 1  # of the ranges
+# Of |disparity|, in reaches: hardly any, the usual ones, far ones, what is beyond all, and none that can be told.
+RANGES = ((0.0, STILL), (0.0, 1.0), (1.0, FARTHEST), (FARTHEST, 4.0), (0.0, MOTIONLESS))
+AT_REST, USUAL, FAR, BEYOND, NONE = range(len(RANGES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,17 +51,18 @@ MOVES_NATS = 16.0
 _ALONE_NATS = 500.0  # edges between depths look like it, too
 # A patch with all its detail in the band, or without parallax, can be trusted further.
 KINDS: Sequence[PatchKind] = (
-    *(PatchKind(0, beyond, 1e-4) for beyond in (0.0, 1.0, 4.0, 16.0, 64.0)),
+    *(PatchKind(AT_REST, beyond, 1e-4) for beyond in (0.0, 1.0, 4.0, 16.0, 64.0)),
     PatchKind(USUAL, 0.0, 0.03),
     *(PatchKind(USUAL, beyond, 0.01) for beyond in _BEYOND),
     PatchKind(USUAL, 1.0, 1.0, _ALONE_NATS),
-    *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (2, 3) for beyond in (0.1, 1.0, 4.0)),
+    *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (FAR, BEYOND) for beyond in (0.1, 1.0, 4.0)),
 )
 USUAL_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
 LEAST_NOISE = 1e-12
 WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
 _HYPOTHESES = 17  # disparities over a range
-_BEYOND_DISPARITIES, _STILL_DISPARITIES = 5, 3
+# In reaches: disparities of what folds in from beyond the band.
+_FOLDED = {AT_REST: np.linspace(-STILL, STILL, 3), USUAL: np.linspace(-0.6, 0.6, 5)}
 _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate
 _ERROR = 5e-4  # of a slice's power: what no light field explains
 _MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each slice
@@ -95,9 +98,10 @@ class DisparityRange:
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameModel:
     """What all groups of patches share. `frequencies` (F, 2) in cycles per sensor column; `per_bin` of a patch;
-    `weights` (F,) of a frequency in likelihoods; `ranges` of disparities, and one of `motionless` patches; `folds` from
-    beyond the band; `alone` (A, V·U), how the slices hold what each view has alone; `noise` (A,); `astray`, the share
-    of the scene's light that gets into each slice but the first, whatever its transfer."""
+    `weights` (F,) of a frequency in likelihoods; `ranges` of disparities, by their place in `RANGES`; `folds` from
+    beyond the band, at rest and in the usual range; `alone` (A, V·U), how the slices hold what each view has alone;
+    `noise` (A,); `astray`, the share of the scene's light that gets into each slice but the first, whatever its
+    transfer."""
 
     model: SliceModel
     frequencies: Floats
@@ -105,21 +109,41 @@ class FrameModel:
     weights: Singles
     multiplicity: Floats
     lowest: NDArray[np.bool_]
-    ranges: tuple[DisparityRange, ...]
-    motionless: DisparityRange
-    folds: tuple[list[Fold], list[Fold]]
+    ranges: Mapping[int, DisparityRange]
+    folds: Mapping[int, list[Fold]]
     alone: Complexes
     noise: Floats
     astray: float = 0.0
 
     @classmethod
     def of(
-        cls, patches: Patches, model: SliceModel, samples_px: tuple[float, float], noise: Floats, reach: float
+        cls,
+        patches: Patches,
+        model: SliceModel,
+        samples_px: tuple[float, float],
+        noise: Floats,
+        reach: float,
+        *,
+        ranges: Collection[int] = range(len(RANGES)),
+        workers: int = 1,
     ) -> FrameModel:
+        """For patches whose disparities are in these `ranges`."""
         bins = patches.bins
         frequencies = bins / np.array(samples_px)
         weights = _INDEPENDENT * patches.multiplicity / 2
         weights[0] = 0  # the patch's mean was taken out
+        found: dict[int, DisparityRange] = {}
+        folds: dict[int, list[Fold]] = {}
+
+        def reach_of(number: int) -> None:
+            near, far = RANGES[number]
+            found[number] = DisparityRange.of(model, frequencies, near * reach, far * reach)
+
+        def fold(number: int) -> None:
+            folds[number] = model.folds(frequencies, _FOLDED[number] * reach)
+
+        parts = [(reach_of, number) for number in ranges] + [(fold, number) for number in ranges if number in _FOLDED]
+        each(lambda part: part[0](part[1]), parts, workers)
         return cls(
             model=model,
             frequencies=frequencies,
@@ -127,12 +151,8 @@ class FrameModel:
             weights=weights.astype(np.float32),
             multiplicity=patches.multiplicity,
             lowest=np.abs(bins * patches.side).max(axis=1) < 1.5,
-            ranges=tuple(DisparityRange.of(model, frequencies, near * reach, far * reach) for near, far in RANGES),
-            motionless=DisparityRange.of(model, frequencies, 0.0, MOTIONLESS * reach),
-            folds=(
-                model.folds(frequencies, np.linspace(-STILL, STILL, _STILL_DISPARITIES) * reach),
-                model.folds(frequencies, np.linspace(-0.6, 0.6, _BEYOND_DISPARITIES) * reach),
-            ),
+            ranges=found,
+            folds=folds,
             alone=model.alone(),
             noise=noise,
         )
@@ -180,10 +200,13 @@ def rests_of(
     each = each + _MEAN_ERROR**2 * means[:, None] * np.abs(frame.model.transfers) ** 2
     each[:, 1:] += frame.astray**2 * (own + means)[:, None]
     plain[:, range(size), range(size)] = each
-    from_beyond = [folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size) for some in frame.folds]
+    from_beyond = {
+        number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size)
+        for number, some in frame.folds.items()
+    }
     lonely = (frame.alone @ frame.alone.conj().T).astype(np.complex64) * own.astype(np.float32)[:, None, None]
     return [
-        plain + np.float32(kind.beyond) * from_beyond[min(kind.range, 1)] + np.float32(kind.alone) * lonely
+        plain + np.float32(kind.beyond) * from_beyond[min(kind.range, USUAL)] + np.float32(kind.alone) * lonely
         for kind in kinds
     ]
 
@@ -206,14 +229,28 @@ def wholes_of(
     ]
 
 
-def likelihoods(wholes: list[Complexes], spectra: Complexes) -> Singles:
+def inverse_of_lower(lower: NDArray[Any]) -> NDArray[np.complex128]:
+    """L⁻¹ of lower triangles L (F, A, A), row by row for all F at once: four times as fast as LU of each."""
+    found = np.zeros(lower.shape, dtype=np.complex128)
+    for row in range(lower.shape[1]):
+        own = 1 / lower[:, row, row, None]
+        found[:, row, row] = own[:, 0]
+        found[:, row, :row] = -own * (lower[:, row, None, :row] @ found[:, :row, :row])[:, 0]
+    return found
+
+
+def likelihoods(wholes: list[Complexes], spectra: Complexes, workers: int = 1) -> Singles:
     """(B, F, N) log likelihoods of patches' frequencies whose slices have these covariances (F, A, A)."""
     found = np.empty((len(wholes), spectra.shape[0], spectra.shape[2]), dtype=np.float32)
-    for whole, one in zip(wholes, found, strict=True):
+
+    def one(number: int) -> None:
+        whole = wholes[number]
         lower = np.linalg.cholesky(whole.astype(np.complex128))
-        white = np.linalg.inv(lower).astype(np.complex64) @ spectra
+        white = inverse_of_lower(lower).astype(np.complex64) @ spectra
         volume = 2 * np.log(np.abs(np.diagonal(lower, axis1=1, axis2=2))).sum(axis=1)
-        one[...] = -(volume[:, None] + (white.real**2 + white.imag**2).sum(axis=1))
+        found[number] = -(volume[:, None] + (white.real**2 + white.imag**2).sum(axis=1))
+
+    each(one, range(len(wholes)), workers)
     return found
 
 
@@ -235,10 +272,10 @@ class LikelyKinds:
         """Of patches (F, A, N) with these `rests_of` their group."""
         found = likelihoods(wholes_of(frame, own, rests), spectra)
         nats = np.einsum("f,bfn->bn", frame.weights, found) - np.array([[kind.nats] for kind in KINDS])
-        still = np.array([number for number, kind in enumerate(KINDS) if kind.range == 0])
-        others = np.array([number for number, kind in enumerate(KINDS) if kind.range != 0])
+        still = np.array([number for number, kind in enumerate(KINDS) if kind.range == AT_REST])
+        others = np.array([number for number, kind in enumerate(KINDS) if kind.range != AT_REST])
         hardly, not_at_all = (
-            at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[0], frame.motionless)
+            at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[AT_REST], frame.ranges[NONE])
         )
         best = others[nats[others].argmax(axis=0)]
         folds = nats[still].max(axis=0) - nats[others].max(axis=0)

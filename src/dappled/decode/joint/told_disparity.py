@@ -80,11 +80,10 @@ def _smoothed(values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ToldViews:
-    """`spectra` (F, V·U, N) of the views of N patches, the variance (V·U, N) a pixel of what views have `alone` and of
-    the `rest`, the `kinds` (N,) of the patches, and their log likelihoods `nats` (N,)."""
+    """`spectra` (F, V·U, N) of the views of N patches, their variance (V·U, N) a pixel but for what each has alone,
+    `rest`, the `kinds` (N,) of the patches, and their log likelihoods `nats` (N,)."""
 
     spectra: Complexes
-    alone: Floats
     rest: Floats
     kinds: NDArray[np.intp]
     nats: Floats
@@ -106,8 +105,7 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
             one[members] += mix.gains(frame.weights[few]).max(axis=0)
     kinds = np.array(USUAL_KINDS)[nats.argmax(axis=0)]
     made = np.empty((len(own), viewed.shape[2], len(kinds)), dtype=np.complex64)
-    alone, rest = np.empty(made.shape[1:]), np.empty(made.shape[1:])
-    likely = np.empty(len(kinds))
+    rest, likely = np.empty(made.shape[1:]), np.empty(len(kinds))
     for number in np.unique(kinds):
         chosen = np.flatnonzero(kinds == number)
         background = PatchBackground.of(rests[number], frame.alone, KINDS[number].alone * own)
@@ -123,8 +121,7 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
             rest[:, chosen[members]] = mix.variance(odds, beside, frame.multiplicity) / SIDE**2
         moved = beside.transpose(0, 2, 1) @ coefficients
         made[:, :, chosen] = background.unmixed @ spectra[:, :, chosen] + moved
-        alone[:, chosen] = (frame.multiplicity @ background.left)[:, None] / SIDE**2
-    return ToldViews(made, alone, rest, kinds, likely)
+    return ToldViews(made, rest, kinds, likely)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
