@@ -33,8 +33,8 @@ from views import (
 )
 from views import Frame as GreyFrame
 
+from dappled.decode.colour_views import dc_views, in_colour
 from dappled.decode.decoder import MaskDecoder
-from dappled.decode.lightfield.colour_views import dc_views, in_colour
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import lineariser
 from dappled.mocks.scene.ray_camera import REAL_COLOURS, RayCamera

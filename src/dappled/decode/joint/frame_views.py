@@ -184,7 +184,6 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         noise=taken.noise(),
         reach=taken.reach,
         astray=taken.astray(),
-        chroma=taken.colours,
         workers=workers,
     )
     shares = found.shares

@@ -47,9 +47,6 @@ from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each
 
 _TEXTURES = 3  # groups of patches of similar texture, each with its own spectrum
-# Of a patch of a mosaic: colours that differ within a cell look like parallax that no disparity has. Red of a frame of
-# saturated boards has 41.3 dB with it, 39.1 without (benchmarks/colour_views.py, seed 1).
-_CHROMA_NATS = 200.0
 # Where things shine through each other a sample has two disparities, and a depth map one. All patches around are then
 # less probable as told than with all disparities at once, there by 3600 nats in the mean; at edges of opaque things
 # single ones are, there by up to 3400, and by 1500 in the mean. Two textures over each other have 34.9 dB as told, and
@@ -108,7 +105,6 @@ def joint_views(
     noise: Floats,
     reach: float,
     astray: Floats | None = None,
-    chroma: bool = False,
     workers: int = 1,
 ) -> JointViews:
     """The views of slices complex64 (K, h, w), the half plane of `model`, DC first.
@@ -116,7 +112,6 @@ def joint_views(
     `samples_px` are the rows and columns of a slice's sample in sensor columns, `noise` (K,) the variances of slice
     pixels, `reach` the largest usual disparity in sensor columns over the aperture, `astray` (patches,) the share of
     a patch's light that gets into each slice but the first, whatever its transfer, row by row of `sigma`; None: none.
-    `chroma`: the slices are those of a mosaic, and hold colours that differ within a cell.
     """
     patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
     cut, means = patches.less_means(patches.cut(slices), model.common()[: len(slices)])
@@ -147,8 +142,6 @@ def joint_views(
     if model.aperture.views >= _FEWEST_VIEWS:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
-        for one in looked.values() if chroma else ():
-            still[one.members] |= one.likely.folds > _CHROMA_NATS
         moved = np.concatenate([one.likely.moved for one in looked.values()])
         motionless = bool(still.mean() > MOST_STILL) and is_motionless(moved)
         each(lambda one: made.solve_at_rest(one, still, motionless), looked.values(), workers)

@@ -159,7 +159,7 @@ def _terms(
     spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
     rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), _USUAL)
     wholes = wholes_of(frame, own, rests, _USUAL)
-    whole = wholes[int(np.einsum("f,bfn->b", frame.weights, likelihoods(wholes, spectra, workers)).argmax())]
+    whole = wholes[int(likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1).argmax())]
     inverse = np.linalg.inv(whole.astype(np.complex128)) * frame.weights[:, None, None]
     apart = model.orders[:, None] - model.orders[None, :]
     differences, place = np.unique(apart.reshape(-1, 2), axis=0, return_inverse=True)

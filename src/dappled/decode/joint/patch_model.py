@@ -239,16 +239,17 @@ def inverse_of_lower(lower: NDArray[Any]) -> NDArray[np.complex128]:
     return found
 
 
-def likelihoods(wholes: list[Complexes], spectra: Complexes, workers: int = 1) -> Singles:
-    """(B, F, N) log likelihoods of patches' frequencies whose slices have these covariances (F, A, A)."""
-    found = np.empty((len(wholes), spectra.shape[0], spectra.shape[2]), dtype=np.float32)
+def likelihoods(wholes: list[Complexes], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
+    """(B, N) log likelihoods of patches (F, A, N) whose slices have these covariances (F, A, A), by frequencies'
+    `weights` (F,)."""
+    found = np.empty((len(wholes), spectra.shape[2]))
 
     def one(number: int) -> None:
-        whole = wholes[number]
-        lower = np.linalg.cholesky(whole.astype(np.complex128))
+        lower = np.linalg.cholesky(wholes[number].astype(np.complex128))
         white = inverse_of_lower(lower).astype(np.complex64) @ spectra
         volume = 2 * np.log(np.abs(np.diagonal(lower, axis1=1, axis2=2))).sum(axis=1)
-        found[number] = -(volume[:, None] + (white.real**2 + white.imag**2).sum(axis=1))
+        squares = (white.real**2 + white.imag**2).sum(axis=1)
+        found[number] = -(weights @ (volume[:, None] + squares))
 
     each(one, range(len(wholes)), workers)
     return found
@@ -258,31 +259,27 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes, workers: int = 1) -
 class LikelyKinds:
     """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats hardly any parallax
     is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods tell badly: small
-    parallax, too, is explained better by folded detail in free amounts, by `folds` nats (N,). `nats` (N,) is the log
-    likelihood of the kind with parallax."""
+    parallax, too, is explained better by folded detail in free amounts. `nats` (N,) is the log likelihood of the kind
+    with parallax."""
 
     with_parallax: NDArray[np.intp]
     at_rest: NDArray[np.intp]
     moved: Floats
-    folds: Floats
     nats: Floats
 
     @classmethod
     def of(cls, frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> LikelyKinds:
         """Of patches (F, A, N) with these `rests_of` their group."""
-        found = likelihoods(wholes_of(frame, own, rests), spectra)
-        nats = np.einsum("f,bfn->bn", frame.weights, found) - np.array([[kind.nats] for kind in KINDS])
+        nats = likelihoods(wholes_of(frame, own, rests), spectra, frame.weights)
+        nats -= np.array([[kind.nats] for kind in KINDS])
         still = np.array([number for number, kind in enumerate(KINDS) if kind.range == AT_REST])
         others = np.array([number for number, kind in enumerate(KINDS) if kind.range != AT_REST])
         hardly, not_at_all = (
             at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[AT_REST], frame.ranges[NONE])
         )
         best = others[nats[others].argmax(axis=0)]
-        folds = nats[still].max(axis=0) - nats[others].max(axis=0)
-        here = np.isin(best, USUAL_KINDS)
-        free = np.maximum(frame.weights @ _mean_of_odds(found[still]), hardly)
-        folds[here] = free[here] - frame.weights @ _mean_of_odds(found[USUAL_KINDS][:, :, here])
-        return cls(best, still[nats[still].argmax(axis=0)], hardly - not_at_all, folds, nats[others].max(axis=0))
+        at_rest = still[nats[still].argmax(axis=0)]
+        return cls(best, at_rest, hardly - not_at_all, nats[others].max(axis=0))
 
 
 def is_motionless(moved: Floats) -> bool:
@@ -317,10 +314,9 @@ def at_rest_nats(
     return np.asarray(found.max(axis=0))
 
 
-def _mean_of_odds(nats: Singles, first: float | None = None) -> Singles:
-    """(F, N) log likelihoods where each frequency may be of any of some kinds (B, F, N): mostly of the first, if
-    `first` says how often."""
+def _mean_of_odds(nats: Singles, first: float) -> Singles:
+    """(F, N) log likelihoods where each frequency may be of any of some kinds (B, F, N): mostly of the `first`."""
     rest = len(nats) - 1
-    odds = np.full(rest + 1, 1 / (rest + 1)) if first is None else np.array([first] + [(1 - first) / rest] * rest)
+    odds = np.array([first] + [(1 - first) / rest] * rest)
     top = nats.max(axis=0)
     return np.asarray(top + np.log(np.tensordot(odds.astype(np.float32), np.exp(nats - top), axes=1)))

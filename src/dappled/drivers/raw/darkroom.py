@@ -19,12 +19,12 @@ from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
 from dappled.decode.calibration.law_search import LawSearch
+from dappled.decode.colour_views import dc_views, in_colour
 from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
-from dappled.decode.lightfield.colour_views import dc_views, in_colour
 from dappled.decode.lightfield.falloff import Falloff, falloff
 from dappled.decode.optics import LAWS
 from dappled.decode.spectrum import LinearRows, Plane
@@ -451,9 +451,9 @@ class FrameLineariser:
             size = field.views.shape[2], field.views.shape[3]
             made = dc_views(even, index, colours, size, field.grid)
             sensor = camera_profile(self._recipe, raw.camera_model or "").sensor((even.shape[0], even.shape[1]))
-            high = field.grid[0, 0] * math.hypot(*sensor.row_mm)
-            wide = field.grid[1, 1] * math.hypot(*sensor.column_mm)
-            return in_colour(field.views, field.slices[0].real, made, row_over_column=high / wide)
+            aspect = field.grid[0, 0] * math.hypot(*sensor.row_mm) / (field.grid[1, 1] * math.hypot(*sensor.column_mm))
+            grey = field.slices[0].real
+            return in_colour(field.views, grey, made, row_over_column=aspect, workers=self._recipe.workers)
 
         return painted
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dappled.decode import DecodeError
 from dappled.decode.array_types import Singles
-from dappled.decode.lightfield.colour_views import dc_views, in_colour
+from dappled.decode.colour_views import dc_views, in_colour
 
 BAYER = np.array([[0, 1], [1, 2]])
 GRID = np.array([[6.0, 0.0, 0.0], [0.0, 6.0, 0.0]])
@@ -112,6 +112,26 @@ def test_an_edge_between_colours_of_the_same_grey_moves_as_the_texture_around_do
     y, x = np.mgrid[:60, :80].astype(np.float32)
     truth, grey = moving(y, x, down=0.3, across=0.3)
     assert error(grey, 1.0, truth, grey) < 0.3
+
+
+def test_an_edge_moves_as_the_nearer_thing_and_texture_as_what_it_is_on() -> None:
+    """A board and what is behind it, of the same mean grey and of other colours, move in opposite directions."""
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    made = []
+    for v in np.arange(5) - 2:
+        line = []
+        for u in np.arange(5) - 2:
+            layers = []
+            for tint, move, turn in ((0.5, 0.35, 0.0), (-0.5, -0.35, 2.0)):
+                at, to = y - move * v, x - move * u
+                grey = 0.3 + 0.03 * (np.sin(0.9 * at + 0.4 * to + turn) + np.sin(0.3 * at - 0.8 * to + turn))
+                layers.append(np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1))
+            away = np.maximum(np.abs(y - 0.35 * v - 30) - 16, np.abs(x - 0.35 * u - 40) - 20)
+            cover = 1 / (1 + np.exp(2 * away))
+            line.append(cover[..., None] * layers[0] + (1 - cover[..., None]) * layers[1])
+        made.append(line)
+    truth = np.asarray(made, dtype=np.float32)
+    assert error(truth.mean(axis=-1), 1.0, truth, truth.mean(axis=-1)) < 0.6
 
 
 def test_a_sample_that_is_higher_than_wide_moves_by_fewer_rows() -> None:

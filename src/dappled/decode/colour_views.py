@@ -1,12 +1,12 @@
 """Views in red, green and blue behind a printed mask: each colour's own DC view, with the parallax of the grey views.
 
 Red alone is sampled every other pixel, and most carriers would alias onto others; around zero frequency it is whole.
-What a view's grey differs from the DC view's has three parts. One is a move: grey changes by disparity times its slope,
-as in optical flow (Lucas and Kanade), and colours move as far, even where two of them have the same grey. Another is
-shade, the same for all around. The rest is what neither explains: sharper edges, and what is hidden. Where two things
-meet, their colours blend in the DC view as their greys do, so a colour is near a straight line over grey, a few samples
-around (He, Sun and Tang, "Guided image filtering"): along it a colour follows shade and rest. Where moves explain
-little, the rest is mostly the views' own error, and counts less.
+What a view's grey differs from the DC view's has three parts. One is a move by the disparity that a depth map of the
+views has, at edges that of the nearer of two things: colours move as far as grey, even where two of them have the same
+grey. Another part is shade, the same for all around. The rest is what neither explains: what is hidden, and where depth
+is wrong. Where two things meet, their colours blend in the DC view as their greys do, so a colour is near a straight
+line over grey, a few samples around (He, Sun and Tang, "Guided image filtering"): along it a colour follows shade and
+rest. Where moves explain little, the rest is mostly the views' own error, and counts less.
 """
 
 from __future__ import annotations
@@ -18,15 +18,20 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
 from dappled.decode.array_types import Floats, Singles
+from dappled.decode.depth.estimate import estimate
+from dappled.decode.depth.evidence import of_views
 from dappled.decode.errors import DecodeError
+from dappled.decode.lightfield import ViewStack
 
-_AROUND = 11  # samples of a view on each side, in which one disparity is fitted
-_STEADY = 0.02  # of the mean square slope of grey: where there is less of it, no disparity is told
+_AROUND = 11  # samples of a view on each side: what is the same around
+_SMOOTH, _NEARER, _SOFT = 5, 3, 0.6  # samples: the windows of a median, and of the nearest; the last one's blur
+_FEWEST_VIEWS = 3  # along an axis: depth compares them with the middle one
+_SLOPE = np.array([1, -8, 0, 8, -1]) / 12  # of a line of samples, exact for polynomials of fourth order
 _TRUST = 1.5  # times the share that moves explain, and at most 1: the square of how much of the rest counts
 _BOX = 5  # samples of a view on each side, in which a colour is taken as linear in grey
 _CELL_PX = 12  # local means: half a period of the mask
 _LOBES = 12  # of the interpolating sinc on each side
-_FLAT = 0.05  # of grey's mean: where grey varies less, noise and folded detail do, and colour is a share of grey
+_FLAT = 0.08  # of grey's mean: where grey varies less, noise and folded detail do, and colour is a share of grey
 _MOST = 10.0  # times grey
 _DARK = 1e-3  # of grey's mean
 
@@ -57,9 +62,11 @@ def dc_views(
     return made
 
 
-def in_colour(views: Singles, grey: Singles, colours: Singles, *, row_over_column: float = 1.0) -> Singles:
-    """float32 (V, U, h, w, C): each colour's DC view, moved by the disparity around, plus its slope over grey times
-    what the move leaves of a view's difference from the grey DC view.
+def in_colour(
+    views: Singles, grey: Singles, colours: Singles, *, row_over_column: float = 1.0, workers: int = 1
+) -> Singles:
+    """float32 (V, U, h, w, C): each colour's DC view, moved by the disparity there, plus its slope over grey times what
+    the move leaves of a view's difference from the grey DC view.
 
     `views` (V, U, h, w), evenly spaced over the aperture; `grey` (h, w) their DC view, `colours` (C, h, w) as from
     `dc_views`; `row_over_column` the height of a sample over its width. The slope is the colour's covariance with grey
@@ -67,9 +74,9 @@ def in_colour(views: Singles, grey: Singles, colours: Singles, *, row_over_colum
     colour's share of grey.
     """
     down, across = (np.arange(n) - (n - 1) / 2 for n in views.shape[:2])
-    places = (down / row_over_column).astype(np.float32), across.astype(np.float32)
+    places = down / row_over_column, across
     beyond = views - grey
-    disparity = _disparity(beyond, grey, places)
+    disparity = _disparity(views, places, workers)
     rest = beyond - _moved(grey, disparity, places)
     shade = _around(rest).astype(np.float32)
     rest = shade + (rest - shade) * _trusted(rest - shade, beyond - shade)
@@ -86,28 +93,29 @@ def in_colour(views: Singles, grey: Singles, colours: Singles, *, row_over_colum
     return made
 
 
-def _disparity(beyond: Singles, grey: Singles, places: tuple[Singles, Singles]) -> Singles:
-    """(h, w) samples from view to view: the least squares of `beyond` (V, U, h, w) less disparity · place · slope."""
-    (down, across), (dy, dx) = places, _slopes(grey)
-    along = dy * np.tensordot(down, beyond.sum(axis=1), 1) + dx * np.tensordot(across, beyond.sum(axis=0), 1)
-    squares = len(across) * (down @ down) * dy**2 + len(down) * (across @ across) * dx**2
-    least = max(_STEADY * float(squares.mean()), 1e-12)
-    return np.asarray(_around(along) / (_around(squares) + least), dtype=np.float32)
+def _disparity(views: Singles, places: tuple[Floats, Floats], workers: int) -> Singles:
+    """(h, w) columns from view to view of the nearest thing around each sample; 0 where depth is unknown."""
+    if max(views.shape[:2]) < _FEWEST_VIEWS:
+        return np.zeros(views.shape[2:], dtype=np.float32)
+    found = estimate(of_views(ViewStack(views, *places)), workers=workers).disparity
+    smooth = ndimage.median_filter(np.where(np.isfinite(found), found, 0), _SMOOTH)
+    return np.asarray(ndimage.gaussian_filter(ndimage.maximum_filter(smooth, _NEARER), _SOFT), dtype=np.float32)
 
 
-def _slopes(image: Singles) -> tuple[Singles, Singles]:
-    """(h, w) each: the image's change a row and a column; 0 along an axis of one sample."""
-    dy, dx = (np.gradient(image, axis=a) if image.shape[a] > 1 else np.zeros_like(image) for a in (0, 1))
-    return dy, dx
+def _moved(image: Singles, disparity: Singles, places: tuple[Floats, Floats]) -> Singles:
+    """(V, U, h, w): by how much each view of an image (h, w), the mean of all views, differs from it where all of it
+    moves: Taylor's series to second order."""
+    down, across = (place.astype(np.float32)[:, None, None] for place in places)
+    dy, dx = (_slope(image, axis) * -disparity for axis in (0, 1))
+    dyy, dyx, dxx = ((_slope(_slope(image, a), b) * disparity**2) for a, b in ((0, 0), (0, 1), (1, 1)))
+    rows = down * dy + (down**2 - np.mean(down**2)) * dyy / 2
+    columns = across * dx + (across**2 - np.mean(across**2)) * dxx / 2
+    return np.asarray(rows[:, None] + columns + down[:, None] * across * dyx, dtype=np.float32)
 
 
-def _moved(image: Singles, disparity: Singles, places: tuple[Singles, Singles]) -> Singles:
-    """(V, U, h, w): by how much each view of an image (h, w) differs from it where all of it moves."""
-    dy, dx = _slopes(image)
-    down, across = places
-    rows = down[:, None, None] * (disparity * dy)
-    columns = across[:, None, None] * (disparity * dx)
-    return np.asarray(rows[:, None] + columns, dtype=np.float32)
+def _slope(image: Singles, axis: int) -> Singles:
+    """(h, w) the image's change a sample; 0 along an axis of one sample."""
+    return np.asarray(ndimage.correlate1d(image, _SLOPE, axis=axis, mode="nearest"), dtype=np.float32)
 
 
 def _trusted(rest: Singles, beyond: Singles) -> Singles:
