@@ -118,36 +118,38 @@ def joint_views(
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach, workers=workers)
     group = _groups(cut[0].real, patches)
     rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
-    shares = np.zeros(len(means)) if astray is None else astray
+    stray = np.zeros(len(means)) if astray is None else astray
     # Patches that light goes astray in are apart, but have the spectrum of their group.
     parts = [
-        (alike, alike & (shares == share))
+        (alike, alike & (stray == share))
         for alike in (group == number for number in np.unique(group))
-        for share in np.unique(shares[alike])
+        for share in np.unique(stray[alike])
     ]
-    looked: dict[int, _Looked] = {}
+    parts.sort(key=lambda part: -np.count_nonzero(part[1]))  # a large one that is left to the end is waited for
+    found: dict[int, _Looked] = {}
 
     def look(part: int) -> None:
         alike, members = parts[part]
         mean = float(np.sqrt(np.mean(means[alike] ** 2)))
         ringing = rings * mean if group[members][0] == _TEXTURES else np.zeros(len(rings))
-        here = replace(frame, noise=frame.noise + ringing**2, astray=float(shares[members][0]))
-        looked[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, np.flatnonzero(members), members[alike])
+        here = replace(frame, noise=frame.noise + ringing**2, astray=float(stray[members][0]))
+        found[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, np.flatnonzero(members), members[alike])
 
     each(look, range(len(parts)), workers)
+    looked = [found[part] for part in range(len(parts))]
     made = _PatchViews.empty(patches, cut, means, model.aperture.views)
-    each(made.solve, looked.values(), workers)
+    each(made.solve, looked, workers)
     still = likely = np.zeros(len(means), dtype=bool)
     told: list[_Told] = []
     if model.aperture.views >= _FEWEST_VIEWS:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
-        moved = np.concatenate([one.likely.moved for one in looked.values()])
+        moved = np.concatenate([one.likely.moved for one in looked])
         motionless = bool(still.mean() > MOST_STILL) and is_motionless(moved)
-        each(lambda one: made.solve_at_rest(one, still, motionless), looked.values(), workers)
+        each(lambda one: made.solve_at_rest(one, still, motionless), looked, workers)
         shares = shares_of(depths, frame.ranges[USUAL].disparities, patches)
         shares[still] = 0
-        each(lambda one: told.extend(made.told(one, shares)), looked.values(), workers)
+        each(lambda one: told.extend(made.told(one, shares)), looked, workers)
         likely = _likely(told, patches)
     apart = made.apart()
     variance = made.variance + made.of_apart * apart
