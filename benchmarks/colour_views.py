@@ -1,7 +1,7 @@
 """How near views in colour come to the truth, each channel by itself: python benchmarks/colour_views.py [--json].
 
 Frames as in `views.py`, but behind a Bayer pattern of overlapping filters: boards of saturated colours, and boards with
-parts of a photograph on them. "shares" are views times the local colours of the frame, as they were made before; "mean"
+parts of a photograph on them. "shares" are views times the local colours of the frame; "mean"
 is the mean of the true views; "limit" is what colours would be if the grey views were the true ones. PSNR in dB of red,
 green and blue, 1.0 = sensor white, each channel at its best exposure (a frame without a white frame is grey in its
 mean, the truth is not).
@@ -72,7 +72,7 @@ def main() -> None:
         corner = [one[1, 0] for one in (truth, views["shares"], views["made"])]
         white = prints.white_of(corner[:1])
         prints.save(
-            arguments.picture, prints.mosaic([prints.toned(p, white) for p in corner], ["true", "before", "now"])
+            arguments.picture, prints.mosaic([prints.toned(p, white) for p in corner], ["true", "shares", "now"])
         )
     if arguments.json:
         show("colour_views", figures, as_json=True)

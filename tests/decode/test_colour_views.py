@@ -81,16 +81,20 @@ def test_grey_without_texture_gives_a_colour_its_share() -> None:
     np.testing.assert_allclose(made[0] - made[1], np.broadcast_to([0.02, 0.01, 0.005], made[0].shape), rtol=1e-3)
 
 
-def moving(y: Singles, x: Singles, views: int = 5, *, down: float, across: float) -> tuple[Singles, Singles]:
+def moving(
+    y: Singles, x: Singles, views: int = 5, *, down: float, across: float, flat: float = 0.0
+) -> tuple[Singles, Singles]:
     """True views (V, U, h, w, 3) that move by so many samples, of stripes of two colours with the same grey on a
-    texture, and their greys, the mean of the colours."""
+    texture, and their greys, the mean of the colours. Within `flat` samples of the middle there is no texture."""
     steps = np.arange(views) - (views - 1) / 2
     made = []
     for v in steps:
         line = []
         for u in steps:
             at, to = y - down * v, x - across * u
-            grey = 0.3 + 0.03 * (np.sin(0.9 * at + 0.4 * to) + np.sin(0.3 * at - 0.8 * to) + np.sin(0.5 * to))
+            away = np.hypot(at - y.shape[0] / 2, to - x.shape[1] / 2)
+            texture = np.sin(0.9 * at + 0.4 * to) + np.sin(0.3 * at - 0.8 * to) + np.sin(0.5 * to)
+            grey = 0.3 + 0.03 * texture / (1 + np.exp(flat - away) * (flat > 0))
             tint = 0.5 * np.tanh(2 * np.sin(0.35 * to + 0.2 * at))
             line.append(np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1))
         made.append(line)
@@ -150,6 +154,28 @@ def test_what_no_move_explains_counts_less() -> None:
     assert np.std((made - truth)[..., 1]) < 0.5 * np.std(off)
 
 
-def test_black_is_no_error() -> None:
+def test_a_move_of_more_than_a_sample_is_followed() -> None:
+    """The outer views move by 1.2 samples along each axis: a slope alone leaves twice as much."""
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    truth, grey = moving(y, x, down=0.6, across=0.6)
+    assert error(grey, 1.0, truth, grey) < 0.18
+
+
+def test_colours_beside_a_place_of_unknown_depth_move_as_what_is_known_there() -> None:
+    """A flat patch has no depth: behind the focus no depth would be the nearest one, and stand still."""
+    y, x = np.mgrid[:60, :80].astype(np.float32)
+    truth, grey = moving(y, x, down=-0.6, across=-0.6, flat=12)
+    noise = np.random.default_rng(3).normal(0, 0.003, grey.shape).astype(np.float32)
+    assert error(grey + noise, 1.0, truth, grey) < 0.25
+
+
+@pytest.mark.parametrize("views", [(5, 5), (2, 2), (1, 1)])
+def test_black_is_no_error(views: tuple[int, int]) -> None:
     black = np.zeros((12, 12), dtype=np.float32)
-    assert np.isfinite(in_colour(np.zeros((2, 2, 12, 12), dtype=np.float32), black, np.stack([black] * 3))).all()
+    assert np.isfinite(in_colour(np.zeros((*views, 12, 12), dtype=np.float32), black, np.stack([black] * 3))).all()
+
+
+def test_without_views_there_are_none_in_colour() -> None:
+    black = np.zeros((12, 12), dtype=np.float32)
+    made = in_colour(np.zeros((0, 0, 12, 12), dtype=np.float32), black, np.stack([black] * 3))
+    assert made.shape == (0, 0, 12, 12, 3)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 
 from dappled.decode.array_types import Floats, Singles
+from dappled.decode.depth.depth_map import nearest_known
 from dappled.decode.depth.estimate import estimate
 from dappled.decode.depth.evidence import of_views
 from dappled.decode.errors import DecodeError
@@ -25,7 +26,6 @@ from dappled.decode.lightfield import ViewStack
 
 _AROUND = 11  # samples of a view on each side: what is the same around
 _SMOOTH, _NEARER, _SOFT = 5, 3, 0.6  # samples: the windows of a median, and of the nearest; the last one's blur
-_FEWEST_VIEWS = 3  # along an axis: depth compares them with the middle one
 _SLOPE = np.array([1, -8, 0, 8, -1]) / 12  # of a line of samples, exact for polynomials of fourth order
 _TRUST = 1.5  # times the share that moves explain, and at most 1: the square of how much of the rest counts
 _BOX = 5  # samples of a view on each side, in which a colour is taken as linear in grey
@@ -73,6 +73,9 @@ def in_colour(
     over grey's variance in boxes, averaged over the boxes that hold a sample. Where grey hardly varies, it tends to the
     colour's share of grey.
     """
+    made = np.empty((*views.shape, len(colours)), dtype=np.float32)
+    if not made.size:
+        return made
     down, across = (np.arange(n) - (n - 1) / 2 for n in views.shape[:2])
     places = down / row_over_column, across
     beyond = views - grey
@@ -84,7 +87,6 @@ def in_colour(
     spread = np.maximum(_box(grey * grey) - mean**2, 0)
     level = max(float(np.abs(grey).mean()), 1e-12)
     least = (_FLAT * level) ** 2
-    made = np.empty((*views.shape, len(colours)), dtype=np.float32)
     for number, colour in enumerate(colours):
         own = _box(colour)
         ratio = np.clip(own / np.maximum(mean, _DARK * level), 0, _MOST)
@@ -94,11 +96,12 @@ def in_colour(
 
 
 def _disparity(views: Singles, places: tuple[Floats, Floats], workers: int) -> Singles:
-    """(h, w) columns from view to view of the nearest thing around each sample; 0 where depth is unknown."""
-    if max(views.shape[:2]) < _FEWEST_VIEWS:
+    """(h, w) columns from view to view of the nearest thing around each sample, by the nearest sample whose depth is
+    known; 0 where none is."""
+    if max(views.shape[:2]) < 2:
         return np.zeros(views.shape[2:], dtype=np.float32)
-    found = estimate(of_views(ViewStack(views, *places)), workers=workers).disparity
-    smooth = ndimage.median_filter(np.where(np.isfinite(found), found, 0), _SMOOTH)
+    found = estimate(of_views(ViewStack(views, *places)), workers=workers)
+    smooth = ndimage.median_filter(np.nan_to_num(nearest_known(found.disparity, found.known)), _SMOOTH)
     return np.asarray(ndimage.gaussian_filter(ndimage.maximum_filter(smooth, _NEARER), _SOFT), dtype=np.float32)
 
 

@@ -10,6 +10,7 @@ import itertools
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,7 @@ class RaySum:
     """A stop of `views` × `views` cells with `points`² points in each (round: those in the circle), of a diameter of
     `kappa` of the ideal. `boards` are disparities in pixels over the ideal aperture; textures fall as f^-`exponent` up
     to `finest` cycles/pixel, with an rms of `contrast`. `snr` is the raw signal's at the mean of 0.35, None without
-    noise."""
+    noise. Boards may have places of their own, blend into each other, or be everywhere and shine through each other."""
 
     boards: tuple[float, ...] = (-6.0, 12.0)
     exponent: float = 1.3
@@ -43,8 +44,7 @@ class RaySum:
     shape: tuple[int, int] = (300, 360)
     seed: int = 0
     views: int = 5
-    apart: bool = False
-    shining_through: bool = False
+    covers: Literal["blending", "apart", "everywhere"] = "blending"
 
     @property
     def f_number(self) -> float:
@@ -74,11 +74,11 @@ class RaySum:
         f = np.hypot(fy, fx)
         size = np.maximum(f, 1 / max(self.shape)) ** -self.exponent * (f <= self.finest) * (f > 0)
         waves = [np.cos(2 * np.pi * (np.arange(wide) / wide - n / len(self.boards))) for n in range(len(self.boards))]
-        covers = [(0.5 - 0.5 * wave) ** (len(self.boards) - 1) for wave in waves]
-        if self.apart:
-            covers = [np.exp(8 * wave) / sum(np.exp(8 * other) for other in waves) for wave in waves]
-        if self.shining_through:
-            covers = [np.full_like(waves[0], 1 / len(waves)) for _ in waves]
+        covers = {
+            "blending": [(0.5 - 0.5 * wave) ** (len(self.boards) - 1) for wave in waves],
+            "apart": [np.exp(8 * wave) / sum(np.exp(8 * other) for other in waves) for wave in waves],
+            "everywhere": [np.full_like(waves[0], 1 / len(waves)) for _ in waves],
+        }[self.covers]
         made = []
         for disparity, cover in zip(self.boards, covers, strict=True):
             texture = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(high, wide))) * size, s=(high, wide))

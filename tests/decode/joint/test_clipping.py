@@ -110,7 +110,7 @@ def test_the_share_of_each_patch_that_is_clipped() -> None:
 @pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.slow)])
 def half_open(request: pytest.FixtureRequest) -> HalfOpen:
     """Half the ideal aperture, one pixel in a hundred at white."""
-    scene = RaySum(finest=BAND, snr=100, kappa=0.5, seed=request.param, apart=True, shape=(240, 280))
+    scene = RaySum(finest=BAND, snr=100, kappa=0.5, seed=request.param, covers="apart", shape=(240, 280))
     plane, true = scene.expose()
     white = float(np.quantile(plane, 0.99))
     return HalfOpen(scene, plane, np.minimum(plane, np.float32(white)), (plane >= white).astype(np.float32), true)

@@ -30,13 +30,13 @@ class Reached:
     truth: np.ndarray
 
 
-def _reached(scene: RaySum) -> Reached:
+def _reached(scene: RaySum, model: str = "joint") -> Reached:
     plane, true = scene.expose()
     fields = [
         scene.decoder(joint_views=joint).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
         for joint in (True, False)
     ]
-    assert [field.attributes["views_model"] for field in fields] == ["joint", "independent"]
+    assert [field.attributes["views_model"] for field in fields] == [model, "independent"]
     np.testing.assert_array_equal(fields[0].slices, fields[1].slices)
     truth = on_slices(true, fields[0].grid, fields[0].slices.shape[1:])
     mean = np.broadcast_to(np.nanmean(truth, axis=(0, 1)), truth.shape)
@@ -54,28 +54,47 @@ def test_noise_is_kept_out_of_views_by_the_disparities_that_are_there() -> None:
 
 
 @pytest.mark.parametrize(
-    "scene",
+    ("scene", "least"),
     [
-        RaySum(finest=BAND, snr=50, shape=(220, 260), apart=True),
+        (RaySum(finest=BAND, snr=50, shape=(220, 260), covers="apart"), 0.58),
         *(
-            pytest.param(RaySum(shape=(440, 520), apart=True, **kind), marks=pytest.mark.slow)
-            for kind in (
-                {"finest": BAND, "snr": 100, "seed": 2},
-                {"exponent": 1.1, "seed": 3},
-                {"boards": (-8.0, 0.0, 9.0), "snr": 100, "seed": 6},
+            pytest.param(RaySum(shape=(440, 520), covers="apart", **kind), least, marks=pytest.mark.slow)
+            for kind, least in (
+                ({"finest": BAND, "snr": 100, "seed": 2}, 0.53),
+                ({"exponent": 1.1, "seed": 3}, 0.53),
+                ({"boards": (-8.0, 0.0, 9.0), "snr": 100, "seed": 6}, 0.53),
             )
         ),
     ],
 )
-def test_two_thirds_of_errors_are_within_the_standard_error(scene: RaySum) -> None:
+def test_two_thirds_of_errors_are_within_the_standard_error(scene: RaySum, least: float) -> None:
     found = _reached(scene)
     samples = [(np.arange(side) + 0.5) / 12 for side in found.truth.shape[2:]]
     at = np.meshgrid(*samples, indexing="ij")
     assert found.field.view_sigma is not None
     there = np.array([[ndimage.map_coordinates(one, at, order=1) for one in line] for line in found.field.view_sigma])
     off = (np.abs(found.field.views - found.truth) / there)[..., 5:-5, 5:-5]
-    assert 0.53 < float(np.mean(off < 1)) < 0.76
+    assert least < float(np.mean(off < 1)) < 0.72
     assert 0.8 < float(np.mean(off < 2)) < 0.99
+
+
+@pytest.mark.parametrize(
+    ("scene", "model"),
+    [
+        (RaySum(finest=BAND, snr=500, shape=(220, 260), covers="apart"), "independent"),
+        (RaySum(finest=BAND, snr=100, shape=(220, 260), covers="apart"), "joint"),
+        pytest.param(
+            RaySum(finest=BAND, snr=300, shape=(440, 520), covers="apart"), "independent", marks=pytest.mark.slow
+        ),
+        pytest.param(RaySum(finest=BAND, snr=200, shape=(440, 520), covers="apart"), "joint", marks=pytest.mark.slow),
+        pytest.param(RaySum(exponent=1.5, shape=(220, 260), covers="apart"), "joint", marks=pytest.mark.slow),
+        pytest.param(RaySum(snr=1000, shape=(220, 260)), "joint", marks=pytest.mark.slow),
+    ],
+)
+def test_the_views_of_a_clean_frame_are_of_the_better_model(scene: RaySum, model: str) -> None:
+    """Little noise alone doesn't say so: of a frame with folded detail the joint model is better without any noise."""
+    found = _reached(scene, model)
+    assert found.joint > found.quick - 0.1
 
 
 @pytest.mark.slow
@@ -176,7 +195,7 @@ def test_a_scene_without_parallax_has_its_mean_picture_for_every_view() -> None:
 
 def test_a_frame_whose_slices_contradict_the_depth_of_its_views_is_doubted() -> None:
     """Two textures, far from each other, shine through each other all over: a depth map has one of them."""
-    scene = RaySum(finest=BAND, snr=100, boards=(-16.0, 20.0), shining_through=True)
+    scene = RaySum(finest=BAND, snr=100, boards=(-16.0, 20.0), covers="everywhere")
     plane, true = scene.expose()
     field, report = scene.decoder(joint_views=True).decode_reported(
         plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number
@@ -185,7 +204,7 @@ def test_a_frame_whose_slices_contradict_the_depth_of_its_views_is_doubted() -> 
     shares = field.attributes["views_shares"]
     assert (shares["told"], shares["at_rest"]) == (0, 0)
     assert report.views_doubt is not None
-    assert report.views_doubt.startswith(f"in {shares['contradict']:.0%} of the picture the slices contradict")
+    assert report.views_doubt.startswith(f"in at least {shares['contradict']:.0%} of the picture the slices contradict")
 
 
 @pytest.mark.parametrize(("moved", "motionless"), [(0.5, True), (6.0, False)])
@@ -198,7 +217,7 @@ def test_only_a_frame_in_which_nothing_tells_of_parallax_has_none(moved: float, 
 
 def test_a_thing_that_moves_before_a_scene_that_does_not_keeps_its_parallax() -> None:
     """Two thirds of the frame have none; 46.6 dB where patches lean to what most of a frame has."""
-    scene = RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(0.0, 0.0, 4.5), apart=True, seed=1)
+    scene = RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(0.0, 0.0, 4.5), covers="apart", seed=1)
     plane, true = scene.expose()
     field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
     assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 48.2
@@ -206,7 +225,7 @@ def test_a_thing_that_moves_before_a_scene_that_does_not_keeps_its_parallax() ->
 
 def test_a_thing_before_a_background_near_the_focus_keeps_its_parallax() -> None:
     """Most of the frame moves by a tenth of a sample from view to view, and was taken as at rest with all of it."""
-    found = _reached(RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(3.2, 3.2, 12.0), apart=True, seed=1))
+    found = _reached(RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(3.2, 3.2, 12.0), covers="apart", seed=1))
     assert found.joint > 44.8, found
 
 
@@ -230,5 +249,5 @@ def test_a_scene_beyond_all_ranges_is_told() -> None:
 
 def test_a_depth_map_of_the_first_views_makes_them_better() -> None:
     """40.0 dB with the first look alone."""
-    found = _reached(RaySum(finest=BAND, snr=50, shape=(220, 260), apart=True))
+    found = _reached(RaySum(finest=BAND, snr=50, shape=(220, 260), covers="apart"))
     assert found.joint > 40.7, found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,14 @@ class DepthMap:
     def known_share(self) -> float:
         """The share of pixels whose disparity is known."""
         return float(self.known.mean())
+
+
+def nearest_known(values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
+    """(h, w) the values, and those of the nearest known sample where they are not known; as they are where none is."""
+    if not known.any():
+        return values
+    row, column = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    return np.asarray(values[row, column])
 
 
 @dataclass(frozen=True, slots=True)

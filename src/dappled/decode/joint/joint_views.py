@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.estimate import estimate
@@ -27,8 +26,8 @@ from dappled.decode.joint.any_disparity import PatchBackground, views_at_any
 from dappled.decode.joint.patch_model import (
     BEYOND,
     KINDS,
+    MOTIONLESS_RANGE,
     MOVES_NATS,
-    NONE,
     SIDE,
     STILL,
     USUAL,
@@ -42,16 +41,12 @@ from dappled.decode.joint.patch_model import (
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.joint.told_disparity import MOST_STILL, at_rest, shares_of, views_told
+from dappled.decode.joint.told_patches import ToldPatches, likely_told, write_variance
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each
 
 _TEXTURES = 3  # groups of patches of similar texture, each with its own spectrum
-# Where things shine through each other a sample has two disparities, and a depth map one. All patches around are then
-# less probable as told than with all disparities at once, there by 3600 nats in the mean; at edges of opaque things
-# single ones are, there by up to 3400, and by 1500 in the mean. Two textures over each other have 34.9 dB as told, and
-# 39.8 not told.
-_TRANSPARENT_NATS, _AROUND = 2000.0, 5
 _FEWEST_VIEWS = 3  # along an axis: depth compares them with the middle one
 _FEWEST = 12  # patches in a group
 # Of views whose patches a depth map tells their disparities; the rest are their first views. With all of it, views of
@@ -65,10 +60,6 @@ _TOLD = (
     *((1.6, 0.04, 0.3), *((1.8, 0.01, 0.15),) * 2, *((0.25, 0.05, 1.2),) * 3, (0.45, 0.05, 0.4)),
     *((1.0, 0.9, 1.0),) * 6,
 )
-# Of patches that a depth map tells their disparities, for each kind: 68 % of errors are within the root of so many
-# times the geometric mean of two variances, by how much the patch and its neighbours were apart after the first look,
-# and what the model leaves to the median patch. The first misses errors that neighbours share, the second the model's.
-_TOLD_TWICE = dict(zip(USUAL_KINDS, (1.8, 1.04, 2.76, 1.24, 1.49, 1.51), strict=True))
 _TOLD_MOTIONLESS = (0.7, 0.86, 2.65)
 
 
@@ -89,12 +80,14 @@ class JointViews:
 class PatchShares:
     """Shares of a frame's patches: with disparities `told` by a depth map, `at_rest`, and of the rest those whose
     disparity is `beyond` `FARTHEST` times the reach, where views are smeared, and those in which slices `contradict`
-    the depth map, as where things shine through each other."""
+    the depth map, as where things shine through each other. `in_band` are patches that have hardly any detail beyond
+    the band."""
 
     told: float
     at_rest: float
     beyond: float
     contradict: float
+    in_band: float
 
 
 def joint_views(
@@ -140,7 +133,7 @@ def joint_views(
     made = _PatchViews.empty(patches, cut, means, model.aperture.views)
     each(made.solve, looked, workers)
     still = likely = np.zeros(len(means), dtype=bool)
-    told: list[_Told] = []
+    told: list[ToldPatches] = []
     if model.aperture.views >= _FEWEST_VIEWS:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
@@ -150,10 +143,11 @@ def joint_views(
         shares = shares_of(depths, frame.ranges[USUAL].disparities, patches)
         shares[still] = 0
         each(lambda one: told.extend(made.told(one, shares)), looked, workers)
-        likely = _likely(told, patches)
+        likely = likely_told(told, patches)
     apart = made.apart()
     variance = made.variance + made.of_apart * apart
-    made.take(told, likely, apart, variance)
+    made.take(told, likely)
+    write_variance(variance, apart, told, likely)
     sigma = np.sqrt(variance).astype(np.float32)
     shape = model.aperture.views, model.aperture.views
     views = made.views().reshape(*shape, *slices.shape[1:])
@@ -163,6 +157,7 @@ def joint_views(
         at_rest=float(still.mean()),
         beyond=float(made.beyond.mean()),
         contradict=tried - float(likely.mean()),
+        in_band=sum(np.count_nonzero(part.in_band) for part in told) / len(means),
     )
     return JointViews(views, sigma.reshape(*shape, *patches.grid), how)
 
@@ -170,8 +165,8 @@ def joint_views(
 @dataclass(frozen=True, slots=True, eq=False)
 class _PatchViews:
     """The views of all patches while they are made: `windowed` (N, V·U, side, side) with `lit` (N, 1, side, side) of
-    their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, and which are `beyond` (N,). Each call writes
-    the patches of its part."""
+    their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, and which are `beyond` (N,). What solves a
+    part writes its patches."""
 
     patches: Patches
     cut: Complexes
@@ -209,7 +204,7 @@ class _PatchViews:
         self.variance[:, members], self.of_apart[members] = found.variance, found.of_apart
         self.beyond[members] = found.beyond
 
-    def told(self, one: _Looked, shares: Floats) -> list[_Told]:
+    def told(self, one: _Looked, shares: Floats) -> list[ToldPatches]:
         """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
         here = np.isin(one.likely.with_parallax, USUAL_KINDS) & shares[one.members].any(axis=1)
         if not here.any():
@@ -218,20 +213,13 @@ class _PatchViews:
         found = views_told(one.frame, one.own, one.rests, self.patches.spectra(self.cut[:, members]), shares[members])
         change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
         windowed = np.asarray(self.windowed[members] + _TRUST * change, dtype=np.float32)
-        times = np.array([_TOLD_TWICE[kind] for kind in found.kinds])
-        return [_Told(members, windowed, times, found.rest, found.nats - one.likely.nats[here])]
+        return [ToldPatches(members, windowed, found.kinds, found.rest, found.nats - one.likely.nats[here])]
 
-    def take(self, told: list[_Told], likely: NDArray[np.bool_], apart: Floats, variance: Floats) -> None:
-        """Take the views of `likely` (N,) patches as told, and write their `variance` (V·U, N), from how far patches
-        were `apart` (V·U, N) before."""
-        if not likely.any():
-            return
-        typical = np.median(np.concatenate([part.rest[:, likely[part.members]] for part in told], axis=1), axis=1)
+    def take(self, told: list[ToldPatches], likely: NDArray[np.bool_]) -> None:
+        """Take the views of patches as told, where those are `likely` (N,)."""
         for part in told:
             kept = likely[part.members]
-            members = part.members[kept]
-            self.windowed[members] = part.windowed[kept]
-            variance[:, members] = part.times[kept] * np.sqrt(apart[:, members] * typical[:, None])
+            self.windowed[part.members[kept]] = part.windowed[kept]
 
     def views(self) -> Singles:
         """(V·U, h, w)"""
@@ -250,18 +238,6 @@ def _depths(views: Singles, aperture: Aperture, samples_px: tuple[float, float],
     return estimate(of_views(stack), workers=workers).disparity.astype(np.float64) * (count * columns_px)
 
 
-def _likely(told: list[_Told], patches: Patches) -> NDArray[np.bool_]:
-    """(N,) which patches were told disparities, and are not far less probable so, with those around."""
-    gained, count = np.zeros((2, len(patches.corners)))
-    for part in told:
-        gained[part.members], count[part.members] = part.gained, 1
-    around, there = (
-        ndimage.uniform_filter(values.reshape(patches.grid), _AROUND, mode="constant").ravel()
-        for values in (gained, count)
-    )
-    return np.asarray((count > 0) & (around >= -_TRANSPARENT_NATS * there))
-
-
 def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
     """(N,) which patches (N, side, side) are alike, by how much fine detail they have: `_TEXTURES` for those at the
     edges, fewer for others."""
@@ -270,19 +246,6 @@ def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
     count = max(1, min(_TEXTURES, len(images) // _FEWEST))
     group = np.searchsorted(np.quantile(texture, np.arange(1, count) / count), texture)
     return np.asarray(np.where(patches.at_edges, _TEXTURES, group))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Told:
-    """Patches, the `members` (M,) of all, as a depth map tells them: `windowed` (M, V·U, side, side), how many `times`
-    (M,) the mean of variances counts, the variance of the `rest` (V·U, M), and by how many nats they are more probable
-    than with all disparities at once: `gained` (M,)."""
-
-    members: NDArray[np.intp]
-    windowed: Singles
-    times: Floats
-    rest: Floats
-    gained: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,7 +296,7 @@ def _solve(looked: _Looked, chosen: NDArray[np.intp], moved: NDArray[np.bool_], 
             members = np.flatnonzero((chosen == number) & (moved != still))
             if not len(members):
                 continue
-            some = frame.ranges[NONE if still else kind.range]
+            some = frame.ranges[MOTIONLESS_RANGE if still else kind.range]
             of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
             made[:, :, members], found = views_at_any(frame, some, own, background, spectra[:, :, members])
             variance[:, members] = of_alone * left + of_rest * found

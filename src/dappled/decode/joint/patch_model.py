@@ -25,7 +25,7 @@ STILL = 1 / 16  # of the reach: hardly any parallax
 MOTIONLESS = STILL / 4  # of the reach: what a patch by itself can't tell from none
 # Of |disparity|, in reaches: hardly any, the usual ones, far ones, what is beyond all, and none that can be told.
 RANGES = ((0.0, STILL), (0.0, 1.0), (1.0, FARTHEST), (FARTHEST, 4.0), (0.0, MOTIONLESS))
-AT_REST, USUAL, FAR, BEYOND, NONE = range(len(RANGES))
+AT_REST, USUAL, FAR, BEYOND, MOTIONLESS_RANGE = range(len(RANGES))
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +127,7 @@ class FrameModel:
         ranges: Collection[int] = range(len(RANGES)),
         workers: int = 1,
     ) -> FrameModel:
-        """For patches whose disparities are in these `ranges`."""
+        """For patches whose disparities are in these `ranges`; `rests_of` needs the usual one in any case."""
         bins = patches.bins
         frequencies = bins / np.array(samples_px)
         weights = _INDEPENDENT * patches.multiplicity / 2
@@ -135,14 +135,14 @@ class FrameModel:
         found: dict[int, DisparityRange] = {}
         folds: dict[int, list[Fold]] = {}
 
-        def reach_of(number: int) -> None:
+        def make_range(number: int) -> None:
             near, far = RANGES[number]
             found[number] = DisparityRange.of(model, frequencies, near * reach, far * reach)
 
         def fold(number: int) -> None:
             folds[number] = model.folds(frequencies, _FOLDED[number] * reach)
 
-        parts = [(reach_of, number) for number in ranges] + [(fold, number) for number in ranges if number in _FOLDED]
+        parts = [(make_range, number) for number in ranges] + [(fold, number) for number in ranges if number in _FOLDED]
         each(lambda part: part[0](part[1]), parts, workers)
         return cls(
             model=model,
@@ -195,11 +195,11 @@ def rests_of(
     size = len(frame.noise)
     through = (np.abs(frame.ranges[USUAL].seen) ** 2).mean(axis=(1, 2, 3)) * own
     plain = np.zeros((len(own), size, size), dtype=np.complex64)
-    each = frame.noise + LEAST_NOISE + _ERROR * through[:, None]
+    own_noise = frame.noise + LEAST_NOISE + _ERROR * through[:, None]
     means = frame.lowest * (mean * SIDE) ** 2
-    each = each + _MEAN_ERROR**2 * means[:, None] * np.abs(frame.model.transfers) ** 2
-    each[:, 1:] += frame.astray**2 * (own + means)[:, None]
-    plain[:, range(size), range(size)] = each
+    own_noise = own_noise + _MEAN_ERROR**2 * means[:, None] * np.abs(frame.model.transfers) ** 2
+    own_noise[:, 1:] += frame.astray**2 * (own + means)[:, None]
+    plain[:, range(size), range(size)] = own_noise
     from_beyond = {
         number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size)
         for number, some in frame.folds.items()
@@ -230,7 +230,7 @@ def wholes_of(
 
 
 def inverse_of_lower(lower: NDArray[Any]) -> NDArray[np.complex128]:
-    """L⁻¹ of lower triangles L (F, A, A), row by row for all F at once: four times as fast as LU of each."""
+    """L⁻¹ of lower triangles L (F, A, A), row by row for all F at once: faster than LU of each."""
     found = np.zeros(lower.shape, dtype=np.complex128)
     for row in range(lower.shape[1]):
         own = 1 / lower[:, row, row, None]
@@ -275,7 +275,8 @@ class LikelyKinds:
         still = np.array([number for number, kind in enumerate(KINDS) if kind.range == AT_REST])
         others = np.array([number for number, kind in enumerate(KINDS) if kind.range != AT_REST])
         hardly, not_at_all = (
-            at_rest_nats(frame, some, own, rests, spectra) for some in (frame.ranges[AT_REST], frame.ranges[NONE])
+            at_rest_nats(frame, some, own, rests, spectra)
+            for some in (frame.ranges[AT_REST], frame.ranges[MOTIONLESS_RANGE])
         )
         best = others[nats[others].argmax(axis=0)]
         at_rest = still[nats[still].argmax(axis=0)]
@@ -309,8 +310,8 @@ def at_rest_nats(
         sizes = [(base + amount * varied)[:, number, None].astype(np.float32) for amount in (*_USUAL_AMOUNTS, *_MORE)]
         nats = [-np.log(size) - power / size for size in sizes]
         for usual in range(len(found)):
-            each = np.stack([nats[usual], *nats[len(found) :]])
-            found[usual] += frame.weights @ _mean_of_odds(each, 1 - _SELDOM)
+            amounts = np.stack([nats[usual], *nats[len(found) :]])
+            found[usual] += frame.weights @ _mean_of_odds(amounts, 1 - _SELDOM)
     return np.asarray(found.max(axis=0))
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.decode.array_types import Complexes, Floats, Singles
+from dappled.decode.depth.depth_map import nearest_known
 from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackground
 from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel
 from dappled.decode.joint.patches import Patches
@@ -72,10 +73,7 @@ def at_rest(disparity: Floats, still: float, patches: Patches) -> NDArray[np.boo
 
 def _smoothed(values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
     """(h, w) the median around each sample, the nearest known one for those that are not."""
-    if not known.any():
-        return values
-    row, column = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    return np.asarray(ndimage.median_filter(values[row, column], _SMOOTH_PX))
+    return np.asarray(ndimage.median_filter(nearest_known(values, known), _SMOOTH_PX))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
