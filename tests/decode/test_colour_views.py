@@ -135,7 +135,8 @@ def test_an_edge_moves_as_the_nearer_thing_and_texture_as_what_it_is_on() -> Non
             line.append(cover[..., None] * layers[0] + (1 - cover[..., None]) * layers[1])
         made.append(line)
     truth = np.asarray(made, dtype=np.float32)
-    assert error(truth.mean(axis=-1), 1.0, truth, truth.mean(axis=-1)) < 0.6
+    grey = np.asarray(truth.mean(axis=-1), dtype=np.float32)
+    assert error(grey, 1.0, truth, grey) < 0.6
 
 
 def test_a_sample_that_is_higher_than_wide_moves_by_fewer_rows() -> None:

@@ -79,11 +79,11 @@ class RaySum:
             "apart": [np.exp(8 * wave) / sum(np.exp(8 * other) for other in waves) for wave in waves],
             "everywhere": [np.full_like(waves[0], 1 / len(waves)) for _ in waves],
         }[self.covers]
-        made = []
+        made: list[tuple[float, NDArray[np.complex128]]] = []
         for disparity, cover in zip(self.boards, covers, strict=True):
             texture = np.fft.irfft2(np.fft.rfft2(rng.normal(size=(high, wide))) * size, s=(high, wide))
             light = (1 + self.contrast * texture / texture.std()) * cover
-            made.append((disparity, np.fft.rfft2(light)))
+            made.append((disparity, np.asarray(np.fft.rfft2(light), dtype=np.complex128)))
         total = sum(float(spectrum[0, 0].real) for _, spectrum in made) / (high * wide)
         return [(disparity, spectrum * (0.35 / total)) for disparity, spectrum in made]
 
