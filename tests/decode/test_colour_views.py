@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from dappled.decode import DecodeError
-from dappled.decode.array_types import Singles
+from dappled.decode.array_types import Floats, Singles
 from dappled.decode.colour_views import dc_views, in_colour
 
 BAYER = np.array([[0, 1], [1, 2]])
@@ -81,25 +83,26 @@ def test_grey_without_texture_gives_a_colour_its_share() -> None:
     np.testing.assert_allclose(made[0] - made[1], np.broadcast_to([0.02, 0.01, 0.005], made[0].shape), rtol=1e-3)
 
 
-def moving(
-    y: Singles, x: Singles, views: int = 5, *, down: float, across: float, flat: float = 0.0
-) -> tuple[Singles, Singles]:
-    """True views (V, U, h, w, 3) that move by so many samples, of stripes of two colours with the same grey on a
-    texture, and their greys, the mean of the colours. Within `flat` samples of the middle there is no texture."""
+def seen(by: Callable[[float, float], Floats], views: int = 5) -> tuple[Singles, Singles]:
+    """True views (V, U, h, w, 3) of what is seen `by` a view at (v, u), and their greys, the mean of the colours."""
     steps = np.arange(views) - (views - 1) / 2
-    made = []
-    for v in steps:
-        line = []
-        for u in steps:
-            at, to = y - down * v, x - across * u
-            away = np.hypot(at - y.shape[0] / 2, to - x.shape[1] / 2)
-            texture = np.sin(0.9 * at + 0.4 * to) + np.sin(0.3 * at - 0.8 * to) + np.sin(0.5 * to)
-            grey = 0.3 + 0.03 * texture / (1 + np.exp(flat - away) * (flat > 0))
-            tint = 0.5 * np.tanh(2 * np.sin(0.35 * to + 0.2 * at))
-            line.append(np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1))
-        made.append(line)
-    truth = np.asarray(made, dtype=np.float32)
-    return truth, truth.mean(axis=-1)
+    truth = np.asarray([[by(v, u) for u in steps] for v in steps], dtype=np.float32)
+    return truth, np.asarray(truth.mean(axis=-1), dtype=np.float32)
+
+
+def moving(y: Singles, x: Singles, *, down: float, across: float, flat: float = 0.0) -> tuple[Singles, Singles]:
+    """Views as `seen` that move by so many samples, of stripes of two colours with the same grey on a texture. Within
+    `flat` samples of the middle there is no texture."""
+
+    def by(v: float, u: float) -> Floats:
+        at, to = y - down * v, x - across * u
+        away = np.hypot(at - y.shape[0] / 2, to - x.shape[1] / 2)
+        texture = np.sin(0.9 * at + 0.4 * to) + np.sin(0.3 * at - 0.8 * to) + np.sin(0.5 * to)
+        grey = 0.3 + 0.03 * texture / (1 + np.exp(flat - away) * (flat > 0))
+        tint = 0.5 * np.tanh(2 * np.sin(0.35 * to + 0.2 * at))
+        return np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1).astype(np.float64)
+
+    return seen(by)
 
 
 def error(views: Singles, row_over_column: float, truth: Singles, grey: Singles) -> float:
@@ -121,21 +124,18 @@ def test_an_edge_between_colours_of_the_same_grey_moves_as_the_texture_around_do
 def test_an_edge_moves_as_the_nearer_thing_and_texture_as_what_it_is_on() -> None:
     """A board and what is behind it, of the same mean grey and of other colours, move in opposite directions."""
     y, x = np.mgrid[:60, :80].astype(np.float32)
-    made = []
-    for v in np.arange(5) - 2:
-        line = []
-        for u in np.arange(5) - 2:
-            layers = []
-            for tint, move, turn in ((0.5, 0.35, 0.0), (-0.5, -0.35, 2.0)):
-                at, to = y - move * v, x - move * u
-                grey = 0.3 + 0.03 * (np.sin(0.9 * at + 0.4 * to + turn) + np.sin(0.3 * at - 0.8 * to + turn))
-                layers.append(np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1))
-            away = np.maximum(np.abs(y - 0.35 * v - 30) - 16, np.abs(x - 0.35 * u - 40) - 20)
-            cover = 1 / (1 + np.exp(2 * away))
-            line.append(cover[..., None] * layers[0] + (1 - cover[..., None]) * layers[1])
-        made.append(line)
-    truth = np.asarray(made, dtype=np.float32)
-    grey = np.asarray(truth.mean(axis=-1), dtype=np.float32)
+
+    def by(v: float, u: float) -> Floats:
+        layers = []
+        for tint, move, turn in ((0.5, 0.35, 0.0), (-0.5, -0.35, 2.0)):
+            at, to = y - move * v, x - move * u
+            grey = 0.3 + 0.03 * (np.sin(0.9 * at + 0.4 * to + turn) + np.sin(0.3 * at - 0.8 * to + turn))
+            layers.append(np.stack([grey * (1 + tint), grey, grey * (1 - tint)], axis=-1).astype(np.float64))
+        away = np.maximum(np.abs(y - 0.35 * v - 30) - 16, np.abs(x - 0.35 * u - 40) - 20)
+        cover = 1 / (1 + np.exp(2 * away))[..., None]
+        return np.asarray(cover * layers[0] + (1 - cover) * layers[1])
+
+    truth, grey = seen(by)
     assert error(grey, 1.0, truth, grey) < 0.6
 
 

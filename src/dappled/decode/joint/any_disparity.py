@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
-from dappled.decode.joint.patch_model import LEAST_NOISE, SIDE, WITHIN, DisparityRange, FrameModel, inverse_of_lower
+from dappled.decode.joint.patch_model import LEAST_NOISE, SIDE, WITHIN, DisparityRange, FrameModel, whitener_of
 
 Doubles = NDArray[np.complex128]
 STRENGTHS = np.array([0.01, 0.1, 0.3, 1.0, 3.0, 10.0], dtype=np.float32)
@@ -39,9 +39,7 @@ class PatchBackground:
     @classmethod
     def of(cls, covariance: Complexes, alone: Complexes, power: Floats) -> PatchBackground:
         """From `alone` (F, A, V·U), how the slices hold what each view has alone, of `power` (F,)."""
-        # In double precision: odds of hypotheses are exponentials of numbers in the thousands.
-        lower = np.linalg.cholesky(covariance.astype(np.complex128))
-        whitener = inverse_of_lower(lower)
+        whitener = whitener_of(covariance)
         white = whitener @ alone
         unmixed = (white.conj().transpose(0, 2, 1) @ whitener * power[:, None, None]).astype(np.complex64)
         explained = power[:, None] * (np.abs(white) ** 2).sum(axis=1)

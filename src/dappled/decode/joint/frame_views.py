@@ -32,7 +32,7 @@ _ASTRAY = 1.0
 # a frame must be far cleaner where more than a few patches have any. `RaySum`'s frames in the band are better inverted
 # from 1.0 to 1.5 on, those with folded detail at no noise (0.3 to 1.3).
 _CLEANER, _CLEANER_FOLDED = 1.25, 0.2
-_IN_BAND = 0.04  # of the patches hardly have any
+_SOME_IN_BAND = 0.04  # of the patches hardly have any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -189,26 +189,28 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         astray=taken.astray(),
         workers=workers,
     )
-    shares, doubts = found.shares, list[str]()
+    shares = found.shares
+    doubt = contradicted = None
     if shares.beyond > _TOLD_BEYOND:
-        doubts.append(
+        doubt = (
             f"{shares.beyond:.0%} of the picture is so near or far that neighbouring views differ there by more than "
             f"{FARTHEST * taken.samples_px[1]:.0f} px of the sensor, and {taken.aperture.views} views can't tell by "
             "how much: don't trust parallax there, focus on it, or stop down"
         )
     if shares.beyond > _MOST_BEYOND:  # inverting supposes no range
         reason = f"{shares.beyond:.0%} of the picture is nearer or farther than the model of the light field reaches"
-        return replace(independent, doubt="; ".join(doubts), reason=reason)
-    cleaner = _CLEANER if shares.in_band > _IN_BAND else _CLEANER_FOLDED
+        return replace(independent, doubt=doubt, reason=reason)
+    cleaner = _CLEANER if shares.in_band > _SOME_IN_BAND else _CLEANER_FOLDED
     if np.mean(noise) < cleaner**2 * np.mean(found.sigma**2):
         reason = "the frame has so little noise that the model of the light field would add errors"
-        return replace(independent, doubt="; ".join(doubts) or None, reason=reason)
+        return replace(independent, doubt=doubt, reason=reason)
     if shares.contradict > _TOLD_CONTRADICTED:
-        doubts.append(
+        contradicted = (
             f"in at least {shares.contradict:.0%} of the picture the slices contradict the depth that the views show, "
             "as where things shine through each other: don't trust depth there"
         )
-    return FrameViews(found.views, "joint", found.sigma, "; ".join(doubts) or None, shares=shares)
+    doubt = "; ".join(filter(None, (doubt, contradicted))) or None
+    return FrameViews(found.views, "joint", found.sigma, doubt, shares=shares)
 
 
 def _unfit(orders: int, shape: tuple[int, int], views: int) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,15 +134,13 @@ class FrameModel:
         found: dict[int, DisparityRange] = {}
         folds: dict[int, list[Fold]] = {}
 
-        def make_range(number: int) -> None:
+        def make(number: int) -> None:
             near, far = RANGES[number]
             found[number] = DisparityRange.of(model, frequencies, near * reach, far * reach)
+            if number in _FOLDED:
+                folds[number] = model.folds(frequencies, _FOLDED[number] * reach)
 
-        def fold(number: int) -> None:
-            folds[number] = model.folds(frequencies, _FOLDED[number] * reach)
-
-        parts = [(make_range, number) for number in ranges] + [(fold, number) for number in ranges if number in _FOLDED]
-        each(lambda part: part[0](part[1]), parts, workers)
+        each(make, ranges, workers)
         return cls(
             model=model,
             frequencies=frequencies,
@@ -229,8 +226,11 @@ def wholes_of(
     ]
 
 
-def inverse_of_lower(lower: NDArray[Any]) -> NDArray[np.complex128]:
-    """L⁻¹ of lower triangles L (F, A, A), row by row for all F at once: faster than LU of each."""
+def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
+    """L⁻¹ (F, A, A) of covariances LLᴴ (F, A, A): what has a covariance is white behind it."""
+    # In double precision: odds of hypotheses are exponentials of numbers in the thousands.
+    lower = np.linalg.cholesky(covariance.astype(np.complex128))
+    # Row by row for all F at once: faster than LU of each.
     found = np.zeros(lower.shape, dtype=np.complex128)
     for row in range(lower.shape[1]):
         own = 1 / lower[:, row, row, None]
@@ -245,9 +245,9 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes, weights: Singles, w
     found = np.empty((len(wholes), spectra.shape[2]))
 
     def one(number: int) -> None:
-        lower = np.linalg.cholesky(wholes[number].astype(np.complex128))
-        white = inverse_of_lower(lower).astype(np.complex64) @ spectra
-        volume = 2 * np.log(np.abs(np.diagonal(lower, axis1=1, axis2=2))).sum(axis=1)
+        whitener = whitener_of(wholes[number])
+        white = whitener.astype(np.complex64) @ spectra
+        volume = -2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1)
         squares = (white.real**2 + white.imag**2).sum(axis=1)
         found[number] = -(weights @ (volume[:, None] + squares))
 
