@@ -88,7 +88,8 @@ def test_a_subscriber_that_was_killed_and_started_again_ends_with_every_frame(tm
     assert kept == list(range(frames))
 
 
-@pytest.mark.slow
+@pytest.mark.alone
+@pytest.mark.slow  # depth has the lowest priority of all: beside two tests that compute, a map takes over a minute
 def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> None:
     """As the schema says, with disparities that are known in most of the picture, and a sigma wherever they are."""
     endpoint = f"ipc://{sockets}/depth"
@@ -97,11 +98,12 @@ def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> N
         "depth_interval_s = 0\n"
     )
     run = [sys.executable, "-m", "dappled", "run", "--simulate", "--frames", "500", "--config", "dappled.toml"]
-    daemon = subprocess.Popen(run, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    with (tmp_path / "said").open("w") as said:
+        daemon = subprocess.Popen(run, cwd=tmp_path, stdout=said, stderr=said)
     try:
         with Subscriber(endpoint, topics=["depth"]) as subscriber:
             message = subscriber.receive(90)
-        assert message is not None
+        assert message is not None, (tmp_path / "said").read_text()[-2000:]
         jsonschema.validate(message.header, schema("depth"))
         arrays = message.arrays()
         known = np.isfinite(arrays["disparity"])
