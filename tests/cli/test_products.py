@@ -51,6 +51,21 @@ def test_views_that_the_model_did_not_make_are_told_with_the_reason(
     assert json.loads(capsys.readouterr().out)["views"] == words
 
 
+@pytest.mark.parametrize(
+    ("verb", "name"), [("views", "a.png"), ("refocus", "a.png"), ("depth", "a.npz"), ("export", "a.mat")]
+)
+def test_what_is_made_of_a_light_field_in_doubt_is_in_doubt(
+    verb: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain, doubts = light_field(), ["3.0% of its pixels are clipped", "the mask lies 16 µm off"]
+    light_files.save(tmp_path / "f.npz", replace(plain, attributes={**plain.attributes, "doubts": doubts}))
+    words = [verb, str(tmp_path / "f.npz"), "-o", str(tmp_path / name), *(["--as", "mat"] if verb == "export" else [])]
+    assert main([*words, "--json"]) == 0
+    said = capsys.readouterr()
+    assert json.loads(said.out)["doubts"] == doubts
+    assert said.err == "".join(f"dappled {verb}: {words[1]} is in doubt: {doubt}\n" for doubt in doubts)
+
+
 @pytest.mark.parametrize("of", ["views", "slices", "shifts", "slice-shifts"])
 def test_views_as_one_picture(field: str, of: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     if "shifts" in of:

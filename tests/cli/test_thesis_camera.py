@@ -143,7 +143,7 @@ def test_behind_a_lens_that_tells_no_f_number_the_carriers_are_found_or_nothing_
     at = {(int(ky), int(kx)): (fy, fx) for ky, kx, fy, fx in made.carriers}
     assert np.abs((np.array(at[1, 1]) - (1, 1) @ TEXTURED.lattice) * QUARTER.shape).max() < 0.1
     bare = str(dng_of(tmp_path / "bare.dng", TEXTURED, TEXTURED.without_film(), told=False))
-    assert main(["decode", bare, *_quarter(tmp_path), "-o", str(tmp_path / "b.npz")]) == 0
+    assert main(["decode", bare, *_quarter(tmp_path), "-o", str(tmp_path / "b.npz")]) == 1
     made = light_files.load(tmp_path / "b.npz")
     assert made.attributes["carriers_found"] is None
     (doubt,) = made.attributes["doubts"]

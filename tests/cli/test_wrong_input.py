@@ -141,9 +141,18 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     doubted = known.doubt or ""
     assert known.doubts[0] in doubted
     assert ("neither law" in doubted) == known.verdict.startswith("neither law")
-    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 0
-    assert "in doubt: " in capsys.readouterr().out
+    assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 1
+    said = capsys.readouterr()
+    assert "in doubt: " in said.out
+    assert said.err == "dappled decode: the light field is in doubt, as said; --anyway exits with 0 all the same\n"
     assert any(told in doubt for doubt in light_files.load(tmp_path / "f.npz").attributes["doubts"])
+    assert main(["decode", *words, "--anyway", "-o", str(tmp_path / "g.npz")]) == 0
+    said = capsys.readouterr()
+    assert "in doubt: " in said.out
+    assert said.err == ""
+    good = str(dng_of(tmp_path / "good.dng", SHOT, masked))
+    assert main(["decode", good, *words, "-o", str(tmp_path / "both")]) == 1
+    assert "1 of 2 frames are in doubt" in capsys.readouterr().err
 
 
 def test_the_same_frame_as_it_is_passes_without_a_doubt(masked: NDArray[np.float32], tmp_path: Path) -> None:
@@ -162,7 +171,7 @@ def test_vignetting_is_a_doubt_unless_a_white_frame_takes_it_off(
     frame = dng_of(tmp_path / "f.dng", SHOT, masked * lens)
     white = dng_of(tmp_path / "w.dng", SHOT, np.full(QUARTER.shape, 0.4) * lens)
     words = ["decode", str(frame), *quarter(tmp_path), "-o", str(tmp_path / "f.npz"), "--overwrite"]
-    assert main(words) == 0
+    assert main(words) == 1
     assert "in doubt: its corners have " in capsys.readouterr().out
     attributes = light_files.load(tmp_path / "f.npz").attributes
     lost, sigma = attributes["falloff"]

@@ -32,7 +32,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--taper", type=float, default=0.0, metavar="SHARE",
                         help="share of each band with a soft edge, 0 to 1: less ringing, less detail")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
-                        help="write the light field although carriers that must be visible are not")  # fmt: skip
+                        help="write the light field although carriers that must be visible are not, and exit with 0\n"
+                        "although a light field is in doubt")  # fmt: skip
     add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not single:
         _refuse_same_names(arguments.frames, arguments.output)
         arguments.output.mkdir(parents=True, exist_ok=True)
-    bad = 0
+    bad = doubted = 0
     for frame in tqdm(arguments.frames, unit="frame", disable=len(arguments.frames) < 2 or not sys.stderr.isatty()):
         target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
         try:
@@ -53,6 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
             if not arguments.anyway:
                 _refuse_contradicted(frame, made)
             light_files.save(target, made.light_field, overwrite=arguments.overwrite)
+            doubted += bool(made.doubts)
             print(json.dumps(_facts(target, made)) if arguments.json else f"{target}: {summary(made)}")
         except DappledError as error:
             if single:
@@ -63,7 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
                 print(json.dumps({"frame": str(frame), "error": str(error)}))
     if bad:
         print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be decoded", file=sys.stderr)
-    return 1 if bad else 0
+    if doubted and not arguments.anyway:
+        which = "the light field is" if single else f"{doubted} of {counted(len(arguments.frames), 'frame')} are"
+        print(f"dappled decode: {which} in doubt, as said; --anyway exits with 0 all the same", file=sys.stderr)
+    return 1 if bad or (doubted and not arguments.anyway) else 0
 
 
 def _refuse_same_names(frames: Sequence[Path], folder: Path) -> None:
@@ -125,8 +130,6 @@ def summary(made: DecodeResult) -> str:
         whole += f", by the law {field.attributes['law']} ({made.search.sentence})"
     if words := decode_arguments.views_words(field):
         whole += f"; {words}"
-    if made.report.doubt:
-        whole += f": {made.report.doubt}"
-    if made.not_linear:
-        whole += f"; in doubt: {'; '.join(made.not_linear)}"
+    if others := [one for one in made.doubts if one not in (made.contradiction, made.unsettled)]:
+        whole += f"; in doubt: {'; '.join(others)}"
     return whole

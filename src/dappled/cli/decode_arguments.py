@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -195,7 +196,8 @@ def refuse_of_flight(arguments: argparse.Namespace, *more: str) -> None:
 
 
 def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
-    """The light field that the arguments name. Raises DappledError."""
+    """The light field that the arguments name. What is in doubt about it is said on standard error: whatever is made
+    of it is in doubt for that. Raises DappledError."""
     found = opened.light_field(arguments.field, focus_m=getattr(arguments, "focus", None))
     calibration = getattr(arguments, "calibration", None)
     if calibration is not None:
@@ -204,6 +206,8 @@ def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
             raise opened.OpenError(f"{calibration} has no distances: make it again with dappled calibrate --target")
         found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
         found.metres()  # the user named it: refuse it if it is for another focal length
+    for doubt in found.doubts:
+        print(f"dappled {arguments.verb}: {arguments.field} is in doubt: {doubt}", file=sys.stderr)
     return found
 
 

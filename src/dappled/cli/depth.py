@@ -156,6 +156,7 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
         "disparity_px": _quartiles(made.disparity),
         "sigma_px": _quartiles(made.sigma),
         "distances_from": None if found.ranging is None else found.ranging.source,
+        "doubts": found.doubts,
     }
     if distances is not None:
         report["distance_known"] = float(np.isfinite(distances.distance_m).mean())

@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     written = write(found, arguments.kind, arguments.output, arguments)
     words = decode_arguments.views_words(found.field)
     if arguments.json:
-        print(json.dumps({"file": str(written), "as": arguments.kind, "views": words or None}))
+        print(json.dumps({"file": str(written), "as": arguments.kind, "views": words or None, "doubts": found.doubts}))
     else:
         print(written)
         if words:

@@ -115,7 +115,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         disparities = [] if arguments.all_in_focus or arguments.index else [d for _, d in planes]
         facts = [dict(note.facts) for note in notes]
-        print(json.dumps({"file": str(arguments.output), "disparities_px": disparities, "notes": facts}))
+        made_of = {"disparities_px": disparities, "notes": facts, "doubts": found.doubts}
+        print(json.dumps({"file": str(arguments.output), **made_of}))
         return 0
     for note in notes:
         print(note.text)

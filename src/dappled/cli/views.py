@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     note = "; ".join(words for words in (note, decode_arguments.views_words(found.field)) if words)
     if arguments.json:
         facts = {"file": str(arguments.output), "of": arguments.of, "views": list(found.views.shape[:4])}
-        print(json.dumps({**facts, **({"note": note} if note else {})}))
+        print(json.dumps({**facts, "doubts": found.doubts, **({"note": note} if note else {})}))
         return 0
     if note:
         print(note)

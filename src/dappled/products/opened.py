@@ -145,9 +145,8 @@ class OpenedLightField(Refocusable):
         size = f"{views[0]} × {views[1]} views of {views[2]} × {views[3]} px" if views[0] else "no views"
         stop = said.get("f_number"), said.get("focal_length_mm")
         taken = [said.get("camera"), said.get("mask"), stop[1] and f"{stop[1]:g} mm", stop[0] and f"f/{stop[0]:g}"]
-        doubts = said.get("doubts") or ()
         words = [f"{size}, {slices} slices", *(str(one) for one in taken if one)]
-        words += [f"{len(doubts)} doubt{'s' * (len(doubts) > 1)}"] if doubts else []
+        words += [counted(len(self.doubts), "doubt")] if self.doubts else []
         return f"<light field {'' if self.path is None else self.path.name + ': '}{', '.join(words)}>"
 
     def _repr_html_(self) -> str:
@@ -155,7 +154,7 @@ class OpenedLightField(Refocusable):
         picture: NDArray[np.float32] | None = np.abs(self.slices[0]) if len(self.slices) else None
         with contextlib.suppress(DecodeError):
             picture = self.stack.middle()
-        doubts = [f"doubt: {one}" for one in self.attributes.get("doubts") or ()]
+        doubts = [f"doubt: {one}" for one in self.doubts]
         more = [f"and {len(doubts) - _SHOWN} more"] if len(doubts) > _SHOWN else []
         shown = None if picture is None or not picture.size else figures.bright(picture)
         return summaries.block(repr(self), shown, [*doubts[:_SHOWN], *more])
@@ -174,6 +173,11 @@ class OpenedLightField(Refocusable):
     def attributes(self) -> Mapping[str, Any]:
         """Frame shape, camera, mask, law, focal length, f-number …"""
         return self.field.attributes
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is in doubt about the light field, a sentence each."""
+        return tuple(map(str, self.attributes.get("doubts") or ()))
 
     @cached_property
     def stack(self) -> ViewStack:

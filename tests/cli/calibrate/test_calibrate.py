@@ -161,9 +161,10 @@ def test_a_wrong_mask_is_told_in_a_sentence(
     assert "written with this doubt in it: neither law explains" in capsys.readouterr().err
     assert calibration_files.load(tmp_path / "c.toml").verdict.startswith("neither law explains")
     frame = [*words[:-2], "--calibration", str(tmp_path / "c.toml"), "-o", str(tmp_path / "f.npz")]
-    assert main(["decode", *frame]) == 0
+    assert main(["decode", *frame]) == 1
     (doubt,) = light_files.load(tmp_path / "f.npz").attributes["doubts"]
     assert doubt.startswith("calibration: neither law explains")
+    assert f"in doubt: {doubt}\n" in capsys.readouterr().out
 
 
 def test_a_dark_frame_is_taken_off_and_one_of_another_size_is_refused(

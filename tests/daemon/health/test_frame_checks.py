@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from PIL import Image
 from scipy import ndimage
 
 from dappled.daemon.health.frame_checks import check_frame, sharpness
 from dappled.daemon.health.go_no_go import Check, verdict
+from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.mocks.scene.masked_camera import reference_camera
@@ -54,6 +56,15 @@ def test_a_clipped_frame_is_no_go(tmp_path: Path) -> None:
     found = by_name(check_frame(path, None))
     assert found["exposure"].state == "no-go"
     assert "expose less" in found["exposure"].text
+
+
+def test_a_jpeg_is_no_go(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "good.jpg"
+    values = reading.read(good).mosaic
+    Image.fromarray((255 * (values / values.max()) ** (1 / 2.2)).astype(np.uint8)).save(path, quality=95)
+    found = by_name(check_frame(path, None))["tones"]
+    assert found.state == "no-go"
+    assert found.text == "it is a JPEG: its tones are not linear; set the camera to raw files"
 
 
 def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:

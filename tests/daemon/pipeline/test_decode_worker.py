@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import struct
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from dappled.daemon.pipeline.decode_worker import DecodeWorker, nearest
 from dappled.decode.depth.depth_map import DepthMap
@@ -22,6 +25,8 @@ from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
 from tests.decode.ray_frames import MASKS, Shot
 from tests.products.fields import DISPARITY, light_field
 
+Lens = tuple[float | None, float | None]  # focal length, mm, and f-number
+
 
 @pytest.mark.parametrize(("length_mm", "known"), [(50.0, True), (12.8, False), (None, False)])
 def test_no_distance_is_told_of_another_zoom(length_mm: float | None, known: bool) -> None:
@@ -32,8 +37,15 @@ def test_no_distance_is_told_of_another_zoom(length_mm: float | None, known: boo
     assert nearest(light_field(), found) is None
 
 
-def ask(worker: DecodeWorker, path: Path, index: int, *, look: bool = True) -> Mapping[str, Any]:
-    facts = {"path": str(path), "focal_length_mm": None, "f_number": None, "index": index, "look": look}
+def ask(
+    worker: DecodeWorker,
+    path: Path,
+    index: int,
+    *,
+    look: bool = True,
+    lens: Lens = (None, None),
+) -> Mapping[str, Any]:
+    facts = {"path": str(path), "focal_length_mm": lens[0], "f_number": lens[1], "index": index, "look": look}
     answer, fds = worker(ChannelMessage({"do": "decode", **facts}))
     for fd in fds:
         os.close(fd)
@@ -113,6 +125,26 @@ def test_vignetting_of_the_first_frame_with_a_lens_is_a_doubt_about_all(
         for index, path in enumerate(frames):
             seen = ask(worker, path, index)["seen"]
             assert any("its corners have" in words for words in seen["doubts"]) is doubted
+
+
+def test_what_bends_the_tones_of_a_frame_is_a_doubt_about_it(flown: tuple[Recipe, list[Path]], tmp_path: Path) -> None:
+    """A JPEG; a PNG that says it has a gamma; pixels that are clipped: of those frames, and not of the next."""
+    shot = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, scene="texture", seed=2)
+    plane = shot.frame()
+    good = dng_of(tmp_path / "good.dng", shot, plane)
+    clipped = dng_of(tmp_path / "clipped.dng", shot, np.clip(plane * 3.2, 0, 1.3))
+    bent = Image.fromarray((255 * (plane / plane.max()) ** (1 / 2.2)).astype(np.uint8))
+    bent.save(tmp_path / "bent.jpg", quality=95)
+    chunk = PngInfo()
+    chunk.add(b"gAMA", struct.pack(">I", 45455))
+    bent.save(tmp_path / "bent.png", pnginfo=chunk)
+    worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
+    frames = [good, tmp_path / "bent.jpg", tmp_path / "bent.png", clipped, good]
+    told = [ask(worker, path, n, lens=(85.0, 22.0))["seen"]["doubts"] for n, path in enumerate(frames)]
+    assert told[0] == told[4] == []
+    assert told[1] == ["it is a JPEG: its tones are not linear, which bends carriers and views; take raw files"]
+    assert told[2][0].startswith("its file says that its values have a gamma of 1/2.2: its tones are not linear")
+    assert any("of its pixels are clipped, which bends carriers and views" in one for one in told[3])
 
 
 def test_a_frame_that_tells_nothing_of_the_lens_does_not_tell_for_others(

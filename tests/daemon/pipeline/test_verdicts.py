@@ -28,6 +28,7 @@ from dappled.daemon.pipeline.verdicts import (
     verdict,
 )
 from dappled.decode.geometry import FrameGeometry, Gnss, GroundHeight, Pose, from_euler, image_motion, turned
+from dappled.drivers.raw.raw_file import clipping
 from dappled.flight import Tag
 from tests.daemon.fakes import no_pose
 
@@ -115,6 +116,20 @@ def test_a_finding_has_its_bound_and_its_sentence(facts: FrameFacts, state: str,
     assert found.state == state
     assert word in " ".join(found.reasons)
     assert (state == "good") == (not found.reasons)
+
+
+def test_clipped_pixels_are_told_once_and_judged_by_the_camera_s_own_bounds() -> None:
+    seen = replace(SEEN, clipped_share=0.03)
+    doubts = [words for words in (clipping(0.03), "the mask lies 16 µm off") if words]
+
+    def found(bounds: VerdictBounds) -> tuple[str, ...]:
+        judge, facts = Judge(NADIR, on_gimbal=False), replace(seen, bounds=bounds)
+        for _ in range(5):
+            made = judge.judge(tag(flown()), (0, 0, 0), facts, carriers=(24, 24), doubts=doubts)
+        return made.reasons
+
+    assert found(BOUNDS) == ("3.0% of the pixels are clipped", "the mask lies 16 µm off")
+    assert found(replace(BOUNDS, clipped_usable=0.04)) == ("the mask lies 16 µm off",)
 
 
 def test_bad_goes_before_unknown_and_unknown_before_usable() -> None:

@@ -17,6 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 
 from dappled.drivers.raw import raw_file, reading
 from dappled.drivers.raw.reading import RawFileError, read, read_metadata
@@ -196,7 +197,27 @@ def test_a_jpeg_gives_values_and_exif() -> None:
     image.save(file, "JPEG", exif=details)
     frame = read(file.getvalue())
     assert abs(int(frame.mosaic[3, 3]) - 100) <= 2
-    assert (frame.camera_make, frame.focal_length_mm) == ("Canon", 100.0)
+    assert (frame.camera_make, frame.focal_length_mm, frame.developed) == ("Canon", 100.0, "it is a JPEG")
+
+
+def with_chunk(name: bytes, data: bytes) -> bytes:
+    chunk = PngInfo()
+    chunk.add(name, data)
+    return png(np.full((16, 24), 100, np.uint8), pnginfo=chunk)
+
+
+@pytest.mark.parametrize(
+    ("data", "told"),
+    [
+        (png(np.full((16, 24), 100, np.uint8)), ""),
+        (with_chunk(b"gAMA", (100_000).to_bytes(4, "big")), ""),
+        (with_chunk(b"gAMA", bytes(4)), ""),
+        (with_chunk(b"gAMA", (45_455).to_bytes(4, "big")), "its file says that its values have a gamma of 1/2.2"),
+        (with_chunk(b"sRGB", b"\0"), "its file says that its values are sRGB"),
+    ],
+)
+def test_a_png_may_say_that_its_values_are_not_linear(data: bytes, told: str) -> None:
+    assert read(data).developed == told
 
 
 @pytest.mark.parametrize(

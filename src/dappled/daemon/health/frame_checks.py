@@ -30,7 +30,7 @@ SEEN_SHARE = 0.5
 def check_frame(frame: Path, recipe: Recipe | None) -> list[Check]:
     """The results of all checks of a frame. Raises DappledError for a file that can't be read as a frame."""
     raw = reading.read(frame)
-    found = [_focal_length(raw), _exposure(raw)]
+    found = [_focal_length(raw), *_tones(raw), _exposure(raw)]
     if recipe is None:
         text = "no mask is configured: carriers, focus and motion were not checked (set mask.profile)"
         return [*found, Check("carriers", "caution", text)]
@@ -50,6 +50,12 @@ def _focal_length(raw: RawFile) -> Check:
     return Check(
         "focal length", "go", f"{raw.focal_length_mm:g} mm{aperture}", measured={"focal_length_mm": raw.focal_length_mm}
     )
+
+
+def _tones(raw: RawFile) -> list[Check]:
+    if not raw.developed:
+        return []
+    return [Check("tones", "no-go", f"{raw.developed}: its tones are not linear; set the camera to raw files")]
 
 
 def _exposure(raw: RawFile) -> Check:

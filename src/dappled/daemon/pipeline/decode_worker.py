@@ -101,7 +101,7 @@ class DecodeWorker:
         blob = Blob.of(preview, "preview")
         ms["preview"] = (time.perf_counter() - began) * 1e3
         found, doubts = self._laws.judge(done)
-        doubts += self._lens_doubts(configured, done)
+        doubts += [*done.not_linear, *self._lens_doubts(configured, done)]
         began = time.perf_counter()
         try:
             picture = self._picture(configured, done, np.abs(slices[0]))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
+from dappled.drivers.raw.raw_file import clipping
 from dappled.errors import counted
 from dappled.flight import Tag
 
@@ -268,7 +269,7 @@ class Judge:
             focus_unknown=focus_unknown,
             carriers_found=carriers[0],
             carriers_predicted=carriers[1],
-            doubts=tuple(doubts),
+            doubts=tuple(one for one in doubts if one != clipping(seen.clipped_share)),  # judged by its own bounds
             off_plan=off_plan(tag, self._plan.exposure),
             pose_source=tag.pose.source,
             position_sigma_m=tag.pose.position_sigma_m,

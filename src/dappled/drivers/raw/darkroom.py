@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,9 +18,8 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
-from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.colour_views import dc_views, in_colour
-from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
+from dappled.decode.decoder import Decoder, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
@@ -33,8 +32,9 @@ from dappled.decode.spectrum.lineariser import check_shape, lineariser
 from dappled.decode.spectrum.plane import Places, colour_index, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
+from dappled.drivers.raw.decode_result import DecodeResult
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check_report
-from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, exposure, not_linear, shares_of_white
+from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, exposure, not_linear, shares_of_white
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
@@ -114,55 +114,6 @@ __all__ = [
     "known_to",
     "of_flight",
 ]
-
-
-@dataclass(frozen=True, slots=True)
-class DecodeResult:
-    """A decoded frame, its report and raw file, and how many milliseconds each step took.
-
-    `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubt` is what
-    the calibration itself was in doubt about, `exposed` how the file's values are, `not_linear` why they may not follow
-    the light in the scene, vignetting among it.
-    """
-
-    light_field: LightField
-    report: DecodeReport
-    raw: RawFile
-    exposed: Exposure
-    ms: dict[str, float] = field(default_factory=dict)
-    checked: LawCheck | None = None
-    calibration_doubt: str | None = None
-    not_linear: tuple[str, ...] = ()
-
-    @property
-    def search(self) -> LawSearch | None:
-        """What the frame shows under all laws; None where they were not tried."""
-        return None if self.checked is None else self.checked.search
-
-    @property
-    def contradiction(self) -> str | None:
-        """Why carriers should be visible and are not, or stand elsewhere; None where there is no such reason."""
-        return None if self.checked is None else self.checked.contradiction
-
-    @property
-    def unsettled(self) -> str | None:
-        """What can't be told of the carriers, or is strange about those that are there; None where nothing is."""
-        return None if self.checked is None else self.checked.unsettled
-
-    @property
-    def observable(self) -> bool:
-        """False where no carrier is seen, and none needs to be at this aperture and in this scene."""
-        return self.report.found > 1 or self.contradiction is not None or self.search is None
-
-    @property
-    def carriers_found(self) -> int:
-        """Carriers seen in the whole plane without the mean: those of the half plane and their conjugates."""
-        return 2 * (self.report.found - 1)
-
-    @property
-    def carriers_predicted(self) -> int:
-        """Carriers predicted on the sensor, counted in the same way."""
-        return 2 * (len(self.report.predicted) - 1)
 
 
 class Darkroom:
@@ -257,8 +208,7 @@ class Darkroom:
             bent.append(lost.doubt)
         attributes["falloff"] = None if lost is None else [lost.lost, lost.sigma]
         made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), tuple(bent))
-        doubts = (made.contradiction, made.unsettled, report.doubt, made.calibration_doubt, *bent)
-        attributes["doubts"] = [words for words in doubts if words]
+        attributes["doubts"] = list(made.doubts)
         if self._checks and not made.observable:
             attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))

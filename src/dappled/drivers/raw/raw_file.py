@@ -68,7 +68,7 @@ class RawFile:
     repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
     `balance` are the file's own white balance gains by colour index, green 1. `taken` is the camera's local time
     without a zone, ISO 8601. `focal_sigma_mm` is half of what the file rounds its focal length to. `developed` says
-    that it is a JPEG, whose values a camera or a program has bent.
+    by what it is known that a camera or a program has bent the values, "" where nothing tells.
     """
 
     mosaic: Values
@@ -85,7 +85,7 @@ class RawFile:
     taken: str | None
     balance: tuple[float, ...] | None
     focal_sigma_mm: float | None = None
-    developed: bool = False
+    developed: str = ""
 
     @classmethod
     def of(cls, settings: ExposureSettings, mosaic: Values, **known: Any) -> RawFile:
@@ -161,11 +161,17 @@ def not_linear(raw: RawFile, exposed: Exposure) -> list[str]:
     """Return why a frame's values do not follow the light, in sentences; empty where nothing speaks against it."""
     found = []
     if raw.developed:
-        found.append("it is a JPEG: its tones are not linear, which bends carriers and views; take raw files")
-    clipped = exposed.clipped_share
-    if clipped > MOST_CLIPPED:
-        found.append(f"{clipped:.1%} of its pixels are clipped, which bends carriers and views: expose less")
+        found.append(f"{raw.developed}: its tones are not linear, which bends carriers and views; take raw files")
+    if (clipped := clipping(exposed.clipped_share)) is not None:
+        found.append(clipped)
     return found
+
+
+def clipping(share: float) -> str | None:
+    """Return the doubt about a frame of which this share of pixels is clipped; None for a few."""
+    if not share > MOST_CLIPPED:
+        return None
+    return f"{share:.1%} of its pixels are clipped, which bends carriers and views: expose less"
 
 
 def read_exif(file: BinaryIO) -> ExposureSettings:

@@ -22,7 +22,7 @@ import numpy as np
 import rawpy
 import tifffile
 from numpy.typing import NDArray
-from PIL import UnidentifiedImageError
+from PIL import Image, UnidentifiedImageError
 
 from dappled.bounds.arrays import read_npy
 from dappled.bounds.claims import ClaimError
@@ -35,6 +35,7 @@ __all__ = ["ExposureSettings", "RawFile", "RawFileError", "RawSource", "read", "
 
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _DNG_VERSION, _MAX_SAMPLE = 50706, 281  # TIFF tags
+_LINEAR_FROM = 0.95  # a PNG's gamma: 1 is linear, 0.45455 is usual
 
 
 class RawFileError(DappledError):
@@ -243,7 +244,19 @@ def _read_picture(file: BinaryIO) -> RawFile:
     if values.dtype == np.int32:  # Pillow's mode "I": a 16-bit PNG in some versions
         values = values.astype(np.uint16)
     file.seek(0)
-    return replace(_plain(values, read_exif(file)), developed=image.format == "JPEG")
+    return replace(_plain(values, read_exif(file)), developed=_developed(image))
+
+
+def _developed(image: Image.Image) -> str:
+    """By what a picture is known not to be linear; "" where its file says nothing of the kind."""
+    if image.format == "JPEG":
+        return "it is a JPEG"
+    gamma = image.info.get("gamma")
+    if "srgb" in image.info:
+        return "its file says that its values are sRGB"
+    if gamma is not None and 0 < gamma < _LINEAR_FROM:
+        return f"its file says that its values have a gamma of 1/{1 / gamma:.3g}"
+    return ""
 
 
 def _png_is_deep_colour(file: BinaryIO) -> bool:
