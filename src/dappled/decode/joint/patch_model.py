@@ -239,6 +239,12 @@ def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
     return found
 
 
+def nats_of(whitener: NDArray[np.complex128], white: Complexes | NDArray[np.complex128]) -> Floats:
+    """(F, N) log likelihoods, but for a constant, of patches that the `whitener` (F, A, A) made `white` (F, A, N)."""
+    volume = 2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1)
+    return np.asarray(volume[:, None] - (white.real**2 + white.imag**2).sum(axis=1))
+
+
 def likelihoods(wholes: list[Complexes], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
     """(B, N) log likelihoods of patches (F, A, N) whose slices have these covariances (F, A, A), by frequencies'
     `weights` (F,)."""
@@ -246,10 +252,7 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes, weights: Singles, w
 
     def one(number: int) -> None:
         whitener = whitener_of(wholes[number])
-        white = whitener.astype(np.complex64) @ spectra
-        volume = -2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1)
-        squares = (white.real**2 + white.imag**2).sum(axis=1)
-        found[number] = -(weights @ (volume[:, None] + squares))
+        found[number] = weights @ nats_of(whitener, whitener.astype(np.complex64) @ spectra)
 
     each(one, range(len(wholes)), workers)
     return found

@@ -19,7 +19,7 @@ from scipy import ndimage
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.depth_map import nearest_known
 from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackground
-from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel
+from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, nats_of
 from dappled.decode.joint.patches import Patches
 
 _SMOOTH_PX = 5  # the window of a median: folded detail scatters the depth of single samples
@@ -135,8 +135,7 @@ class _Whitened:
     def of(cls, seen: Complexes, background: PatchBackground, spectra: Complexes) -> _Whitened:
         rows = seen.astype(np.complex128) @ background.whitener.transpose(0, 2, 1)
         white = background.whitener @ spectra
-        volume = 2 * np.log(np.abs(np.diagonal(background.whitener, axis1=1, axis2=2))).sum(axis=1)
-        without = volume[:, None] - (white.real**2 + white.imag**2).sum(axis=1)
+        without = nats_of(background.whitener, white)
         return cls(rows.conj() @ rows.transpose(0, 2, 1), rows.conj() @ white, without)
 
 
