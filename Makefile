@@ -4,6 +4,8 @@ BIN := .venv/bin
 .DEFAULT_GOAL := help
 .PHONY: help setup peers walk docs notebooks clean-room wheel demo test check test-fast coverage test-slow soak faults bench lock deb deb-trial arm64 install uninstall clean
 PREFIX ?= /usr/local
+# Tests start hundreds of processes: where no bytecode may be kept, each of them compiles all modules anew.
+unexport PYTHONDONTWRITEBYTECODE
 # Three tests on two cores: a third of the time of tests is waiting for sockets and processes.
 BESIDE = -n $(shell echo $$(( ($$(nproc) * 3 + 1) / 2 ))) --dist worksteal
 

@@ -66,6 +66,7 @@ def lay_out(honest: dict[str, Path], folder: Path, mutations: int, door: str = "
     return mutations * (1 if door else len(honest))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(600)  # it starts a dozen processes, and others may keep the machine busy
 def test_bombs_and_a_few_mutations_at_every_door(honest: dict[str, Path], tmp_path: Path) -> None:
     count = lay_out(honest, tmp_path / "in", QUICK)

@@ -138,6 +138,7 @@ def test_a_white_or_dark_frame_of_another_size_is_refused(
     assert "694×922" in err
 
 
+@pytest.mark.slow
 def test_a_batch_goes_on_past_bad_frames_and_says_so(
     stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -54,7 +54,7 @@ def _scene(seed: int) -> list[tuple[Texture, float]]:
     ]
 
 
-@pytest.mark.parametrize("stops", [2, 4, 8])
+@pytest.mark.parametrize("stops", [pytest.param(2, marks=pytest.mark.slow), 4, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: int) -> None:
     camera, scene = Camera.hidden(3), _scene(0)
     f_number = stops * FULL_F
@@ -99,7 +99,7 @@ def told_right(
     return request.param, known, _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=FULL_F)
 
 
-@pytest.mark.parametrize("told", [0.67, pytest.param(0.9, marks=pytest.mark.slow), 1.0, 1.5])
+@pytest.mark.parametrize("told", [*(pytest.param(told, marks=pytest.mark.slow) for told in (0.67, 0.9)), 1.0, 1.5])
 def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
     far_out: tuple[Camera, Calibration, Plane], told_right: tuple[bool, Calibration, Decoded], told: float
 ) -> None:
@@ -178,6 +178,7 @@ def stopped() -> tuple[Camera, Plane]:
     return camera, camera.expose(_scene(0), STOPPED_F)
 
 
+@pytest.mark.slow
 def test_a_stopped_down_frame_is_decoded_at_its_own_carriers(stopped: tuple[Camera, Plane]) -> None:
     camera, plane = stopped
     field, report = _decoder().decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=STOPPED_F)

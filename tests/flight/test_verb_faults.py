@@ -56,7 +56,7 @@ def sweep(shim: Path, name: str, place: Path, step: int) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("name", ["offload", "pickup"])
+@pytest.mark.parametrize("name", ["offload", pytest.param("pickup", marks=pytest.mark.slow)])
 def test_some_calls_that_fail_lose_no_frame(shim: Path, place: Path, name: str) -> None:
     found = sweep(shim, name, place, 61)
     assert found["wrong"] == []

@@ -33,8 +33,8 @@ SCALE, BORDER = 0.5, 12
 METRES = (5.0, 10.0, 20.0, 40.0)
 FAR_METRES = (5.0, 10.0, 20.0, 200.0)
 GREEN = 1
-SNRS = [50.0, pytest.param(100.0, marks=pytest.mark.slow)]
-SEEDS = [3, pytest.param(4, marks=pytest.mark.slow)]
+SNRS = [50.0, 100.0]
+SEEDS = [3, 4]
 Floats = NDArray[np.floating]
 
 
@@ -133,6 +133,7 @@ def say(line: str) -> None:
     print(line)  # noqa: T201  figures for people who run with -s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("snr", SNRS)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_bad_pixels(seed: int, snr: float) -> None:
@@ -176,6 +177,7 @@ def _covered(found: Floats, truth: Floats, sigma: Floats) -> float:
     return float(np.mean(np.abs(found - truth)[inside] <= sigma[inside]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("snr", SNRS)
 def test_sigmas_hold_on_a_scene_with_edges_and_a_leaning_board(seed: int, snr: float) -> None:

@@ -32,6 +32,7 @@ def test_carriers_finds_the_published_pitch_untold(letters: Path) -> None:
     assert orders[0, 1]["measured"]["col"] == pytest.approx(orders[0, 1]["col"], abs=0.5)
 
 
+@pytest.mark.slow
 def test_replay_publishes_its_slices_with_the_flight_s_pose(
     letters: Path, shared_data: Path, sockets: Path, tmp_path: Path
 ) -> None:

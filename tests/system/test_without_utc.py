@@ -6,6 +6,8 @@ import time
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from dappled.clock import SystemClock
 from dappled.config.settings import Settings, resolve
 from dappled.daemon.service import Service
@@ -19,6 +21,7 @@ from tests.system.conftest import dappled
 SECOND_NS = 10**9
 
 
+@pytest.mark.slow
 def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
     settings = resolve(Settings())
     settings = replace(

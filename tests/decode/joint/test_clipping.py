@@ -116,6 +116,7 @@ def half_open(request: pytest.FixtureRequest) -> HalfOpen:
     return HalfOpen(scene, plane, np.minimum(plane, np.float32(white)), (plane >= white).astype(np.float32), true)
 
 
+@pytest.mark.slow
 def test_what_clipped_beside_the_masks_dark_places_is_told_by_these(half_open: HalfOpen) -> None:
     """Views are nearly those of a sensor without a white, and slices those of the file."""
     decoder, knows = half_open.decoders()

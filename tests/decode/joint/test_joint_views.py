@@ -161,6 +161,7 @@ def test_few_slices_don_t_blow_rounding_up() -> None:
     assert np.abs(made.views - scene).max() < 0.3
 
 
+@pytest.mark.slow
 def test_clipped_light_that_goes_astray_is_not_taken_for_parallax() -> None:
     """Clipping bends the mask's waves, and at half the ideal aperture weak orders decide how far views differ."""
     scene = RaySum(finest=BAND, snr=100, kappa=0.5, contrast=0.3)

@@ -72,6 +72,7 @@ def test_a_colour_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
         Darkroom(Recipe("auto", "lenslet", cfa="RGGX")).decode(tmp_path / "frame.npy")
 
 
+@pytest.mark.slow
 def test_a_lytro_container_gives_the_same_light_field_as_its_pixels_in_a_png(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "lenslet/lytro_like"
     for name in ("raw", "white"):

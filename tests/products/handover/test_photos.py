@@ -43,6 +43,7 @@ def degrees(parts: Any, sign: str) -> float:
     return (d + m / 60 + s / 3600) * (-1 if sign in "SW" else 1)
 
 
+@pytest.mark.slow
 def test_each_frame_is_a_tiff_and_a_jpeg_and_geo_txt_names_them(photos: Path, short_flight: Flown) -> None:
     for form, suffix in (("tiff", ".tif"), ("jpeg", ".jpg")):
         names = [f"00000{n}{suffix}" for n in range(2)]
@@ -58,6 +59,7 @@ def test_each_frame_is_a_tiff_and_a_jpeg_and_geo_txt_names_them(photos: Path, sh
             assert (yaw, pitch, roll) == pytest.approx((told.yaw_deg, told.pitch_deg, told.roll_deg), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_pictures_hold_the_view_and_its_exif(photos: Path, short_flight: Flown) -> None:
     truth = short_flight.truths[1]
     assert truth.pose is not None
@@ -87,6 +89,7 @@ def test_pictures_hold_the_view_and_its_exif(photos: Path, short_flight: Flown) 
         assert tags[EXIF].value["FNumber"] == (1480, 100) or float(np.divide(*tags[EXIF].value["FNumber"])) == 14.8
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("exiftool") is None, reason="Debian's libimage-exiftool-perl is not here")
 def test_exiftool_reads_exif_and_xmp(photos: Path, short_flight: Flown) -> None:
     for path in (photos / "tiff" / "000001.tif", photos / "jpeg" / "000001.jpg"):
@@ -105,6 +108,7 @@ def test_exiftool_reads_exif_and_xmp(photos: Path, short_flight: Flown) -> None:
             assert found["ExifTool:Validate"] == "0 0 0"
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(shutil.which("exiv2") is None, reason="Debian's exiv2 is not here")
 def test_exiv2_reads_exif_and_xmp(photos: Path) -> None:
     for path in (photos / "tiff" / "000001.tif", photos / "jpeg" / "000001.jpg"):

@@ -80,6 +80,7 @@ def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pyte
     assert sorted(path for path in short_flight.folder.rglob("*")) == before  # the recording is as it was
 
 
+@pytest.mark.slow
 def test_neighbouring_frames_have_one_colour(short_flight: Flown, tmp_path: Path) -> None:
     assert main(words(short_flight, tmp_path, "--each", "--as", "cog")) == 0
     pictures = []
@@ -105,6 +106,7 @@ def common(folder: Path) -> tuple[float, float, float, float]:
     return max(a.left, b.left), max(a.bottom, b.bottom), min(a.right, b.right), min(a.top, b.top)
 
 
+@pytest.mark.slow
 def test_terrain_and_difference(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     more = ["--as", "terrain", "difference", "--against", str(short_flight.folder), "--gsd", "0.05"]
     assert main(words(short_flight, tmp_path, *more)) == 0
@@ -175,6 +177,7 @@ def later_flight(short_flight: Flown, tmp_path: Path) -> Path:
     return begun.folder.path
 
 
+@pytest.mark.slow
 def test_frames_and_control_points_are_the_first_flights_alone(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:
@@ -187,6 +190,7 @@ def test_frames_and_control_points_are_the_first_flights_alone(
     assert (tmp_path / "maps" / "difference.tif").is_file()
 
 
+@pytest.mark.slow
 def test_a_control_point_of_a_frame_that_is_left_out_is_noted(
     short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -218,6 +222,7 @@ def test_a_base_map_elsewhere_leaves_the_recorded_poses(short_flight: Flown, tmp
     assert report["files"] == ["footprints.geojson"]
 
 
+@pytest.mark.slow
 def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:
