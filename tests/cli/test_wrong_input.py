@@ -144,7 +144,7 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 1
     said = capsys.readouterr()
     assert "in doubt: " in said.out
-    assert said.err == "dappled decode: the light field is in doubt, as said; --anyway exits with 0 all the same\n"
+    assert said.err == "dappled decode: written, but in doubt: see above; --anyway accepts that\n"
     assert any(told in doubt for doubt in light_files.load(tmp_path / "f.npz").attributes["doubts"])
     assert main(["decode", *words, "--anyway", "-o", str(tmp_path / "g.npz")]) == 0
     said = capsys.readouterr()
@@ -152,7 +152,7 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     assert said.err == ""
     good = str(dng_of(tmp_path / "good.dng", SHOT, masked))
     assert main(["decode", good, *words, "-o", str(tmp_path / "both")]) == 1
-    assert "1 of 2 frames are in doubt" in capsys.readouterr().err
+    assert "written, but in doubt, 1 of 2 frames: see above" in capsys.readouterr().err
 
 
 def test_the_same_frame_as_it_is_passes_without_a_doubt(masked: NDArray[np.float32], tmp_path: Path) -> None:
@@ -181,3 +181,6 @@ def test_vignetting_is_a_doubt_unless_a_white_frame_takes_it_off(
     assert "its corners" not in capsys.readouterr().out
     attributes = light_files.load(tmp_path / "f.npz").attributes
     assert (attributes["falloff"], attributes["doubts"]) == (None, [])
+    bright = dng_of(tmp_path / "bright.dng", SHOT, np.full(QUARTER.shape, 1.3) * lens)
+    assert main([*words, "--white", str(bright)]) == 1
+    assert "in doubt: white frame: " in capsys.readouterr().out

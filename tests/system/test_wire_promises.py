@@ -111,6 +111,7 @@ def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> N
         assert known.mean() > 0.5
         assert (arrays["sigma"][known] > 0).all()
         assert message.header["method"] == "combined"
+        assert message.header["doubts"] == []
     finally:
         daemon.send_signal(signal.SIGTERM)
         try:

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from dappled.cli import georeference, geotag
 from dappled.cli.arguments import whole
-from dappled.errors import DappledError, counted
+from dappled.errors import DappledError, counted, doubts_of
 from dappled.flight import disk_error, layout
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import KINDS, Done, Job, Manifest
@@ -90,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             for text in write(manifest):
                 refused += 1
                 print(f"dappled batch: {text}", file=sys.stderr)
+        _tell_doubts(manifest, jobs)
     if not jobs:
         raise DappledError("these flights hold no frames")
     if not arguments.json:
@@ -103,7 +104,19 @@ def _report(done: Done, *, as_json: bool) -> None:
         tqdm.write(f"dappled batch: {text}", file=sys.stderr)
     if as_json:
         said = {"flight": done.flight, "frame": done.frame, "error": done.error, "refused": dict(done.refused)}
-        print(json.dumps({**said, "seconds": done.seconds, "files": [one.name for one in done.outputs]}))
+        print(
+            json.dumps(
+                {**said, "doubts": done.doubts, "seconds": done.seconds, "files": [one.name for one in done.outputs]}
+            )
+        )
+
+
+def _tell_doubts(manifest: Manifest, jobs: Sequence[Job]) -> None:
+    """Say what is in doubt about the light fields of each flight."""
+    for flight in dict.fromkeys(job.flight for job in jobs):
+        known = [manifest.done[job.key] for job in jobs if job.flight == flight and job.key in manifest.done]
+        for text in doubts_of((Path(one.frame).stem, one.doubts) for one in known):
+            print(f"dappled batch: {Path(flight).name}: {text}", file=sys.stderr)
 
 
 def _flights(given: Sequence[Path]) -> list[Path]:
@@ -172,8 +185,6 @@ def _lists(manifest: Manifest, placed: Sequence[Placed], jobs: Sequence[Job]) ->
             elif frames:
                 names = [Path(name).stem for name in frames]
                 forms.finish(kind, folder / kind, flight, names)
-                for text in forms.doubts(kind, folder / kind, names):
-                    print(f"dappled batch: {folder / kind}: {text}", file=sys.stderr)
         except OSError as error:
             said.append(str(disk_error("write the lists of", folder / kind, error)))
         except DappledError as error:

@@ -33,7 +33,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
                         help="share of each band with a soft edge, 0 to 1: less ringing, less detail")  # fmt: skip
     parser.add_argument("--anyway", action="store_true",
                         help="write the light field although carriers that must be visible are not, and exit with 0\n"
-                        "although a light field is in doubt")  # fmt: skip
+                        "although what was written is in doubt (otherwise 1)")  # fmt: skip
     add_overwrite(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
@@ -66,8 +66,8 @@ def run(arguments: argparse.Namespace) -> int:
     if bad:
         print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be decoded", file=sys.stderr)
     if doubted and not arguments.anyway:
-        which = "the light field is" if single else f"{doubted} of {counted(len(arguments.frames), 'frame')} are"
-        print(f"dappled decode: {which} in doubt, as said; --anyway exits with 0 all the same", file=sys.stderr)
+        which = "" if single else f", {doubted} of {counted(len(arguments.frames), 'frame')}"
+        print(f"dappled decode: written, but in doubt{which}: see above; --anyway accepts that", file=sys.stderr)
     return 1 if bad or (doubted and not arguments.anyway) else 0
 
 

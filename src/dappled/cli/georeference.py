@@ -126,13 +126,17 @@ def add_placing(parser: argparse.ArgumentParser) -> None:
 def placed(flight: Path, given: Mapping[str, Any], progress: Progress, stack: ExitStack, *,
            watch: Watch | None = None) -> Survey:  # fmt: skip
     """A flight's frames on the map, for other verbs: `given` are arguments of this one, the rest are their defaults.
+    What is in doubt about them is said on standard error.
 
     Raises DappledError.
     """
     parser = argparse.ArgumentParser()
     configure(parser)
     arguments = argparse.Namespace(**{**vars(parser.parse_args([str(flight)])), **given})
-    return _survey(flight, arguments, progress, stack, [], watch=watch)
+    made = _survey(flight, arguments, progress, stack, [], watch=watch)
+    for text in made.doubts:
+        print(text, file=sys.stderr)
+    return made
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -167,7 +171,7 @@ def run(arguments: argparse.Namespace) -> int:
                 missing.append(str(error))
         if arguments.against is not None:
             files += _changes(made, terrain_of, output, arguments, progress=progress, missing=missing)
-    made = replace(made, notes=(*made.notes, *missing))
+    made = replace(made, notes=(*made.notes, *made.doubts, *missing))
     report = map_files.write_report(made, output, files)
     if arguments.json:
         print(report.read_text(), end="")

@@ -14,7 +14,7 @@ from scipy import ndimage
 from dappled.daemon.health.frame_checks import check_frame, sharpness
 from dappled.daemon.health.go_no_go import Check, verdict
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
@@ -58,13 +58,29 @@ def test_a_clipped_frame_is_no_go(tmp_path: Path) -> None:
     assert "expose less" in found["exposure"].text
 
 
-def test_a_jpeg_is_no_go(good: Path, tmp_path: Path) -> None:
+def refuse(*_: object, **__: object) -> None:
+    raise DappledError("it is not looked at")
+
+
+def test_a_jpeg_is_no_go_behind_a_mask(good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "good.jpg"
     values = reading.read(good).mosaic
     Image.fromarray((255 * (values / values.max()) ** (1 / 2.2)).astype(np.uint8)).save(path, quality=95)
-    found = by_name(check_frame(path, None))["tones"]
+    assert by_name(check_frame(path, None))["tones"].state == "caution"
+    monkeypatch.setattr(Darkroom, "decode", refuse)
+    found = by_name(check_frame(path, RECIPE))["tones"]
     assert found.state == "no-go"
     assert found.text == "it is a JPEG: its tones are not linear; set the camera to raw files"
+
+
+def test_what_a_calibration_is_in_doubt_about_is_a_caution(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    decode = Darkroom.decode
+    doubt = "calibration: neither law explains these frames"
+    monkeypatch.setattr(
+        Darkroom, "decode", lambda *words, **names: replace(decode(*words, **names), calibration_doubt=doubt)
+    )
+    found = by_name(check_frame(good, RECIPE))
+    assert (found["doubts"].state, found["doubts"].text) == ("caution", doubt)
 
 
 def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:

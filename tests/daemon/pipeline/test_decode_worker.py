@@ -143,7 +143,7 @@ def test_what_bends_the_tones_of_a_frame_is_a_doubt_about_it(flown: tuple[Recipe
     told = [ask(worker, path, n, lens=(85.0, 22.0))["seen"]["doubts"] for n, path in enumerate(frames)]
     assert told[0] == told[4] == []
     assert told[1] == ["it is a JPEG: its tones are not linear, which bends carriers and views; take raw files"]
-    assert told[2][0].startswith("its file says that its values have a gamma of 1/2.2: its tones are not linear")
+    assert told[2][0].startswith("its gAMA chunk says that its values have a gamma of 1/2.2: its tones are not linear")
     assert any("of its pixels are clipped, which bends carriers and views" in one for one in told[3])
 
 

@@ -24,6 +24,8 @@ from dappled.flight import Cause, Frame, Shot
 from tests.daemon.fakes import FakeCamera, eventually, no_pose
 from tests.schemas import schema
 
+DOUBT = "3.0% of its pixels are clipped"
+
 
 class FakeMaker:
     """Finds the same depth in every frame, or fails."""
@@ -48,7 +50,8 @@ class FakeMaker:
         both = np.zeros((2, 2, 3), dtype=np.float32)
         body.write(both.tobytes())
         arrays = [wire.describe_array(name, both[0], "px") for name in ("disparity", "sigma")]
-        return FrameDepth(body, arrays, [-0.5, 0.5], [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]], "geometric", self.nearest_m)
+        grid = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
+        return FrameDepth(body, arrays, [-0.5, 0.5], grid, "geometric", self.nearest_m, (DOUBT,))
 
 
 def shot(index: int, *, decoded: bool = True) -> PendingShot:
@@ -109,6 +112,7 @@ def test_a_message_as_the_schema_says(bench: Bench) -> None:
     jsonschema.validate(header, schema("depth"))
     arrays = wire.Message("depth", header, body).arrays()
     assert [arrays[name].shape for name in ("disparity", "sigma")] == [(2, 3), (2, 3)]
+    assert header["doubts"] == [DOUBT]
     assert bench.maker.asked == [("frames/3.dng", "contrast")]
 
 

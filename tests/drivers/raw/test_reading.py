@@ -212,12 +212,18 @@ def with_chunk(name: bytes, data: bytes) -> bytes:
         (png(np.full((16, 24), 100, np.uint8)), ""),
         (with_chunk(b"gAMA", (100_000).to_bytes(4, "big")), ""),
         (with_chunk(b"gAMA", bytes(4)), ""),
-        (with_chunk(b"gAMA", (45_455).to_bytes(4, "big")), "its file says that its values have a gamma of 1/2.2"),
-        (with_chunk(b"sRGB", b"\0"), "its file says that its values are sRGB"),
+        (with_chunk(b"gAMA", (45_455).to_bytes(4, "big")), "its gAMA chunk says that its values have a gamma of 1/2.2"),
+        (with_chunk(b"sRGB", b"\0"), "its sRGB chunk says that it was developed"),
     ],
 )
 def test_a_png_may_say_that_its_values_are_not_linear(data: bytes, told: str) -> None:
     assert read(data).developed == told
+
+
+def test_a_jpeg_of_four_colours_is_a_jpeg() -> None:
+    file = io.BytesIO()
+    Image.new("CMYK", (24, 16), (10, 20, 30, 40)).save(file, "JPEG")
+    assert read(file.getvalue()).developed == "it is a JPEG"
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -205,11 +206,10 @@ def listed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         named[f"{flight}/{form}"] = list(names)
         return []
 
-    monkeypatch.setattr(georeference, "decode", lambda *_: None)
+    monkeypatch.setattr(georeference, "decode", lambda *_: SimpleNamespace(doubts=("3.0% of its pixels are clipped",)))
     monkeypatch.setattr(workers, "in_processes", lambda jobs, make, _: map(make, jobs))
     monkeypatch.setattr(forms, "write_frame", written)
     monkeypatch.setattr(forms, "finish", finished)
-    monkeypatch.setattr(forms, "doubts", lambda *_: [])
     return named
 
 
@@ -228,10 +228,13 @@ def test_what_one_form_refuses_the_others_keep(
     assert said.err.splitlines() == [
         *["dappled batch: the time of frames/000000.dng in UTC was never known"] * 2,
         f"dappled batch: {full}",
+        "dappled batch: first: frame 000000 is in doubt: 3.0% of its pixels are clipped",
+        "dappled batch: second: frame 000000 is in doubt: 3.0% of its pixels are clipped",
     ]
     rows = [json.loads(line) for line in said.out.splitlines()]
     assert [sorted(row["refused"]) for row in rows] == [["stac"], [], ["stac"], []]
     assert [len(row["files"]) for row in rows] == [2, 3, 2, 3]
+    assert {tuple(row["doubts"]) for row in rows} == {("3.0% of its pixels are clipped",)}
 
 
 def test_files_of_other_positions_are_made_again(

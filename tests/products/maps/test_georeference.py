@@ -8,6 +8,7 @@ import zipfile
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import laspy
 import numpy as np
@@ -20,7 +21,7 @@ from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
 from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
-from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.flight import Tag, recording
 from dappled.mocks.autopilot.path import TruePose
@@ -46,6 +47,29 @@ def words(flight: Flown, output: Path, *more: str) -> list[str]:
     recipe = flight.recipe
     given = ["--camera", recipe.camera, "--mask", recipe.mask, "--calibration", recipe.calibration]
     return ["georeference", str(flight.folder), "-o", str(output), *given, *more]
+
+
+@pytest.mark.slow
+def test_maps_of_light_fields_in_doubt_say_so(
+    short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each kind of doubt once, with the first frame: in the report of a map, and where a flight is refocused."""
+    decode = Darkroom.decode
+
+    def doubted(*given: Any, **named: Any) -> DecodeResult:
+        made = decode(*given, **named)
+        attributes = {**made.light_field.attributes, "doubts": ["3.0% of its pixels are clipped"]}
+        return replace(made, light_field=replace(made.light_field, attributes=attributes))
+
+    monkeypatch.setattr(Darkroom, "decode", doubted)
+    told = "frame 000000 is in doubt: 3.0% of its pixels are clipped"
+    assert main(words(short_flight, tmp_path / "maps", "--as", "cog")) == 0
+    assert capsys.readouterr().err.splitlines().count(told) == 1
+    assert told in (tmp_path / "maps" / "report.json").read_text()
+    recipe = ["--camera", short_flight.recipe.camera, "--mask", short_flight.recipe.mask]
+    flight = ["--flight", str(short_flight.folder), "--calibration", short_flight.recipe.calibration, *recipe]
+    assert main(["refocus", *flight, "--height", "0", "-o", str(tmp_path / "a.tif")]) == 0
+    assert capsys.readouterr().err.splitlines().count(told) == 1
 
 
 def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

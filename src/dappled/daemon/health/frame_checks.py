@@ -9,15 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.daemon.health.go_no_go import Check
+from dappled.daemon.health.go_no_go import Check, State
 from dappled.daemon.pipeline.verdicts import DIRECTIONS, fineness
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.raw_file import exposure
+from dappled.drivers.raw.raw_file import MOST_CLIPPED, exposure
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
 
-CLIPPED_SHARE = 0.01
 DARK_SHARE = 0.01
 SHARP = {1: 0.31, 2: 0.335}
 """A picture below this fineness has no detail finer than two pixels; keys are the squared length of the step. 0.25 is
@@ -30,7 +29,7 @@ SEEN_SHARE = 0.5
 def check_frame(frame: Path, recipe: Recipe | None) -> list[Check]:
     """The results of all checks of a frame. Raises DappledError for a file that can't be read as a frame."""
     raw = reading.read(frame)
-    found = [_focal_length(raw), *_tones(raw), _exposure(raw)]
+    found = [_focal_length(raw), *_tones(raw, "caution" if recipe is None else "no-go"), _exposure(raw)]
     if recipe is None:
         text = "no mask is configured: carriers, focus and motion were not checked (set mask.profile)"
         return [*found, Check("carriers", "caution", text)]
@@ -39,7 +38,7 @@ def check_frame(frame: Path, recipe: Recipe | None) -> list[Check]:
     except DappledError as error:
         return [*found, Check("carriers", "no-go", f"it can't be decoded: {error}")]
     picture = np.abs(made.light_field.slices[0])
-    return [*found, _carriers(made, recipe), *sharpness(picture)]
+    return [*found, _carriers(made, recipe), *_doubts(made), *sharpness(picture)]
 
 
 def _focal_length(raw: RawFile) -> Check:
@@ -52,17 +51,17 @@ def _focal_length(raw: RawFile) -> Check:
     )
 
 
-def _tones(raw: RawFile) -> list[Check]:
+def _tones(raw: RawFile, state: State) -> list[Check]:
     if not raw.developed:
         return []
-    return [Check("tones", "no-go", f"{raw.developed}: its tones are not linear; set the camera to raw files")]
+    return [Check("tones", state, f"{raw.developed}: its tones are not linear; set the camera to raw files")]
 
 
 def _exposure(raw: RawFile) -> Check:
     exposed = exposure(raw, every=1)
     clipped, mean = exposed.clipped_share, exposed.mean_share
     measured = {"clipped_share": clipped, "mean_share": mean}
-    if clipped > CLIPPED_SHARE:
+    if clipped > MOST_CLIPPED:
         text = f"{clipped:.1%} of the pixels are white: expose less (clipped carriers can't be restored)"
         return Check("exposure", "no-go", text, measured=measured)
     if mean < DARK_SHARE:
@@ -94,6 +93,13 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Check:
         advice = "check mask, profile and focal length; stop down for a test, then `dappled calibrate`"
         return Check("carriers", "no-go", f"{text}: {advice}", measured=measured)
     return Check("carriers", "caution", text, measured=measured)
+
+
+def _doubts(made: DecodeResult) -> list[Check]:
+    """What no other check says: of the calibration, and of carriers that can't be this mask's."""
+    said = made.calibration_doubt, made.contradiction, made.unsettled
+    text = "; ".join(words for words in said if words)
+    return [Check("doubts", "no-go" if made.contradiction else "caution", text)] if text else []
 
 
 def sharpness(picture: NDArray[Any]) -> list[Check]:

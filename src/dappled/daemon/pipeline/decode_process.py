@@ -98,7 +98,8 @@ class DecodedFrame:
 class FrameDepth:
     """Depth of one frame. `body` holds disparity and sigma, float32 (h, w) each, as `arrays` says; `range_px` the 2nd
     and 98th percentile of the known disparities, None where none is known; `grid` as in DecodedFrame. `nearest_m` is
-    the nearest distance and its standard error, None where no calibration leads to metres or too little is known."""
+    the nearest distance and its standard error, None where no calibration leads to metres or too little is known;
+    `doubts` what may be wrong with the frame."""
 
     body: mmap.mmap
     arrays: list[dict[str, Any]]
@@ -106,6 +107,7 @@ class FrameDepth:
     grid: list[list[float]]
     law: str
     nearest_m: tuple[float, float] | None = None
+    doubts: tuple[str, ...] = ()
 
 
 class FrameDecoder(Protocol):
@@ -188,7 +190,9 @@ class DecodeProcess:
         depth = answer.body
         nearest = depth["nearest_m"]
         pair = None if nearest is None else (float(nearest[0]), float(nearest[1]))
-        return FrameDepth(body, depth["arrays"], depth["range_px"], depth["grid"], depth["law"], pair)
+        return FrameDepth(
+            body, depth["arrays"], depth["range_px"], depth["grid"], depth["law"], pair, tuple(depth["doubts"])
+        )
 
     def close(self) -> None:
         """End the worker, also in the middle of a frame, which then is not decoded."""

@@ -57,9 +57,10 @@ class DecodeWorker:
         body = question.body
         if body["do"] == "set up":
             recipe = Recipe.of_values(body["recipe"])
-            self._darkroom = Darkroom(replace(recipe, decided=None, try_laws=False, keep_law=False))
+            plain = replace(recipe, try_laws=False, keep_law=False)
+            self._darkroom = Darkroom(replace(plain, decided=None))
             self._looks = recipe.try_laws and recipe.decided is None
-            self._decided = None if recipe.decided is None else Darkroom(recipe)
+            self._decided = None if recipe.decided is None else Darkroom(plain)
             self._preview_px = body["preview_px"]
             return {}, ()
         assert self._darkroom is not None  # "set up" comes first
@@ -261,6 +262,7 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         "range_px": [float(edge) for edge in np.quantile(known, [0.02, 0.98])] if known.size else None,
         "grid": field.grid.tolist(),
         "law": field.attributes["law"],
+        "doubts": done.doubts,
     }
     return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
 

@@ -87,6 +87,7 @@ class LiveDepth:
             "range_px": found.range_px,
             "grid": found.grid,
             "arrays": found.arrays,
+            "doubts": list(found.doubts),
         }
         self._publisher.publish("depth", header, found.body)
         if found.nearest_m is not None and self._nearest is not None:

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
+from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.colour_views import dc_views, in_colour
-from dappled.decode.decoder import Decoder, MaskDecoder
+from dappled.decode.decoder import Decoder, DecodeReport, MaskDecoder
 from dappled.decode.depth import RANGING
 from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
@@ -32,9 +33,8 @@ from dappled.decode.spectrum.lineariser import check_shape, lineariser
 from dappled.decode.spectrum.plane import Places, colour_index, coloured, find_defects, local_colours, mended, spread
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
-from dappled.drivers.raw.decode_result import DecodeResult
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check_report
-from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, exposure, not_linear, shares_of_white
+from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, exposure, not_linear, shares_of_white
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
@@ -114,6 +114,61 @@ __all__ = [
     "known_to",
     "of_flight",
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class DecodeResult:
+    """A decoded frame, its report and raw file, and how many milliseconds each step took.
+
+    `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubt` is what
+    the calibration itself was in doubt about, `exposed` how the file's values are, `not_linear` why they may not follow
+    the light in the scene, vignetting among it.
+    """
+
+    light_field: LightField
+    report: DecodeReport
+    raw: RawFile
+    exposed: Exposure
+    ms: dict[str, float] = field(default_factory=dict)
+    checked: LawCheck | None = None
+    calibration_doubt: str | None = None
+    not_linear: tuple[str, ...] = ()
+
+    @property
+    def search(self) -> LawSearch | None:
+        """What the frame shows under all laws; None where they were not tried."""
+        return None if self.checked is None else self.checked.search
+
+    @property
+    def contradiction(self) -> str | None:
+        """Why carriers should be visible and are not, or stand elsewhere; None where there is no such reason."""
+        return None if self.checked is None else self.checked.contradiction
+
+    @property
+    def unsettled(self) -> str | None:
+        """What can't be told of the carriers, or is strange about those that are there; None where nothing is."""
+        return None if self.checked is None else self.checked.unsettled
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """All that is in doubt about the frame, a sentence each."""
+        found = (self.contradiction, self.unsettled, self.report.doubt, self.calibration_doubt, *self.not_linear)
+        return tuple(words for words in found if words)
+
+    @property
+    def observable(self) -> bool:
+        """False where no carrier is seen, and none needs to be at this aperture and in this scene."""
+        return self.report.found > 1 or self.contradiction is not None or self.search is None
+
+    @property
+    def carriers_found(self) -> int:
+        """Carriers seen in the whole plane without the mean: those of the half plane and their conjugates."""
+        return 2 * (self.report.found - 1)
+
+    @property
+    def carriers_predicted(self) -> int:
+        """Carriers predicted on the sensor, counted in the same way."""
+        return 2 * (len(self.report.predicted) - 1)
 
 
 class Darkroom:
@@ -202,7 +257,8 @@ class Darkroom:
         }
         with _timed(ms, "exposure"):
             exposed = exposure(raw)
-        bent = not_linear(raw, exposed) if isinstance(decoder, MaskDecoder) else []
+        bent = not_linear(raw, exposed, masked=isinstance(decoder, MaskDecoder))
+        bent += self._lineariser.doubts
         lost = self.lost_at_corners(light_field) if views else None
         if lost is not None and lost.doubt is not None:
             bent.append(lost.doubt)
@@ -323,10 +379,12 @@ def _timed(ms: dict[str, float], what: str) -> Iterator[None]:
 
 
 class FrameLineariser:
-    """Makes frames of one recipe linear. Keeps what every frame needs: dark and white frame, defects, gains."""
+    """Makes frames of one recipe linear. Keeps what every frame needs: dark and white frame, defects, gains; `doubts`
+    are those about the white frame."""
 
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
+        self.doubts: list[str] = []
         self._dark: NDArray[Any] | None = None
         self._defects: Places | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
@@ -360,7 +418,7 @@ class FrameLineariser:
         """Return the plane's linear rows, and with `colour` what makes their light field's views coloured."""
         raw = override(raw, self._recipe)
         lenslets = self._recipe.mask == profiles.LENSLET
-        cfa, black = _one_index_a_colour(raw)
+        cfa, black = raw.colour_pattern()
         balance = None if cfa is None or not lenslets else self._white_balance()
         dark = self._dark_frame()
         if dark is not None and dark.shape == raw.mosaic.shape:
@@ -410,11 +468,16 @@ class FrameLineariser:
     def _white_balance(self) -> NDArray[np.float64] | None:
         """Return the gains that make the white frame grey; None without one."""
         if self._recipe.white and self._balance is None:
-            raw = read(self._recipe.white, self._recipe)
-            cfa, black = _one_index_a_colour(raw)
+            raw = self._white_frame()
+            cfa, black = raw.colour_pattern()
             if cfa is not None:
                 self._balance = planes.estimate_balance(raw.mosaic, black=black, cfa=cfa)
         return self._balance
+
+    def _white_frame(self) -> RawFile:
+        raw, masked = read(self._recipe.white, self._recipe), self._recipe.mask != profiles.LENSLET
+        self.doubts = [f"white frame: {words}" for words in not_linear(raw, exposure(raw), masked=masked)]
+        return raw
 
     def _dark_frame(self) -> NDArray[Any] | None:
         if self._recipe.dark and self._dark is None:
@@ -423,9 +486,9 @@ class FrameLineariser:
 
     def _gain(self, shape: tuple[int, int]) -> Plane:
         if shape not in self._gains:
-            raw = read(self._recipe.white, self._recipe)
+            raw = self._white_frame()
             with naming(self._recipe.white):
-                cfa, black = _one_index_a_colour(raw)
+                cfa, black = raw.colour_pattern()
                 white = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa)
                 self._gains[shape] = planes.white_gain(white, cell_px=math.sqrt(white.size) / 32)
         return self._gains[shape]
@@ -434,17 +497,3 @@ class FrameLineariser:
 def _by_shares(shares: NDArray[np.float32], shape: tuple[int, ...]) -> Painter:
     """Colours of frames behind lenslets: local ones, the same for all views of a place."""
     return lambda field: coloured(field.views, field.grid, shares, shape)
-
-
-def _one_index_a_colour(raw: RawFile) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:
-    """Return colour pattern and black levels, with both greens as one colour where their black levels agree.
-
-    LibRaw gives a Bayer pattern's second green an index of its own; it is then no longer the commonest colour.
-    """
-    if raw.cfa is None:
-        return None, raw.black
-    levels = raw.black if isinstance(raw.black, tuple) else (raw.black,) * len(raw.colour_names)
-    first = [raw.colour_names.index(name) for name in raw.colour_names]
-    if any(levels[index] != levels[one] for index, one in enumerate(first)):
-        return raw.cfa, raw.black
-    return np.array(first, dtype=np.int64)[raw.cfa], raw.black

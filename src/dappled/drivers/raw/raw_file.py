@@ -128,6 +128,19 @@ class RawFile:
             self.focal_sigma_mm,
         )
 
+    def colour_pattern(self) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:
+        """Return colour pattern and black levels, with both greens as one colour where their black levels agree.
+
+        LibRaw gives a Bayer pattern's second green an index of its own; it is then no longer the commonest colour.
+        """
+        if self.cfa is None:
+            return None, self.black
+        levels = self.black if isinstance(self.black, tuple) else (self.black,) * len(self.colour_names)
+        first = [self.colour_names.index(name) for name in self.colour_names]
+        if any(levels[index] != levels[one] for index, one in enumerate(first)):
+            return self.cfa, self.black
+        return np.array(first, dtype=np.int64)[self.cfa], self.black
+
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
@@ -157,12 +170,13 @@ def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
     return Exposure(shares, clipped, float(np.mean(share)), black)
 
 
-def not_linear(raw: RawFile, exposed: Exposure) -> list[str]:
-    """Return why a frame's values do not follow the light, in sentences; empty where nothing speaks against it."""
+def not_linear(raw: RawFile, exposed: Exposure, *, masked: bool = True) -> list[str]:
+    """Return why a frame's values do not follow the light, in sentences; empty where nothing speaks against it. Behind
+    lenslets, not `masked`, what is clipped spoils its own place alone."""
     found = []
     if raw.developed:
         found.append(f"{raw.developed}: its tones are not linear, which bends carriers and views; take raw files")
-    if (clipped := clipping(exposed.clipped_share)) is not None:
+    if masked and (clipped := clipping(exposed.clipped_share)) is not None:
         found.append(clipped)
     return found
 

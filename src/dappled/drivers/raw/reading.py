@@ -234,6 +234,7 @@ def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
 def _read_picture(file: BinaryIO) -> RawFile:
     """Read a PNG or a JPEG. Raises what Pillow raises, and ValueError for one that holds no frame."""
     image = open_picture(file)
+    developed = _developed(image)
     if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
         raise ValueError("it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG")
     if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
@@ -244,7 +245,7 @@ def _read_picture(file: BinaryIO) -> RawFile:
     if values.dtype == np.int32:  # Pillow's mode "I": a 16-bit PNG in some versions
         values = values.astype(np.uint16)
     file.seek(0)
-    return replace(_plain(values, read_exif(file)), developed=_developed(image))
+    return replace(_plain(values, read_exif(file)), developed=developed)
 
 
 def _developed(image: Image.Image) -> str:
@@ -253,9 +254,9 @@ def _developed(image: Image.Image) -> str:
         return "it is a JPEG"
     gamma = image.info.get("gamma")
     if "srgb" in image.info:
-        return "its file says that its values are sRGB"
+        return "its sRGB chunk says that it was developed"
     if gamma is not None and 0 < gamma < _LINEAR_FROM:
-        return f"its file says that its values have a gamma of 1/{1 / gamma:.3g}"
+        return f"its gAMA chunk says that its values have a gamma of 1/{1 / gamma:.3g}"
     return ""
 
 

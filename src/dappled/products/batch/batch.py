@@ -84,7 +84,7 @@ class BatchOutput:
 @dataclass(frozen=True, slots=True)
 class Done:
     """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'.
-    `refused` says why a kind was not made where others were or could have been."""
+    `refused` says why a kind was not made where others were or could have been; `doubts` are the light field's."""
 
     key: str
     flight: str
@@ -95,6 +95,7 @@ class Done:
     cpu_seconds: float
     peak_mb: float
     refused: Mapping[str, str] = field(default_factory=dict)
+    doubts: tuple[str, ...] = ()
 
     def lacks(self, kind: str) -> bool:
         """Whether this kind was not made."""
@@ -172,8 +173,10 @@ def make(job: Job) -> Done:
     began, cpu = time.monotonic(), time.process_time()
     outputs: list[BatchOutput] = []
     refused: dict[str, str] = {}
+    doubts: tuple[str, ...] = ()
     try:
         making = _making(job)
+        doubts = making.decoded.doubts
         for kind in job.kinds:
             try:
                 outputs += making.made(kind)
@@ -184,7 +187,7 @@ def make(job: Job) -> Done:
         error = _why(job, caught)
     seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
     name = Path(job.flight).name
-    return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused)
+    return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused, doubts)
 
 
 def _why(job: Job, error: Exception) -> str:
@@ -431,8 +434,9 @@ class Manifest:
 
 def _done(row: dict[str, Any]) -> Done:
     """Raises ValueError, TypeError and KeyError."""
-    done = Done(**{**row, "outputs": tuple(BatchOutput(**one) for one in row["outputs"])})
-    if not all(isinstance(name, str) for name in (done.key, *(one.name for one in done.outputs))):
+    outputs = tuple(BatchOutput(**one) for one in row["outputs"])
+    done = Done(**{**row, "outputs": outputs, "doubts": tuple(row.get("doubts", ()))})
+    if not all(isinstance(name, str) for name in (done.key, *done.doubts, *(one.name for one in done.outputs))):
         raise TypeError("a name is not text")
     if not isinstance(done.refused, dict):
         raise TypeError("what was refused is not told by kind")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
-from dappled.products.handover import colmap, mcap_file, nerfstudio, stac, view_cameras, view_files
+from dappled.products.handover import colmap, mcap_file, nerfstudio, stac, view_files
 from dappled.products.maps import cog, georeference
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Options
@@ -53,13 +53,6 @@ def write_frame(form: str, folder: Path, frame: HandedFrame) -> list[Path]:
         frame.flight, [one], [], projection=frame.projection, level_m=frame.level_m, options=options
     )
     return stac.write_item(folder, survey, one, station, gain=cog.gain_of([one.image]), utc_ns=frame.utc_ns)
-
-
-def doubts(form: str, folder: Path, names: Sequence[str]) -> list[str]:
-    """What is strange about the light fields of these frames, a sentence each. Raises ViewCameraError."""
-    if form not in _RIGS:
-        return []
-    return view_cameras.doubts_of(view_files.read_frames(folder, names))
 
 
 def finish(form: str, folder: Path, flight: str, names: Sequence[str]) -> list[Path]:

@@ -17,7 +17,7 @@ import numpy as np
 from dappled.bounds.parsing import parse_json
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import camera_pose
-from dappled.errors import DappledError, without_numbers
+from dappled.errors import DappledError, doubts_of
 from dappled.products.maps.eye import through
 from dappled.products.maps.photographs import Photograph, Station
 
@@ -260,13 +260,7 @@ def provisos(frames: Sequence[FrameCameras]) -> list[str]:
             "the lens was taken as focused at infinity: focused at F metres, each view's principal point is off by its "
             "distance from the middle view (m) times the focal length (px) / F (give it with --focus)"
         )
-    return [*said, *doubts_of(frames)]
-
-
-def doubts_of(frames: Sequence[FrameCameras]) -> list[str]:
-    """What is strange about the light fields, a sentence each, with the first frame that it was said of."""
-    first = {without_numbers(text): (text, one.name) for one in reversed(frames) for text in one.doubts}
-    return [f"frame {name} is in doubt: {text}" for text, name in first.values()]
+    return [*said, *doubts_of((one.name, one.doubts) for one in frames)]
 
 
 def world_of(frames: Sequence[FrameCameras]) -> LocalAxes:

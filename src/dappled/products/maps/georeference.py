@@ -13,7 +13,7 @@ import numpy as np
 
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.errors import DappledError
+from dappled.errors import DappledError, doubts_of
 from dappled.flight import FlightFolder, Frame, Tag
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
@@ -73,6 +73,11 @@ class Survey:
     notes: tuple[str, ...] = ()
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
     lens: FlightLens | None = None
+
+    @property
+    def doubts(self) -> list[str]:
+        """What is in doubt about the photographs' light fields, a sentence each."""
+        return doubts_of((one.name, one.doubts) for one in self.photographs)
 
     def tags(self) -> dict[str, str]:
         """The metadata of map files."""
