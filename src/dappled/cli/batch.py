@@ -104,11 +104,8 @@ def _report(done: Done, *, as_json: bool) -> None:
         tqdm.write(f"dappled batch: {text}", file=sys.stderr)
     if as_json:
         said = {"flight": done.flight, "frame": done.frame, "error": done.error, "refused": dict(done.refused)}
-        print(
-            json.dumps(
-                {**said, "doubts": done.doubts, "seconds": done.seconds, "files": [one.name for one in done.outputs]}
-            )
-        )
+        files = [one.name for one in done.outputs]
+        print(json.dumps({**said, "doubts": done.doubts, "seconds": done.seconds, "files": files}))
 
 
 def _tell_doubts(manifest: Manifest, jobs: Sequence[Job]) -> None:

@@ -177,7 +177,7 @@ class OpenedLightField(Refocusable):
     @property
     def doubts(self) -> tuple[str, ...]:
         """What is in doubt about the light field, a sentence each."""
-        return tuple(map(str, self.attributes.get("doubts") or ()))
+        return self.field.doubts
 
     @cached_property
     def stack(self) -> ViewStack:

@@ -44,6 +44,11 @@ class LightField:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     view_sigma: NDArray[np.float32] | None = None
 
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What may be wrong with it, a sentence each; files of older versions name none."""
+        return tuple(map(str, self.attributes.get("doubts") or ()))
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewStack:

@@ -188,10 +188,9 @@ def photograph(
         image = np.ascontiguousarray(field.views[v, u])
         y, x = field.view_offsets[v, u] * aperture_of(station, field).width_m
         eye = through(eye, (float(y), float(x)), focus_m)
-    doubts = tuple(map(str, field.attributes.get("doubts") or ()))
     sigmas = _sigmas(station.tag.pose)
     return Photograph(
-        station.name, station.tag.utc_ns, image, eye, *sigmas, field.grid, views, apertures, aperture, doubts,
+        station.name, station.tag.utc_ns, image, eye, *sigmas, field.grid, views, apertures, aperture, field.doubts,
         lens_of(profile, _focal_length_mm(station, field), focus_m),
     )  # fmt: skip
 
