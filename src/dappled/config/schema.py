@@ -31,7 +31,7 @@ class ConfigError(DappledError):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Finding:
+class BadSetting:
     """One thing that is wrong in a file: a sentence with the place, and the table and key that it is about."""
 
     table: str
@@ -39,7 +39,7 @@ class Finding:
     text: str
 
 
-def refuse(findings: Sequence[Finding]) -> None:
+def refuse(findings: Sequence[BadSetting]) -> None:
     """Raise ConfigError with all sentences where there are any."""
     if findings:
         raise ConfigError("\n".join(finding.text for finding in findings))
@@ -121,7 +121,9 @@ def build(cls: type[Record], table: Mapping[str, Any], source: TomlSource, name:
     return record
 
 
-def examine(cls: type[Record], table: Mapping[str, Any], source: TomlSource, name: str) -> tuple[Record, list[Finding]]:
+def examine(
+    cls: type[Record], table: Mapping[str, Any], source: TomlSource, name: str
+) -> tuple[Record, list[BadSetting]]:
     """Build the record `cls` from what is right in a table, and say what is wrong: there the default stands.
 
     Raises ConfigError where a key is missing that has no default.
@@ -133,7 +135,7 @@ def examine(cls: type[Record], table: Mapping[str, Any], source: TomlSource, nam
         if key not in fields:
             near = difflib.get_close_matches(key, fields, 1, 0.4)
             hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(fields)}"
-            findings.append(Finding(name, key, f"{source.where(name, key)} is not a known key; {hint}"))
+            findings.append(BadSetting(name, key, f"{source.where(name, key)} is not a known key; {hint}"))
     values = {}
     for key, field in fields.items():
         if key not in table:
@@ -144,7 +146,7 @@ def examine(cls: type[Record], table: Mapping[str, Any], source: TomlSource, nam
         try:
             values[key] = _convert(table[key], hints[key], rule, f"{source.where(name, key)}")
         except ConfigError as error:
-            findings.append(Finding(name, key, str(error)))
+            findings.append(BadSetting(name, key, str(error)))
     return cls(**values), findings
 
 

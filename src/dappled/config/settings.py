@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.config.schema import Finding, Rule, TomlSource, examine, read_toml, refuse, setting
+from dappled.config.schema import BadSetting, Rule, TomlSource, examine, read_toml, refuse, setting
 
 DEPTH_METHODS = ("contrast", "combined")
 SIMULATED_FLIGHTS = Path("flights")  # where `dappled run --simulate` records without a file
@@ -281,7 +281,7 @@ class SettingsFile:
 
     settings: Settings
     source: TomlSource
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[BadSetting, ...] = ()
 
 
 def load(path: Path | None) -> Settings:
@@ -319,19 +319,19 @@ def _other_kind(tables: Mapping[str, Any]) -> str:
     return ""
 
 
-def _examine_tables(tables: Mapping[str, Any], source: TomlSource) -> tuple[Settings, list[Finding]]:
+def _examine_tables(tables: Mapping[str, Any], source: TomlSource) -> tuple[Settings, list[BadSetting]]:
     if other := _other_kind(tables):
-        return Settings(), [Finding("", "", f"{source.name} is {other}")]
+        return Settings(), [BadSetting("", "", f"{source.name} is {other}")]
     records: dict[str, Any] = {}
-    findings: list[Finding] = []
+    findings: list[BadSetting] = []
     for name, table in tables.items():
         if name not in TABLES:
             near = difflib.get_close_matches(name, TABLES, 1, 0.4)
             hint = f"did you mean [{near[0]}]?" if near else f"known: {', '.join(TABLES)}"
-            findings.append(Finding(name, "", f"{source.where('', name)} is not a known table; {hint}"))
+            findings.append(BadSetting(name, "", f"{source.where('', name)} is not a known table; {hint}"))
         elif not isinstance(table, Mapping):
             text = f"{source.where('', name)} must be a table: write [{name}] on a line of its own"
-            findings.append(Finding(name, "", text))
+            findings.append(BadSetting(name, "", text))
         else:
             records[name], more = examine(TABLES[name], table, source, name)
             findings += more

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.config import profiles
-from dappled.config.schema import ConfigError, Finding, refuse
+from dappled.config.schema import BadSetting, ConfigError, refuse
 from dappled.config.settings import TABLES, Settings, SettingsFile
 from dappled.daemon.console import placement
 from dappled.daemon.console import process as console_process
@@ -64,7 +64,7 @@ def _of_another(file: Path) -> bool:
         return False
 
 
-def findings(file: SettingsFile, *, by_this_user: bool = True, starting: bool = False) -> list[Finding]:
+def findings(file: SettingsFile, *, by_this_user: bool = True, starting: bool = False) -> list[BadSetting]:
     """What is wrong in a settings file: what can't be read, and what can't work. A rule that reads a setting which is
     wrong already is left out; where another user may run the daemon, a rule that depends on the user; and for a daemon
     that is `starting`, one whose subject may come."""
@@ -93,12 +93,12 @@ def checked(file: SettingsFile, *, by_this_user: bool = True, starting: bool = F
     return file.settings
 
 
-def _finding(file: SettingsFile, place: str, text: str) -> Finding:
+def _finding(file: SettingsFile, place: str, text: str) -> BadSetting:
     """A finding at the setting that the sentence names, if the file has it; else at `place`."""
     table, _, key = place.partition(".")
     named = (match[2] for match in _KEY.finditer(text) if match[1] == table)
     key = next((name for name in named if file.source.has(table, name)), key)
-    return Finding(table, key, f"{file.source.where(table, key)}: {text}")
+    return BadSetting(table, key, f"{file.source.where(table, key)}: {text}")
 
 
 def _links(settings: Settings) -> None:

@@ -13,7 +13,7 @@ from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.errors import sentence, without_numbers
 
-Level = Literal["info", "warning"]
+LineLevel = Literal["info", "warning"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +22,7 @@ class LogLine:
 
     number: int
     utc_ns: int
-    level: Level
+    level: LineLevel
     text: str
 
 
@@ -36,7 +36,7 @@ class Logbook(logging.Handler):
         self._guard = threading.Lock()
         self._count = 0
 
-    def add(self, text: str, level: Level = "info") -> None:
+    def add(self, text: str, level: LineLevel = "info") -> None:
         """Add a line; the oldest is removed when the logbook is full. The same line twice in a row is kept once."""
         with self._guard:
             if self._lines and self._lines[-1].text == text:
@@ -74,7 +74,7 @@ class NewProblems:
         return [text for text in problems if again or without_numbers(text) not in known]
 
 
-def of_shot(pending: PendingShot) -> tuple[str, Level]:
+def of_shot(pending: PendingShot) -> tuple[str, LineLevel]:
     """The line that says how a shot ended, and its level."""
     who = f"frame {pending.shot.index}" if pending.frame else f"shot {pending.shot.index}"
     if pending.problem:

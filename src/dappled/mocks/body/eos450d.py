@@ -24,7 +24,7 @@ from dappled.clock import Clock
 from dappled.mocks.body import ptp
 from dappled.mocks.body.eos_card import CARD_BYTES, FOLDER, STORAGE, Card, StoredObject
 from dappled.mocks.body.faults import BodyFaults
-from dappled.mocks.body.ptp import Code, EosEvent, Format, Handler, Op, PtpRequest, PtpResponse
+from dappled.mocks.body.ptp import EosEvent, Format, Handler, Op, PtpRequest, PtpResponse, ResponseCode
 from dappled.workers import Loop
 
 Expose: TypeAlias = Callable[[int, int], tuple[bytes, str]]
@@ -99,7 +99,7 @@ class Eos450d:
     def contact(self) -> bool:
         """Close the contact of the remote socket: an exposure, with or without a link. False if there is none."""
         with self._lock:
-            return self._release(PtpRequest(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == Code.OK
+            return self._release(PtpRequest(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == ResponseCode.OK
 
     def turn(self, what: str, value: int) -> None:
         """A hand turns something at the body, or something in it runs low; it announces that. Raises ValueError."""
@@ -116,10 +116,10 @@ class Eos450d:
         """The body's answer to one transaction; `data` is what came with it."""
         handler = self._handlers.get(request.code)
         if handler is None:
-            return PtpResponse(Code.OPERATION_NOT_SUPPORTED)
+            return PtpResponse(ResponseCode.OPERATION_NOT_SUPPORTED)
         with self._lock:
             if not self._session and request.code not in (Op.GET_DEVICE_INFO, Op.OPEN_SESSION):
-                return PtpResponse(Code.SESSION_NOT_OPEN)
+                return PtpResponse(ResponseCode.SESSION_NOT_OPEN)
             return handler(request, data)
 
     # --- identity and session
@@ -148,11 +148,11 @@ class Eos450d:
             return PtpResponse(data=struct.pack("<HHB", prop, 0xFFFF, 0) + value + value + b"\0")
         if prop == 0xD407:
             return PtpResponse(data=struct.pack("<HHBIIB", prop, 6, 0, 1, 1, 0))
-        return PtpResponse(Code.DEVICE_PROP_NOT_SUPPORTED)
+        return PtpResponse(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
 
     def _open(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         if self._session:
-            return PtpResponse(Code.SESSION_ALREADY_OPEN)
+            return PtpResponse(ResponseCode.SESSION_ALREADY_OPEN)
         self._session = True
         return PtpResponse()
 
@@ -168,14 +168,14 @@ class Eos450d:
     def _release(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         triggered_ns = self._clock.monotonic_ns()
         if self._working or self._faults.lasts("busy"):
-            return PtpResponse(Code.DEVICE_BUSY)
+            return PtpResponse(ResponseCode.DEVICE_BUSY)
         if self._faults.take("error"):
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         to_memory = self._properties.to_memory
         full = not to_memory and (self._card.full or self._faults.lasts("full"))
         if full or not self._properties.shots_left:
             # A real body says OK and parameter 7, which libgphoto2 reads over USB only: its PTP/IP drops parameters.
-            return PtpResponse(Code.STORE_FULL)
+            return PtpResponse(ResponseCode.STORE_FULL)
         self._working = True
         self._releases += 1
         self._properties.announce(ptp.eos_status(1))
@@ -186,9 +186,9 @@ class Eos450d:
 
     def _viewfinder(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
         if not self._properties.shows_viewfinder:
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         if self._working:
-            return PtpResponse(Code.DEVICE_BUSY)
+            return PtpResponse(ResponseCode.DEVICE_BUSY)
         self._looks += 1
         picture = chart(self._looks)
         return PtpResponse(data=struct.pack("<II", 8 + len(picture), _VIEWFINDER_JPEG) + picture)
@@ -396,23 +396,23 @@ class Properties:
     def _request(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         prop = request.parameter(0)
         if prop not in self._values:
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         self.announce(ptp.eos_property(prop, self._values[prop]))
         return PtpResponse()
 
     def _set(self, _request: PtpRequest, data: bytes) -> PtpResponse:
         if len(data) < 12:
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         _size, prop = struct.unpack_from("<II", data)
         if prop not in self._values:
-            return PtpResponse(Code.DEVICE_PROP_NOT_SUPPORTED)
+            return PtpResponse(ResponseCode.DEVICE_PROP_NOT_SUPPORTED)
         value = data[8:]
         if prop in _BY_HAND:
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         if prop in _CHOICES and struct.unpack_from("<I", value)[0] not in _CHOICES[Prop(prop)]:
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         if prop == Prop.IMAGE_FORMAT and value not in map(_words, _FORMATS):
-            return PtpResponse(Code.GENERAL_ERROR)
+            return PtpResponse(ResponseCode.GENERAL_ERROR)
         self._put(prop, value)
         if prop == Prop.CAPTURE_DESTINATION:
             self._put(Prop.AVAILABLE_SHOTS, _u32(0 if self.to_memory else 100))

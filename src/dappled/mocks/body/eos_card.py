@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from dappled.mocks.body import ptp
 from dappled.mocks.body.faults import BodyFaults
-from dappled.mocks.body.ptp import Code, Format, Handler, Op, PtpRequest, PtpResponse
+from dappled.mocks.body.ptp import Format, Handler, Op, PtpRequest, PtpResponse, ResponseCode
 
 CARD_BYTES = 512 << 20
 """Room for about a hundred small frames: the card is in this process' memory."""
@@ -111,7 +111,7 @@ class Card:
     def _info(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.get(request.parameter(0))
         if found is None:
-            return PtpResponse(Code.INVALID_OBJECT_HANDLE)
+            return PtpResponse(ResponseCode.INVALID_OBJECT_HANDLE)
         return PtpResponse(
             data=ptp.object_info(
                 storage=STORAGE,
@@ -134,13 +134,13 @@ class Card:
     def _whole(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.get(request.parameter(0))
         if found is None:
-            return PtpResponse(Code.INVALID_OBJECT_HANDLE)
+            return PtpResponse(ResponseCode.INVALID_OBJECT_HANDLE)
         return PtpResponse(data=self._sent(found, 0, len(found.data)))
 
     def _part(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.get(request.parameter(0))
         if found is None:
-            return PtpResponse(Code.INVALID_OBJECT_HANDLE)
+            return PtpResponse(ResponseCode.INVALID_OBJECT_HANDLE)
         piece = self._sent(found, request.parameter(1), request.parameter(2))
         return PtpResponse(parameters=(len(piece),), data=piece)
 
@@ -151,11 +151,11 @@ class Card:
         return memoryview(found.data)[offset:end]
 
     def _no_thumb(self, _request: PtpRequest, _data: bytes) -> PtpResponse:
-        return PtpResponse(Code.NO_THUMBNAIL_PRESENT)
+        return PtpResponse(ResponseCode.NO_THUMBNAIL_PRESENT)
 
     def _delete(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         found = self._objects.pop(request.parameter(0), None)
-        return PtpResponse(Code.INVALID_OBJECT_HANDLE) if found is None else PtpResponse()
+        return PtpResponse(ResponseCode.INVALID_OBJECT_HANDLE) if found is None else PtpResponse()
 
     def _transferred(self, request: PtpRequest, _data: bytes) -> PtpResponse:
         """The file has been fetched: free its memory."""

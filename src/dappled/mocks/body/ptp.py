@@ -76,7 +76,7 @@ WITH_DATA_OUT = frozenset({Op.SET_DEVICE_PROP_VALUE, Op.EOS_SET_DEVICE_PROP_VALU
 """Operations whose data come from the initiator; libgphoto2 doesn't say so in the request's data phase field."""
 
 
-class Code(IntEnum):
+class ResponseCode(IntEnum):
     """Response codes."""
 
     OK = 0x2001
@@ -133,7 +133,7 @@ class PtpRequest:
 class PtpResponse:
     """What a body says to a request: response code, response parameters, data (None: no data phase)."""
 
-    code: int = Code.OK
+    code: int = ResponseCode.OK
     parameters: tuple[int, ...] = ()
     data: bytes | memoryview | None = None
 

@@ -1,0 +1,149 @@
+"""What was found, as values: code, level, what it is about, and facts; `findings.toml` has the words of each code.
+
+Two findings are of one kind when code and subject are equal, whatever their numbers. Only this module builds their
+sentences; no code reads a sentence back.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum, StrEnum
+from importlib import resources
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias
+
+Value: TypeAlias = str | int | float | bool | None
+_NO_FACTS: Mapping[str, Value] = MappingProxyType({})
+
+
+class Level(IntEnum):
+    """How much a finding weighs. Above `NOTE` nothing is "go", and a result is in doubt."""
+
+    NOTE = 0
+    CAUTION = 1
+    STOP = 2
+
+    @property
+    def word(self) -> str:
+        """The level as JSON holds it."""
+        return self.name.lower()
+
+
+class Code(StrEnum):
+    """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""
+
+    CARD_CHANGED = "card.changed"
+    FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
+    FRAME_RIVAL_SHOTS = "frame.rival_shots"
+    LINK_SAME_IDS = "link.same_ids"
+    PICTURE_ON_CARD = "picture.on_card"
+    TIME_WEEK_ROLLOVER = "time.week_rollover"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Subject:
+    """What a finding is about: a kind (flight, frame, shot, picture, file, link, log, argument, service) and which one.
+
+    >>> str(Subject("frame", 42)), str(Subject("flight"))
+    ('frame 42', 'flight')
+    """
+
+    kind: str
+    which: str | int = ""
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.which}" if self.which != "" else self.kind
+
+
+@dataclass(frozen=True, slots=True)
+class Wording:
+    """How a code is told: its sentence with {facts}, what to do, and the page of the documents."""
+
+    level: Level
+    sentence: str
+    remedy: str = ""
+    page: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing found. `facts` have their unit in the key (`sigma_ms`) and stand as JSON."""
+
+    code: Code
+    subject: Subject
+    facts: Mapping[str, Value] = field(default_factory=lambda: _NO_FACTS)
+    level: Level = Level.NOTE
+
+    def __hash__(self) -> int:
+        return hash((self.code, self.subject))
+
+    @property
+    def kind(self) -> tuple[Code, Subject]:
+        """What makes two findings the same, whatever their numbers."""
+        return self.code, self.subject
+
+    def to_json(self) -> dict[str, Any]:
+        """The finding as ledger, wire and `--json` hold it."""
+        return {
+            "code": self.code.value,
+            "level": self.level.word,
+            "subject": {"kind": self.subject.kind, "which": self.subject.which},
+            "facts": dict(self.facts),
+        }
+
+    @classmethod
+    def from_json(cls, row: Mapping[str, Any]) -> Self:
+        """What `to_json` made. Raises KeyError or ValueError where a part is missing or unknown."""
+        about = row["subject"]
+        return cls(
+            Code(row["code"]),
+            Subject(str(about["kind"]), about["which"]),
+            dict(row["facts"]),
+            Level[str(row["level"]).upper()],
+        )
+
+
+def finding(code: Code, subject: Subject, level: Level | None = None, **facts: Value) -> Finding:
+    """A finding with its code's own level, unless another is given."""
+    return Finding(code, subject, facts, WORDS[code].level if level is None else level)
+
+
+def worst(found: Iterable[Finding]) -> Level:
+    """The highest level among findings; `NOTE` of none."""
+    return max((one.level for one in found), default=Level.NOTE)
+
+
+def first_of_each(found: Iterable[Finding]) -> list[Finding]:
+    """Each kind once, as it was found first, in that order."""
+    first: dict[tuple[Code, Subject], Finding] = {}
+    for one in found:
+        first.setdefault(one.kind, one)
+    return list(first.values())
+
+
+def in_order(found: Sequence[Finding]) -> list[Finding]:
+    """Worst first, then newest: `found` stands in the order of finding."""
+    return sorted(found[::-1], key=lambda one: -one.level)  # noqa: C415  sorted() keeps the order of equals
+
+
+def text(one: Finding) -> str:
+    """What was found, as a clause without its subject and without a full stop."""
+    return WORDS[one.code].sentence.format_map(one.facts)
+
+
+def told(one: Finding) -> str:
+    """What was found, of what, and what to do."""
+    remedy = WORDS[one.code].remedy.format_map(one.facts)
+    return f"{one.subject}: {text(one)}" + (f": {remedy}" if remedy else "")
+
+
+def _words() -> Mapping[Code, Wording]:
+    table = tomllib.loads(resources.files("dappled").joinpath("findings.toml").read_text("utf-8"))
+    return MappingProxyType(
+        {Code(code): Wording(Level[row.pop("level").upper()], **row) for code, row in table.items()}
+    )
+
+
+WORDS: Mapping[Code, Wording] = _words()

@@ -1,0 +1,49 @@
+"""Findings as values, and the one table of their words."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import dappled
+from dappled import findings
+from dappled.findings import WORDS, Code, Finding, Level, Subject, finding
+
+SOURCE = Path(dappled.__file__).parent
+
+
+def test_each_code_has_words_and_is_found_somewhere() -> None:
+    assert set(WORDS) == set(Code)
+    names = {
+        name
+        for path in SOURCE.rglob("*.py")
+        if path.name != "findings.py"
+        for name in re.findall(r"Code\.([A-Z_0-9]+)", path.read_text("utf-8"))
+    }
+    assert {one.name for one in Code} <= names, "a code that nothing finds"
+
+
+def test_the_words_of_all_codes_stand_in_one_order() -> None:
+    assert [one.value for one in WORDS] == sorted(one.value for one in Code)
+
+
+def test_a_finding_survives_json_and_is_equal_by_code_and_subject() -> None:
+    one = finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=5)
+    assert Finding.from_json(one.to_json()) == one
+    assert one.level is Level.CAUTION
+    assert one.kind == finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=6).kind
+    assert findings.first_of_each([one, finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=6)]) == [one]
+
+
+def test_the_worst_comes_first_then_the_newest() -> None:
+    card = finding(Code.CARD_CHANGED, Subject("flight"))
+    old, new = (finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", number), rival=9) for number in (1, 2))
+    assert findings.in_order([old, card, new]) == [new, old, card]
+    assert findings.worst([card, old]) is Level.CAUTION
+    assert findings.worst([]) is Level.NOTE
+
+
+def test_words_take_the_facts() -> None:
+    one = finding(Code.FRAME_CLOCK_DISAGREES, Subject("frame", 4), off_s=-8.0)
+    assert findings.text(one) == "by the body's clock it was taken -8 s away from its shot"
+    assert findings.told(one) == f"frame 4: {findings.text(one)}: compare the picture with its neighbours"
