@@ -37,6 +37,7 @@ class Code(StrEnum):
     CARD_CHANGED = "card.changed"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"
+    FRAME_UNCONFIRMED = "frame.unconfirmed"
     LINK_SAME_IDS = "link.same_ids"
     PICTURE_ON_CARD = "picture.on_card"
     TIME_WEEK_ROLLOVER = "time.week_rollover"

@@ -1,4 +1,4 @@
-"""Names of files by their content."""
+"""Whose a file is, and names of files by their content."""
 
 from __future__ import annotations
 
@@ -9,9 +9,98 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.drivers.attribution import (
-    true_name,
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, true_name
+from dappled.findings import Code, Subject, finding
+
+SECOND = 10**9
+KNOWN = BodyClock((4900.0, 4900.3, 4899.8, 4900.1))
+
+
+def clue(taken_s: float | None, arrived_s: float = 201.0, since_s: float | None = None, **names: int) -> FileClue:
+    return FileClue(taken_s, round(arrived_s * SECOND), None if since_s is None else round(since_s * SECOND), **names)
+
+
+def claim(shot: int, fired_s: float) -> Claim:
+    return Claim(shot, round(fired_s * SECOND))
+
+
+def test_the_only_shot_left_does_not_get_a_file_that_the_body_s_clock_excludes() -> None:
+    found = attribute(clue(5010), [], [claim(4, 200)], KNOWN)
+    assert (found.shot, found.doubt) == (None, None)  # a picture of 90 s before
+
+
+def test_a_time_at_which_no_unknown_picture_can_have_been_made_shows_that_the_clock_was_set() -> None:
+    found = attribute(clue(5010, since_s=150.0), [], [claim(4, 200)], KNOWN)
+    assert found.shot == 4
+    assert found.doubt is not None
+    assert found.doubt.kind == (Code.FRAME_CLOCK_DISAGREES, Subject("frame", 4))
+    assert found.doubt.facts["off_s"] == pytest.approx(-90, abs=0.2)
+    again = attribute(clue(5012, 203.0, 150.0), [], [claim(5, 202)], found.clock)
+    assert (again.shot, again.doubt) == (5, None)
+    third = attribute(clue(5014, 205.0, 150.0), [], [claim(6, 204)], again.clock)
+    assert (third.shot, third.doubt) == (6, None)
+
+
+def test_a_clock_that_was_set_back_is_believed_when_files_in_a_row_agree() -> None:
+    ends, clock = [], KNOWN
+    for shot in range(4, 8):
+        at_s = 200.0 + 5 * shot
+        found = attribute(clue(round(at_s + 4800), at_s + 1), [], [claim(shot, at_s)], clock)
+        clock = found.clock
+        ends.append((found.shot, found.doubt is not None))
+    assert ends == [(None, False), (5, True), (6, False), (7, False)]
+
+
+def test_a_picture_by_hand_between_shots_that_fit_does_not_count_as_a_clock_that_was_set() -> None:
+    clock = KNOWN
+    for shot in range(4, 8):
+        at_s = 200.0 + 10 * shot
+        by_hand = attribute(clue(at_s + 4892, at_s + 1), [], [claim(shot, at_s)], clock)
+        own = attribute(clue(at_s + 4900, at_s + 2), [], [claim(shot, at_s)], by_hand.clock)
+        assert (by_hand.shot, own.shot, own.doubt) == (None, shot, None)
+        clock = own.clock
+
+
+@pytest.mark.parametrize(
+    ("late", "waiting", "taken_s", "shot", "code"),
+    [
+        ([], [4], None, 4, None),
+        ([], [4, 5], None, 4, None),
+        ([], [], 5100, None, None),
+        ([3], [], None, 3, Code.FRAME_UNCONFIRMED),
+        ([3], [], 5090, 3, None),
+        ([3], [4], None, 4, Code.FRAME_RIVAL_SHOTS),
+        ([3], [4], 5090, 3, None),
+        ([3], [4], 5100, 4, None),
+        ([], [3, 4], 5100, 4, None),  # the event of shot 3 was lost
+        ([2, 3], [], None, None, None),
+        ([3], [], 5110, None, None),
+    ],
 )
+def test_order_and_time(
+    late: list[int], waiting: list[int], taken_s: float | None, shot: int | None, code: Code | None
+) -> None:
+    """Shots are fired each 10 s, shot 4 at 200 s."""
+    claims = {one: claim(one, 160.0 + 10 * one) for one in range(6)}
+    found = attribute(clue(taken_s, 260.0), [claims[one] for one in late], [claims[one] for one in waiting], KNOWN)
+    assert (found.shot, found.doubt and found.doubt.code) == (shot, code)
+
+
+def test_no_shot_made_a_file_that_came_before_it_was_fired() -> None:
+    assert attribute(clue(None, 199.0), [], [claim(4, 200)], BodyClock()).shot is None
+
+
+def test_names_in_order_exclude_older_and_newer_shots() -> None:
+    late, waiting = [claim(2, 180)], [claim(4, 200)]
+    assert attribute(clue(None, after=3), late, waiting, BodyClock()).shot == 4
+    assert attribute(clue(None, after=3), late, waiting, BodyClock()).doubt is None
+    assert attribute(clue(None, before=3), late, waiting, BodyClock()).shot == 2
+
+
+def test_two_shots_within_the_clock_s_tolerance_are_rivals() -> None:
+    found = attribute(clue(5099.6), [claim(3, 199)], [claim(4, 200)], KNOWN)
+    assert found.shot == 4
+    assert found.doubt == finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=3)
 
 
 def tiff(order: str, *tags: int) -> bytes:

@@ -1,18 +1,25 @@
 """Attribute a camera's file to the shot that made it, and correct its name by its content.
 
-A file may come after its shot was given up; it must not become the next shot's frame. The body's own clock
-distinguishes the shots. Where it can't, the file is marked as doubtful.
+`attribute` is the one rule for all drivers: a pure function from what is known of a file, of the shots that lack one
+and of the body's clock to a shot, a shot with a doubt, or no shot: a stray. A file is never a shot's only because no
+other shot is left: where the body's own time speaks against it, it is a stray, or in doubt.
 """
 
 from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
-from statistics import median
+from dataclasses import dataclass, replace
+from statistics import median, pstdev
+
+from dappled.findings import Code, Finding, Subject, finding
 
 TOLERANCE_S = 3.0
-"""A body's time has whole seconds, and is the time of the exposure or of the writing of the file."""
+"""A body's time has whole seconds, or two, and is the time of the exposure or of the writing of the file."""
+_LEAST_S = 1.5
+"""Two times in whole seconds differ by less than one, and the shutter's latencies by some tenths."""
+_SIGMAS = 4.0
+_FEW = 4
 _KEPT = 16
 _DNG_VERSION = 50706
 
@@ -26,54 +33,147 @@ class Claim:
 
 
 @dataclass(frozen=True, slots=True)
-class Attribution:
-    """The shot that made a file, None where that is unknown; a sentence where there is doubt."""
+class FileClue:
+    """What is known of a file whose shot is sought. Times of this machine are monotonic.
 
-    shot: int | None
-    doubt: str = ""
+    `taken_s`: when it was made by the body's clock, which may be wrong; None where the body doesn't say. `arrived_ns`:
+    when it was announced or first listed. `since_ns`: every picture made before is known already (None: unknown).
+    `after` and `before`: the shots whose certain frames stand next to it by the camera's count of names, on the same
+    card; None where there are none, or where names don't count.
+    """
+
+    taken_s: float | None
+    arrived_ns: int
+    since_ns: int | None = None
+    after: int | None = None
+    before: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class BodyClock:
-    """The body's time minus this machine's, in seconds, from the last 16 files whose shot was certain."""
+    """The body's time minus this machine's, in seconds, from the last 16 files whose shot was certain.
+
+    `rivals_s` are those of the last files that disagree with them and agree with one another: the body's clock may have
+    been set.
+    """
 
     offsets_s: tuple[float, ...] = ()
+    rivals_s: tuple[float, ...] = ()
 
-    def learnt(self, claim: Claim, taken_s: int) -> BodyClock:
-        """Add a file whose shot is certain. If it doesn't fit the earlier ones, drop them: the body's clock was set."""
-        kept = self.offsets_s if self.offsets_s and self.fits(claim, taken_s) else ()
-        return BodyClock((*kept, taken_s - claim.fired_ns / 1e9)[-_KEPT:])
+    @property
+    def limit_s(self) -> float:
+        """How far a file's time may be from its shot's: four standard deviations of those that are known, at least 1.5
+        s and at most 3 s."""
+        if len(self.offsets_s) < _FEW:
+            return TOLERANCE_S
+        return min(max(_SIGMAS * pstdev(self.offsets_s), _LEAST_S), TOLERANCE_S)
 
-    def fits(self, claim: Claim, taken_s: int) -> bool:
+    def off_s(self, claim: Claim, taken_s: float) -> float:
+        """How much later than this shot the file was made. Needs at least one offset."""
+        return taken_s - claim.fired_ns / 1e9 - median(self.offsets_s)
+
+    def fits(self, claim: Claim, taken_s: float) -> bool:
         """Whether this shot may have made the file. Needs at least one offset."""
-        return abs(taken_s - claim.fired_ns / 1e9 - median(self.offsets_s)) <= TOLERANCE_S
+        return abs(self.off_s(claim, taken_s)) <= self.limit_s
+
+    def learnt(self, claim: Claim, taken_s: float) -> BodyClock:
+        """With a file whose shot is certain. If it doesn't fit the earlier ones, the body's clock was set: only those
+        that agree with it are kept."""
+        new_s = taken_s - claim.fired_ns / 1e9
+        known = self.offsets_s
+        if known and abs(self.off_s(claim, taken_s)) > TOLERANCE_S:
+            known = self.rivals_s if self.agreeing(claim, taken_s) else ()
+        return BodyClock((*known, new_s)[-_KEPT:])
+
+    def against(self, claim: Claim, taken_s: float) -> BodyClock:
+        """With a file that would be this shot's only if the body's clock had been set."""
+        kept = self.rivals_s if self.agreeing(claim, taken_s) else ()
+        return replace(self, rivals_s=(*kept, taken_s - claim.fired_ns / 1e9)[-_KEPT:])
+
+    def agreeing(self, claim: Claim, taken_s: float) -> int:
+        """How many files before, in a row, were as far from their shots as this one is from this shot."""
+        near = self.rivals_s and abs(taken_s - claim.fired_ns / 1e9 - median(self.rivals_s)) <= TOLERANCE_S
+        return len(self.rivals_s) if near else 0
 
 
-def attribute(late: Sequence[Claim], current: Claim | None, taken_s: int | None, clock: BodyClock) -> Attribution:
+@dataclass(frozen=True, slots=True)
+class Attribution:
+    """The shot that made a file, None for a stray; what is known of the body's clock after it; and a finding where the
+    shot is in doubt."""
+
+    shot: int | None
+    clock: BodyClock
+    doubt: Finding | None = None
+
+
+def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], clock: BodyClock) -> Attribution:
     """Find the shot that made a file.
 
-    `late` are shots that were given up after they had been fired; `current` is the one whose file is awaited. The file
-    is the current shot's where there are no late ones and the body's time does not exclude it.
+    `waiting` are the shots whose files are awaited, in the order of firing; `late` are those that were given up after
+    they had been fired. The caller keeps `clock` of the answer, and takes the shot out of both lists; after a doubt
+    between shots no file of an older one is expected.
+
+    By names, a file is of no shot before `clue.after` or behind `clue.before`. By the body's clock it is of a shot that
+    it fits. Of several that fit, and where there is no clock, files come in order; a shot given up is a rival. A file
+    that fits none is a picture of another moment, a stray, where it can have been made then: not before `since_ns` and
+    not in the future. Else the body's clock was set, and it is the awaited shot's, in doubt; so is the second such file
+    in a row. From then on the new time counts.
     """
-    claims = [*late, *([] if current is None else [current])]
-    if not claims:
-        return Attribution(None)
-    if taken_s is not None and clock.offsets_s:
-        fitting = [claim for claim in claims if clock.fits(claim, taken_s)]
-        if len(fitting) == 1:
-            return Attribution(fitting[0].shot)
-        if not fitting and current is None:
-            return Attribution(None, "by the body's clock no shot that lacks a file made it")
-        claims = fitting or claims
-    if len(claims) == 1:
-        certain = current is not None and not late
-        return Attribution(claims[0].shot, "" if certain else _rivals(claims))
-    return Attribution(current.shot if current in claims and current is not None else None, _rivals(claims))
+    claims = [one for one in (*late, *waiting) if _possible(one, clue)]
+    awaited = next((one for one in waiting if one in claims), None)
+    taken_s = clue.taken_s
+    if not claims or taken_s is None or not clock.offsets_s:
+        return _by_order(claims, awaited, late, taken_s, clock)
+    if fitting := [one for one in claims if clock.fits(one, taken_s)]:
+        return _by_order(fitting, awaited, late, taken_s, clock)
+    nearest = min(claims, key=lambda one: abs(clock.off_s(one, taken_s)))
+    if abs(clock.off_s(nearest, taken_s)) <= TOLERANCE_S:
+        return Attribution(nearest.shot, clock.learnt(nearest, taken_s), _disagrees(nearest, taken_s, clock))
+    if awaited is None:
+        return Attribution(None, clock)
+    agreeing = clock.agreeing(awaited, taken_s) + (not _of_another_moment(clue, taken_s, clock))
+    if agreeing > 1:
+        return Attribution(awaited.shot, clock.learnt(awaited, taken_s))
+    doubt = _disagrees(awaited, taken_s, clock) if agreeing else None
+    return Attribution(awaited.shot if doubt else None, clock.against(awaited, taken_s), doubt)
 
 
-def _rivals(claims: Sequence[Claim]) -> str:
-    shots = " or ".join(str(claim.shot) for claim in claims)
-    return f"it may be the file of shot {shots}: one had been given up, and the body's clock doesn't distinguish them"
+def _possible(claim: Claim, clue: FileClue) -> bool:
+    if claim.fired_ns > clue.arrived_ns:
+        return False
+    return (clue.after is None or claim.shot > clue.after) and (clue.before is None or claim.shot < clue.before)
+
+
+def _by_order(
+    claims: Sequence[Claim], awaited: Claim | None, late: Sequence[Claim], taken_s: float | None, clock: BodyClock
+) -> Attribution:
+    """Choose among shots that the body's clock doesn't exclude: by time where it is known, else the awaited one."""
+    dated_s = taken_s if clock.offsets_s else None
+    rivals = [one for one in claims if one in late]
+    chosen = awaited if awaited in claims else claims[0] if len(claims) == 1 else None
+    if dated_s is not None and rivals:
+        chosen = min(claims, key=lambda one: abs(clock.off_s(one, dated_s)))
+    if chosen is None:
+        return Attribution(None, clock)
+    subject = Subject("frame", chosen.shot)
+    if rival := next((one for one in reversed(rivals if chosen not in rivals else claims) if one != chosen), None):
+        return Attribution(chosen.shot, clock, finding(Code.FRAME_RIVAL_SHOTS, subject, rival=rival.shot))
+    if rivals and dated_s is None:
+        return Attribution(chosen.shot, clock, finding(Code.FRAME_UNCONFIRMED, subject, shot=chosen.shot))
+    return Attribution(chosen.shot, clock if taken_s is None else clock.learnt(chosen, taken_s))
+
+
+def _of_another_moment(clue: FileClue, taken_s: float, clock: BodyClock) -> bool:
+    """Whether a picture can have been made when the file was, by the body's clock as it was known."""
+    made_ns = (taken_s - median(clock.offsets_s)) * 1e9
+    slack_ns = clock.limit_s * 1e9
+    since_ns = made_ns if clue.since_ns is None else clue.since_ns
+    return since_ns - slack_ns <= made_ns <= clue.arrived_ns + slack_ns
+
+
+def _disagrees(claim: Claim, taken_s: float, clock: BodyClock) -> Finding:
+    off_s = clock.off_s(claim, taken_s)
+    return finding(Code.FRAME_CLOCK_DISAGREES, Subject("frame", claim.shot), off_s=off_s)
 
 
 def true_name(name: str, head: bytes) -> str:

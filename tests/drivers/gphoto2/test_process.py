@@ -427,7 +427,7 @@ def test_without_a_body_s_time_a_file_that_may_be_late_is_marked(ready: Harness)
     ready.turn(30.1)
     (came,) = arrivals(shot_on(ready, 2, None, 1))
     assert came.shot == 2
-    assert "shot 1 or 2" in came.facts["doubt"]
+    assert came.facts["doubt"] == "it may be of shot 1 as well"
     came.blob.close()
     (came,) = arrivals(shot_on(ready, 3, None, 2))
     assert "doubt" not in came.facts  # files come in order

@@ -9,7 +9,8 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dappled.drivers.attribution import BodyClock, Claim, attribute
+from dappled import findings
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute
 from dappled.drivers.camera import (
     Arrival,
     CameraEvent,
@@ -282,14 +283,14 @@ class CameraState:
         """Say which shot made a frame. The current shot ends with its frame."""
         fired_ns = None if self.current is None else self.current.fired_ns
         current = None if self.current is None or fired_ns is None else Claim(self.current.shot, fired_ns)
-        found = attribute(self._late, current, taken_s, self._clock)
+        clue = FileClue(taken_s, arrival.monotonic_ns)
+        found = attribute(clue, self._late, [] if current is None else [current], self._clock)
+        self._clock = found.clock
         if current is not None and found.shot == current.shot:
             self.current = None
-            if taken_s is not None and not self._late:
-                self._clock = self._clock.learnt(current, taken_s)
         left = [] if found.doubt else [claim for claim in self._late if claim.shot != found.shot]
         self._late = deque(left, LATE_LIMIT)  # files come in order: after one in doubt no older one is expected
-        facts = {**arrival.facts, **({"doubt": found.doubt} if found.doubt else {})}
+        facts = {**arrival.facts, **({"doubt": findings.text(found.doubt)} if found.doubt else {})}
         facts["body_offsets_s"] = list(self._clock.offsets_s)
         return Arrival(found.shot, arrival.name, arrival.blob, arrival.monotonic_ns, facts)
 

@@ -9,8 +9,9 @@ from __future__ import annotations
 import threading
 from collections.abc import Generator, Iterator
 
+from dappled import findings
 from dappled.clock import Clock
-from dappled.drivers.attribution import BodyClock, Claim, attribute
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute
 from dappled.drivers.camera import Arrival, CameraError, Companion, ShotFailed
 from dappled.drivers.wired import matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
@@ -113,13 +114,12 @@ class FileWatch:
         except CameraError:
             return  # the next look may find it again
         with self._lock:
-            current = self._claims[0] if self._claims else None
-        shown = None if taken_s is None else int(taken_s)
-        found = attribute(self._late, current, shown, self._body_clock)
-        if current is not None and found.shot == current.shot and shown is not None and not self._late:
-            self._body_clock = self._body_clock.learnt(current, shown)
-        facts = {"doubt": found.doubt} if found.doubt else {}
+            waiting = list(self._claims)
+        clue = FileClue(taken_s, self._first_seen[main.stem])
+        found = attribute(clue, self._late, waiting, self._body_clock)
+        facts = {"doubt": findings.text(found.doubt)} if found.doubt else {}
         if (yield from self._bring(found.shot, group, facts)):
+            self._body_clock = found.clock
             self._late = [] if found.doubt else [one for one in self._late if one.shot != found.shot]
 
     def _match(self, fresh: list[FileGroup]) -> Iterator[Arrival | Companion]:
