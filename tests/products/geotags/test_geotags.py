@@ -161,6 +161,33 @@ def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> 
     assert point["properties"]["gnss"]["fix_type"] == 6
 
 
+def test_geo_txt_has_both_accuracies_or_none(tmp_path: Path) -> None:
+    flight = one_frame(tmp_path, b"raw", "IMG.CR2", replace(rtk(), vertical_sigma_m=None))
+    geotags.write(flight, Mounting())
+    (line,) = (flight / "geotags" / "geo.txt").read_text().splitlines()[1:]
+    assert len(line.split()) == 7  # of eight words OpenDroneMap would read seven too
+
+
+@pytest.mark.parametrize("heading", [1, -1])
+def test_the_track_is_cut_at_the_antimeridian(tmp_path: Path, heading: int) -> None:
+    begun = recording.begin(tmp_path / "flights", RecordedClock(START_NS))
+    for index, longitude_deg in enumerate((179.998, 179.999, -179.999, -179.997)[::heading]):
+        request(begun, index)
+        where = replace(pose(), longitude_rad=math.radians(longitude_deg), latitude_rad=math.radians(-17 + index / 100))
+        begun.ledger.add_tag(replace(tag(deliver(begun, index, b"raw")), pose=where))
+    begun.close()
+    flight = begun.folder.path
+    geotags.write(flight, Mounting())
+    track, *points = json.loads((flight / "geotags" / "track.geojson").read_text())["features"]
+    assert len(points) == 4
+    assert track["geometry"]["type"] == "MultiLineString"
+    west, east = track["geometry"]["coordinates"]
+    assert west[-1][0] == heading * 180
+    assert east[0][0] == -heading * 180
+    assert west[-1][1:] == east[0][1:]
+    assert west[-1][1] == pytest.approx(-16.985, abs=1e-6)
+
+
 def test_times_are_put_right_where_utc_was_learnt(tmp_path: Path) -> None:
     flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk(), utc_known=False)
     geotags.write(flight, Mounting())
@@ -294,6 +321,25 @@ def chunks(data: bytes) -> list[tuple[bytes, bytes]]:
         found.append((data[at + 4 : at + 8], data[at + 8 : at + 12 + length]))
         at += 12 + length
     return found
+
+
+@pytest.mark.parametrize("fill", [0, 1, 3, 700])
+@pytest.mark.parametrize("header", [True, False])
+@pytest.mark.parametrize("exif", [True, False])
+def test_a_jpeg_may_have_fill_bytes_before_its_markers(fill: int, header: bool, exif: bool) -> None:
+    made = io.BytesIO()
+    known = Image.Exif()
+    known[271] = "Canon"
+    Image.new("RGB", (16, 16), "red").save(made, "JPEG", **({"exif": known} if exif else {}))
+    plain = made.getvalue()
+    after = 4 + int.from_bytes(plain[4:6], "big")
+    body = (plain[2:after] if header else b"") + b"\xff" * fill + plain[after:]
+    copy = exif_gps.tagged(plain[:2] + body, exif_gps.Place(41.5, -91.5, 200.0))
+    picture = Image.open(io.BytesIO(copy))
+    picture.load()
+    assert picture.getexif().get(271) == ("Canon" if exif else None)
+    assert picture.getexif().get_ifd(0x8825)[2] == (41.0, 30.0, 0.0)
+    assert copy.count(b"Exif\0\0") == 1
 
 
 @given(st.binary(max_size=200))

@@ -112,15 +112,22 @@ def with_directory(data: bytes, tag: int, inner: Sequence[Entry], first_too: Seq
 
 
 def _jpeg(data: bytes, where: Place) -> bytes:
-    """APP1 stays where it was; a new one follows the start and a JFIF header."""
+    """APP1 stays where it was; a new one follows the start and a JFIF header. Fill bytes (any number of FF before a
+    marker) stay."""
     at, insert = 2, 2
-    while data[at] == 0xFF and data[at + 1] not in (_SOS, 0xD9):
-        (length,) = struct.unpack_from(">H", data, at + 2)
-        if data[at + 1] == _APP1 and data[at + 4 : at + 10] == _EXIF:
-            return data[:at] + _segment(_tiff(data[at + 10 : at + 2 + length], where)) + data[at + 2 + length :]
-        at += 2 + length
-        if insert == 2 and data[3] == _APP0:
-            insert = at
+    while data[at] == 0xFF:
+        marker = at
+        while data[marker + 1] == 0xFF:
+            marker += 1
+        if data[marker + 1] in (_SOS, 0xD9):
+            break
+        (length,) = struct.unpack_from(">H", data, marker + 2)
+        end = marker + 2 + length
+        if data[marker + 1] == _APP1 and data[marker + 4 : marker + 10] == _EXIF:
+            return data[:marker] + _segment(_tiff(data[marker + 10 : end], where)) + data[end:]
+        if at == 2 and data[marker + 1] == _APP0:
+            insert = end
+        at = end
     return data[:insert] + _segment(_tiff(EMPTY, where)) + data[insert:]
 
 

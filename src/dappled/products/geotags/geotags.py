@@ -8,6 +8,7 @@ import json
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
+from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -155,10 +156,10 @@ def _write(path: Path, data: bytes) -> None:
 
 
 def odm(placed: Sequence[Placed], suffix: str | None = None) -> str:
-    """OpenDroneMap's geo.txt: EPSG:4326, then `name x y z [yaw pitch roll [hacc [vacc]]]`.
+    """OpenDroneMap's geo.txt: EPSG:4326, then `name x y z [yaw pitch roll [hacc vacc]]`.
 
-    Fields are positional: a line ends before the first unknown one. z is above mean sea level. `suffix` replaces
-    that of the frames' names, for pictures made of them.
+    Fields are positional: a line ends before the first unknown one; of the two accuracies OpenDroneMap reads both or
+    none. z is above mean sea level. `suffix` replaces that of the frames' names, for pictures made of them.
     """
     lines = ["EPSG:4326"]
     for one in placed:
@@ -171,8 +172,7 @@ def odm(placed: Sequence[Placed], suffix: str | None = None) -> str:
         if camera.pix4d:
             words += [f"{angle:.4f}" for angle in _ypr(camera)]
             vertical = one.tag.pose.vertical_sigma_m
-            words += [] if sigma is None else [f"{sigma:.3f}"]
-            words += [] if sigma is None or vertical is None else [f"{vertical:.3f}"]
+            words += [] if sigma is None or vertical is None else [f"{sigma:.3f}", f"{vertical:.3f}"]
         lines.append(" ".join(words))
     return "\n".join(lines) + "\n"
 
@@ -199,14 +199,11 @@ def geojson(placed: Sequence[Placed]) -> str:
     known = sorted(((one, one.camera) for one in placed if one.camera), key=lambda pair: pair[0].frame.index)
     features: list[dict[str, Any]] = []
     if len(known) > 1:
-        line = [_coordinates(camera) for _, camera in known]
-        features.append(
-            {
-                "type": "Feature",
-                "properties": {"name": "track"},
-                "geometry": {"type": "LineString", "coordinates": line},
-            }
-        )
+        pieces = _cut([_coordinates(camera) for _, camera in known])
+        line = {"type": "LineString", "coordinates": pieces[0]}
+        if len(pieces) > 1:
+            line = {"type": "MultiLineString", "coordinates": pieces}
+        features.append({"type": "Feature", "properties": {"name": "track"}, "geometry": line})
     for one, camera in known:
         turned = _ypr(camera) if camera.pix4d else (None, None, None)
         features.append(
@@ -237,6 +234,21 @@ def geojson(placed: Sequence[Placed]) -> str:
 def _coordinates(camera: CameraPose) -> list[float]:
     place = [round(camera.longitude_deg, 9), round(camera.latitude_deg, 9)]
     return place if camera.height_ellipsoid_m is None else [*place, round(camera.height_ellipsoid_m, 3)]
+
+
+def _cut(line: Sequence[list[float]]) -> list[list[list[float]]]:
+    """A line of longitude, latitude (and height) cut at the antimeridian (RFC 7946, 3.1.9)."""
+    pieces = [[line[0]]]
+    for a, b in pairwise(line):
+        if abs(b[0] - a[0]) > 180:
+            edge = math.copysign(180.0, a[0])
+            span = b[0] + 2 * edge - a[0]
+            share = (edge - a[0]) / span if span else 0.0
+            between = [round(p + share * (q - p), 9) for p, q in zip(a[1:], b[1:], strict=False)]
+            pieces[-1] += [] if a[0] == edge else [[edge, *between]]
+            pieces.append([] if b[0] == -edge else [[-edge, *between]])
+        pieces[-1].append(b)
+    return [piece if len(piece) > 1 else piece * 2 for piece in pieces]  # a line has two points or more
 
 
 def _ypr(camera: CameraPose) -> tuple[float, float, float]:
