@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers walk docs notebooks clean-room wheel demo test check test-fast coverage test-slow soak faults bench lock deb deb-trial arm64 install uninstall clean
+.PHONY: help setup peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow test-long both long soak faults bench lock deb deb-trial arm64 install uninstall clean
 PREFIX ?= /usr/local
 # Tests start hundreds of processes: where no bytecode may be kept, each of them compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -16,7 +16,7 @@ setup: ## create the environment in .venv (the other targets do it if needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py
 
-peers: ## MAVSDK, MAVProxy and pycolmap, which slow tests talk to, in .venv-peers (done by test-slow when needed)
+peers: ## MAVSDK, MAVProxy and pycolmap, which long tests talk to, in .venv-peers (done by test-long when needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py peers
 
@@ -25,9 +25,14 @@ demo: setup ## fly eight simulated frames through the whole daemon, and draw the
 
 CHECKS = $(BIN)/ruff check -q . && $(BIN)/ruff format -q --check . && $(BIN)/mypy && $(BIN)/lint-imports
 TESTS = $(BIN)/pytest -q --no-header $(BESIDE) -m "not slow" --durations=25
+# Prints what was taken of so many seconds and CPU-seconds (docs/tests.md).
+BUDGET = $(BIN)/python tools/budget.py
+
+test: setup ## lint, types, import contracts, and the default tests
+	@$(BUDGET) "make test" 240 400 $(MAKE) -s checked-tests
 
 # The checks take a core for a minute: beside the tests, not before them.
-test: setup ## lint, types, import contracts, and the default tests
+checked-tests:
 	@failed=; { $(CHECKS); } & checks=$$!; \
 	$(TESTS) || failed=tests; \
 	wait $$checks || { echo "the checks failed: see what they say above, or run make check" >&2; failed=checks; }; \
@@ -43,11 +48,20 @@ coverage: setup ## run the default tests and report which lines they reach (a th
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
-test-slow: setup peers ## the tests that take longer; those that watch a clock run with no other beside them
+test-slow: setup ## the tests at real seams; those that watch a clock run with no other beside them
+	@$(BUDGET) "make test-slow" 480 900 $(MAKE) -s both TIER="slow and not long"
+
+test-long: setup peers ## soaks, sweeps, matrices and benchmarks
+	@$(BUDGET) "make test-long" 2400 4800 $(MAKE) -s both TIER=long
+
+both:
 	@failed=0; \
-	$(BIN)/pytest -q --no-header -m "slow and not alone" --durations=25 $(BESIDE) || failed=1; \
-	$(BIN)/pytest -q --no-header -m "slow and alone" --durations=15 || failed=1; \
+	$(BIN)/pytest -q --no-header -m "$(TIER) and not alone" --durations=25 $(BESIDE) || failed=1; \
+	$(BIN)/pytest -q --no-header -m "$(TIER) and alone" --durations=15 || failed=1; \
 	exit $$failed
+
+long: ## what is too long for each change: the long tests, arm64, the README in both bare roots; as root
+	@.ci/run arm64 test-long clean-room
 
 walk: setup ## the modules that a command and a frame pass, traced anew and written into ARCHITECTURE.md
 	@$(BIN)/python -m tests.architecture.walk --write

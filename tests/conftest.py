@@ -20,9 +20,13 @@ settings.load_profile("dappled")
 SLOW_S = 600.0
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """A slow test that names no limit of its own has a long one: a busy machine takes twice as long."""
+    """A long test is a slow one too. A slow test that names no limit of its own has a long one: a busy machine takes
+    twice as long."""
     for item in items:
+        if item.get_closest_marker("long"):
+            item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_S))
 

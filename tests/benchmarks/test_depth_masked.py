@@ -12,7 +12,7 @@ scenes, masked = program("depth_scenes"), program("depth_masked")
 SIDE = 96
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_depth_of_a_masked_frame_of_boards() -> None:
     field, truth = masked.expose(scenes.boards(1, SIDE), SIDE, 1).decoded(0.0)
     found = estimate.estimate(evidence.of_light_field(field))

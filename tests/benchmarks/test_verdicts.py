@@ -7,7 +7,7 @@ import pytest
 from tests.benchmarks import program
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("cause", ["motion", "defocus", "clipping"])
 def test_truly_bad_frames_are_called_bad_and_fine_ones_are_not(cause: str) -> None:
     """Without the margin that keeps the border's ringing out, 88 to 99 % of the defocused frames were found."""

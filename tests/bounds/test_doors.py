@@ -80,7 +80,7 @@ def test_bombs_and_a_few_mutations_at_every_door(honest: dict[str, Path], tmp_pa
     assert {name for name in refused if found[name] == "ok"} <= HARMLESS
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("door", samples.DOORS)
 def test_many_mutations_of_one_door(honest: dict[str, Path], tmp_path: Path, door: str) -> None:

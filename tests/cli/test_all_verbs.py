@@ -16,7 +16,6 @@ import pytest
 from dappled.cli import VERBS, completion, parser
 
 pytestmark = pytest.mark.slow
-
 BODY = ["--camera", "canon-eos-450d"]
 MASK = [*BODY, "--mask", "mask-2"]
 CALLS: dict[str, list[str]] = {
@@ -157,6 +156,10 @@ def test_no_verb_is_left_out() -> None:
     assert set(CALLS) == leaves()
 
 
+FEW = ("run", "decode", "watch", "flight offload")
+EACH = [*FEW, *(pytest.param(name, marks=pytest.mark.long) for name in CALLS if name not in FEW)]
+
+
 def well(told: tuple[int, str, str]) -> tuple[int, str, str]:
     """What a command told, if it is fit for a person: a documented exit code, no traceback, no escape sequences."""
     code, out, err = told
@@ -166,7 +169,7 @@ def well(told: tuple[int, str, str]) -> tuple[int, str, str]:
     return told
 
 
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_narrow_terminal_without_colour_and_a_reader_that_has_gone(forks: Forks, name: str) -> None:
     words = [*name.split(), *CALLS[name]]
     usual, out, _ = well(forks.call(words, COLUMNS="40", NO_COLOR="1"))
@@ -183,7 +186,7 @@ SIGINT, SIGTERM = 2, 15
 
 
 @pytest.mark.parametrize("sent", [SIGINT, SIGTERM])
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize("name", EACH)
 def test_a_signal_as_it_begins_ends_it_without_a_traceback(forks: Forks, name: str, sent: int) -> None:
     code, _, err = forks.call([*name.split(), *CALLS[name]], sent=sent)
     assert "Traceback" not in err

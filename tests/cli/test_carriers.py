@@ -89,7 +89,7 @@ def test_stopped_down_carriers_are_measured_to_a_twentieth_of_a_bin(
     assert _rms(bench.off_bins(seen, key="measured")) < 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_mask_that_is_not_where_it_is_said_to_be_is_found_and_doubted(
     bench: Bench, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -71,7 +71,7 @@ def test_a_frame_near_the_ideal_aperture_still_shows_where_its_lattice_is(
     assert np.abs(off * (694, 922)).max() < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_wrong_focal_length_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     camera = reference_camera(2, scale=0.25, scene="bench", law="fd")
     camera = replace(camera, installation=Installation(0.01, (0.001, 0.002), 1.03))
@@ -89,7 +89,7 @@ def test_a_wrong_focal_length_is_told(tmp_path: Path, capsys: pytest.CaptureFixt
         assert words in out + err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_carriers_are_found_and_cut_as_far_off_as_exif_rounds_the_focal_length(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -168,7 +168,7 @@ def test_two_frames_of_one_name_are_not_written_over_each_other(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bands_fall_off_softly_where_that_is_asked_for(
     stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -66,7 +66,7 @@ def test_a_stop_while_code_is_made_has_the_exit_code_of_an_interruption(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pages", [0, 1, 24])
+@pytest.mark.parametrize("pages", [24, *(pytest.param(few, marks=pytest.mark.long) for few in (0, 1))])
 def test_a_run_ends_in_order_with_pages_open(tmp_path: Path, pages: int) -> None:
     port = free_port(socket.SOCK_STREAM)
     with tempfile.TemporaryDirectory(prefix="dpl-") as sockets:
@@ -85,8 +85,12 @@ def short() -> Iterator[Path]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("span_s", [(0.1, 0.1), (0.3, 2.5), (2.5, 6.0)], ids=["at once", "loading", "starting"])
+@pytest.mark.parametrize("sent", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "span_s",
+    [(0.1, 0.1), (0.3, 2.5), pytest.param((2.5, 6.0), marks=pytest.mark.long)],
+    ids=["at once", "loading", "starting"],
+)
 def test_a_start_is_interrupted_at_any_moment(
     tmp_path: Path, short: Path, span_s: tuple[float, float], sent: signal.Signals
 ) -> None:

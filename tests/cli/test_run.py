@@ -112,7 +112,7 @@ def test_frames_that_could_not_be_decoded_are_a_failure_though_all_are_safe(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("burning", [0, 2], ids=["calm", "both cores loaded"])
+@pytest.mark.parametrize("burning", [0, pytest.param(2, marks=pytest.mark.long)], ids=["calm", "both cores loaded"])
 def test_a_run_that_goes_well_tells_of_no_problem(tmp_path: Path, burning: int) -> None:
     """Every line on a person's screen is one of these: no warning of a library, no death of a process, no "problem"."""
     load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(burning)]

@@ -42,7 +42,7 @@ def _quarter(folder: Path) -> list[str]:
     return ["--camera", str(folder / "quarter.toml"), "--mask", "mask-2"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_readme_s_calibrate_command_works_on_a_450d_behind_mask_2(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

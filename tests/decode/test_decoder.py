@@ -54,7 +54,7 @@ def _scene(seed: int) -> list[tuple[Texture, float]]:
     ]
 
 
-@pytest.mark.parametrize("stops", [pytest.param(2, marks=pytest.mark.slow), 4, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("stops", [pytest.param(2, marks=pytest.mark.long), 4, pytest.param(8, marks=pytest.mark.long)])
 def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: int) -> None:
     camera, scene = Camera.hidden(3), _scene(0)
     f_number = stops * FULL_F
@@ -65,7 +65,7 @@ def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: in
     assert psnr(field.views, truth) > psnr(np.broadcast_to(field.slices[0].real, truth.shape), truth) - 0.5
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_views_of_a_hidden_camera_meet_the_truth(seed: int) -> None:
     camera, scene = Camera.hidden(seed), _scene(seed)
     field, report = _decoder(_calibration(camera)).decode_reported(
@@ -99,7 +99,7 @@ def told_right(
     return request.param, known, _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=FULL_F)
 
 
-@pytest.mark.parametrize("told", [*(pytest.param(told, marks=pytest.mark.slow) for told in (0.67, 0.9)), 1.0, 1.5])
+@pytest.mark.parametrize("told", [*(pytest.param(told, marks=pytest.mark.long) for told in (0.67, 0.9)), 1.0, 1.5])
 def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
     far_out: tuple[Camera, Calibration, Plane], told_right: tuple[bool, Calibration, Decoded], told: float
 ) -> None:
@@ -116,7 +116,7 @@ def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
     assert (f"its carriers show f/{shown:.2g}, told is f/{told * FULL_F:.3g}" in (report.doubt or "")) == far
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_print_s_scale_that_was_fitted_belongs_to_the_aperture() -> None:
     """A film 4.5 % too coarse at a known distance, its frame's f-number told 5 % too small: together 9.5 %."""
     camera = replace(Camera.hidden(3), mask=replace(MASK, frequency_per_mm=0.955 * MASK.frequency_per_mm))
@@ -130,7 +130,7 @@ def test_a_print_s_scale_that_was_fitted_belongs_to_the_aperture() -> None:
         assert (report.doubt is None) == (scale < 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [0.99, 1.01])
 def test_a_print_one_percent_off_costs_the_views_less_than_a_decibel(scale: float) -> None:
     design, printed = print_costs_db(scale, seed=3, beams=5)
@@ -178,7 +178,7 @@ def stopped() -> tuple[Camera, Plane]:
     return camera, camera.expose(_scene(0), STOPPED_F)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_stopped_down_frame_is_decoded_at_its_own_carriers(stopped: tuple[Camera, Plane]) -> None:
     camera, plane = stopped
     field, report = _decoder().decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=STOPPED_F)
@@ -218,7 +218,7 @@ def test_a_diagonal_mask_decodes(stopped: tuple[Camera, Plane]) -> None:
     assert field.views.shape[:2] == (5, 5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_frame_gives_the_same_bytes_for_any_workers(stopped: tuple[Camera, Plane]) -> None:
     fields = [_decoder(workers=n).decode(stopped[1], focal_length_mm=FOCAL_MM, f_number=STOPPED_F) for n in (1, 1, 3)]
     assert len({field.slices.tobytes() for field in fields}) == 1

@@ -49,7 +49,7 @@ def test_one_decoder_serves_several_threads() -> None:
 
 
 @pytest.mark.parametrize(
-    "shape", [pytest.param((1200, 1600)), pytest.param((8192, 12288), marks=pytest.mark.slow, id="100 megapixels")]
+    "shape", [pytest.param((1200, 1600)), pytest.param((8192, 12288), marks=pytest.mark.long, id="100 megapixels")]
 )
 def test_a_warm_decoder_holds_at_most_six_frames(shape: tuple[int, int]) -> None:
     rows = _rows(shape)

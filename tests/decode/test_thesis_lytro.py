@@ -61,7 +61,7 @@ def _frame(steps_bins: NDArray[np.float64], seed: int) -> NDArray[np.float32]:
     return np.asarray(frame + rng.normal(0, frame.mean() / 50, frame.shape), dtype=np.float32)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_every_carrier_of_the_list_is_found_on_a_frame_of_that_lattice() -> None:
     steps = _fitted()
     found = find_lattice(transform(_frame(steps, 1), workers=2))

@@ -145,7 +145,7 @@ def test_a_power_cut_at_some_steps_loses_nothing_acknowledged(calls: list[Call],
     assert cut_everywhere(calls, folder / "flights", folder / "left", SHORT, each=29) > 20
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_power_cut_at_any_step_loses_nothing_acknowledged(calls: list[Call], folder: Path) -> None:
     assert cut_everywhere(calls, folder / "flights", folder / "left", LONG) > 300
 

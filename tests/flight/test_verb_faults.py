@@ -56,14 +56,16 @@ def sweep(shim: Path, name: str, place: Path, step: int) -> dict[str, Any]:
     return found
 
 
-@pytest.mark.parametrize("name", ["offload", pytest.param("pickup", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "name", ["offload", *(pytest.param(one, marks=pytest.mark.slow) for one in VERBS if one != "offload")]
+)
 def test_some_calls_that_fail_lose_no_frame(shim: Path, place: Path, name: str) -> None:
     found = sweep(shim, name, place, 61)
     assert found["wrong"] == []
     assert found["refused"] > 5
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1000)
 @pytest.mark.parametrize("name", VERBS)
 def test_more_calls_that_fail_lose_no_frame(shim: Path, place: Path, name: str) -> None:

@@ -105,14 +105,21 @@ def settle(verb: Verb, place: Path, promise: dict[str, str], where: str) -> None
         raise AssertionError(f"{where}: {error}") from error
 
 
-@pytest.mark.parametrize("name", ["offload", "pickup"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "offload",
+        "pickup",
+        *(pytest.param(one, marks=pytest.mark.slow) for one in VERBS if one not in ("offload", "pickup")),
+    ],
+)
 def test_a_power_cut_at_any_step_of_a_verb_loses_no_frame(folder: Path, name: str) -> None:
     states = sweep(folder, name, SHORT, settle_every=25)
     print(f"{name}: {states} states after a power cut, no acknowledged frame lost")  # noqa: T201  a figure for people who run with -s
     assert states > 10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(1000)
 @pytest.mark.parametrize("name", VERBS)
 def test_a_power_cut_at_any_step_of_a_verb_can_be_finished(folder: Path, name: str) -> None:

@@ -41,7 +41,7 @@ def test_a_mask_that_cannot_be_simulated_is_one_sentence(tmp_path: Path) -> None
         SimulatedCamera("canon-eos-450d", str(tmp_path / "coarse.toml")).on_a_bench(World())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("mask", ["mask-1", "mask-2", "mask-5"])
 def test_its_file_is_a_450d_s(mask: str) -> None:
     camera = eos450d_camera(1, profiles.mask(mask).mask, scene="white")

@@ -128,7 +128,7 @@ def test_a_board_of_as_much_noise_as_contrast_is_found(pictures: list[NDArray[np
     assert np.sqrt(np.mean((dim - clear) ** 2)) < 2.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_eight_boards_of_two_megapixels_take_five_seconds_of_cpu(
     pictures: list[NDArray[np.float64]], tmp_path: Path
 ) -> None:

@@ -42,7 +42,7 @@ def test_the_head_is_nearer_than_the_fence(shared_data: Path) -> None:
     assert np.nanmedian(head) > np.nanmedian(fence) + 0.8
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_under_lenslets_nearer_is_larger_too(shared_data: Path) -> None:
     """A lenslet turns the aperture's picture round; the bust of this made raw stands before its wall all the same."""
     folder = shared_data / "lenslet" / "lytro_like"

@@ -39,7 +39,9 @@ def test_an_interval_of_0_s_is_a_burst_that_loses_and_doubles_nothing(sockets: P
 
 @pytest.mark.slow
 @pytest.mark.alone
-@pytest.mark.parametrize("fault", ["unplug", "drop-transfer", "no-event"])
+@pytest.mark.parametrize(
+    "fault", ["unplug", *(pytest.param(other, marks=pytest.mark.long) for other in ("drop-transfer", "no-event"))]
+)
 def test_in_a_burst_each_shot_ends_once_whatever_the_body_does(sockets: Path, tmp_path: Path, fault: str) -> None:
     here = sockets / tmp_path.name[-12:]
     here.mkdir()

@@ -161,7 +161,7 @@ def test_unplugged_in_mid_download(here: Path) -> None:
         back_in_service(daemon, body)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_unplugged_for_good(here: Path) -> None:
     with a_body(delay_s=0.7) as body, daemon_before(here, body, file_timeout_s=2) as daemon:
         index = wished(daemon)
@@ -186,7 +186,7 @@ def test_silence(here: Path) -> None:
         back_in_service(daemon, body)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_busy_for_10_s(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("busy 10")
@@ -208,7 +208,7 @@ def test_event_lost_though_the_file_is_on_the_card(here: Path) -> None:
         back_in_service(daemon, body)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_bodies_of_one_model(here: Path) -> None:
     with (
         a_body(serial="0000000001") as other,
@@ -254,7 +254,7 @@ def test_card_full(here: Path) -> None:
         back_in_service(daemon, body)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("hours", [1, -1])
 def test_clock_of_the_body_wrong_by_an_hour(here: Path, hours: int) -> None:
     """Nothing goes by the body's clock but what its own files say of each other."""
@@ -314,7 +314,7 @@ def camera_process(body: SimulatedBody) -> int:
     raise AssertionError("there is no camera process")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_body_that_is_not_as_planned(here: Path) -> None:
     """Set by the computer where the body lets it, else no-go; a dial turned in flight is told before the next shot."""
 

@@ -264,6 +264,7 @@ def test_a_person_shoots_looks_and_focuses(chromium: Browser, daemon: Daemon) ->
     assert watched.wrong == []
 
 
+@pytest.mark.long
 def test_the_slider_s_alpha_is_the_command_s(chromium: Browser, daemon: Daemon, tmp_path: Path) -> None:
     """What the page draws and names α is, of the command's pictures, most like the one at that α."""
     page = opened(chromium, daemon, LAPTOP).page
@@ -306,6 +307,7 @@ def likeness(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
     return float(np.corrcoef(one[inner].ravel(), other[inner].ravel())[0, 1])
 
 
+@pytest.mark.long
 def test_an_interval_runs_and_stops(chromium: Browser, daemon: Daemon) -> None:
     watched = opened(chromium, daemon, LAPTOP)
     page = watched.page
@@ -324,7 +326,7 @@ def test_an_interval_runs_and_stops(chromium: Browser, daemon: Daemon) -> None:
     assert watched.wrong == []
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_photographs_by_distance_are_shown_and_stopped(chromium: Browser, tmp_path: Path, sockets: Path) -> None:
     """They begin by themselves: the page must tell that they do, and end them."""
     by_itself = "[trigger]\ndistance_m = 9\nfrom_height_m = 2\n"
@@ -340,6 +342,7 @@ def test_photographs_by_distance_are_shown_and_stopped(chromium: Browser, tmp_pa
         assert watched.wrong == []
 
 
+@pytest.mark.long
 def test_a_phone_shows_go_or_no_go_first_and_fits(chromium: Browser, daemon: Daemon) -> None:
     watched = opened(chromium, daemon, PHONE, device_scale_factor=2, is_mobile=True, has_touch=True)
     page = watched.page
@@ -361,7 +364,9 @@ def test_a_phone_shows_go_or_no_go_first_and_fits(chromium: Browser, daemon: Dae
 SIZES = [(390, 844), (844, 390), (1024, 600), (1280, 800)]
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(
+    ("width", "height"), [SIZES[0], *(pytest.param(*size, marks=pytest.mark.long) for size in SIZES[1:])]
+)
 def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
     chromium: Browser, daemon: Daemon, width: int, height: int
 ) -> None:
@@ -417,6 +422,7 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
     assert watched.wrong == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("width", "height"), [(390, 844), (1280, 800)])
 def test_the_map_shows_the_planned_area_and_what_of_it_was_not_seen(
     chromium: Browser, tmp_path: Path, sockets: Path, width: int, height: int
@@ -441,6 +447,7 @@ def test_the_map_shows_the_planned_area_and_what_of_it_was_not_seen(
         assert watched.wrong == []
 
 
+@pytest.mark.long
 def test_live_view_before_a_shot_and_off_while_shooting(chromium: Browser, tmp_path: Path, sockets: Path) -> None:
     with flown(tmp_path, sockets) as daemon:
         for viewport in (
@@ -471,6 +478,7 @@ def test_live_view_before_a_shot_and_off_while_shooting(chromium: Browser, tmp_p
         assert watched.wrong == []
 
 
+@pytest.mark.long
 def test_a_setting_is_set_and_what_the_body_says_is_shown(chromium: Browser, daemon: Daemon) -> None:
     watched = opened(chromium, daemon, LAPTOP)
     page = watched.page
@@ -498,6 +506,7 @@ def test_before_the_first_frame_what_is_not_known_is_unknown(chromium: Browser, 
         assert not re.search(r"(?<![.\d])0(?![.\d])", told), told
 
 
+@pytest.mark.long
 def test_without_webgl_the_vehicle_makes_the_picture(daemon: Daemon, chromium: Browser) -> None:
     without = "HTMLCanvasElement.prototype.getContext = (of => function (kind, ...more) {"
     without += (

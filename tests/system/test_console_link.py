@@ -128,7 +128,9 @@ def said(what: str) -> str:
     return f"document.querySelector('#outcome').textContent.includes({what!r})"
 
 
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    "size", ["phone", *(pytest.param(size, marks=pytest.mark.long) for size in SIZES if size != "phone")]
+)
 def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
     chromium: Browser, daemon: Daemon, link: Link, size: str
 ) -> None:
@@ -158,6 +160,7 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
         until(page, f"Number(document.querySelector('#counters dd').textContent) === {before + 1}")
 
 
+@pytest.mark.long
 def test_an_answer_that_was_lost_is_asked_for_by_number(chromium: Browser, daemon: Daemon, link: Link) -> None:
     page = page_of(chromium, link.url, "laptop")
     before = requested(daemon)
@@ -168,6 +171,7 @@ def test_an_answer_that_was_lost_is_asked_for_by_number(chromium: Browser, daemo
     until(page, f"Number(document.querySelector('#counters dd').textContent) === {before + 1}")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", SIZES)
 def test_what_a_thumb_needs_is_on_the_first_screen(chromium: Browser, daemon: Daemon, size: str) -> None:
     page = page_of(chromium, daemon.url, size)
@@ -196,7 +200,9 @@ def test_what_a_thumb_needs_is_on_the_first_screen(chromium: Browser, daemon: Da
     assert small == []
 
 
-@pytest.mark.parametrize(("number", "word"), [(signal.SIGTERM, "Ended"), (signal.SIGKILL, "No contact")])
+@pytest.mark.parametrize(
+    ("number", "word"), [pytest.param(signal.SIGTERM, "Ended", marks=pytest.mark.long), (signal.SIGKILL, "No contact")]
+)
 def test_a_flight_s_end_is_told_and_a_death_is_no_end(
     chromium: Browser, tmp_path: Path, sockets: Path, number: int, word: str
 ) -> None:
@@ -246,6 +252,7 @@ def recorded_flight(browser: Browser, flights: Path) -> None:
 BARE = '[camera]\ndriver = "simulated"\noptions = {picture = "pattern:60000:dng"}\n'
 
 
+@pytest.mark.long
 def test_what_is_lost_without_mask_and_link_is_a_caution_with_names(
     chromium: Browser, tmp_path: Path, sockets: Path
 ) -> None:
@@ -271,6 +278,7 @@ calibration = "c.toml"
 """
 
 
+@pytest.mark.long
 def test_a_calibration_of_another_camera_is_no_go_on_the_page_before_and_after_frames(
     chromium: Browser, tmp_path: Path, sockets: Path
 ) -> None:

@@ -133,7 +133,7 @@ def say(line: str) -> None:
     print(line)  # noqa: T201  figures for people who run with -s
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("snr", SNRS)
 @pytest.mark.parametrize("seed", SEEDS)
 def test_bad_pixels(seed: int, snr: float) -> None:
@@ -146,7 +146,7 @@ def test_bad_pixels(seed: int, snr: float) -> None:
     assert known.mean() > 0.97
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("snr", [50.0, 100.0])
 def test_distances_in_metres(snr: float) -> None:
     """Well under a constant-plane guess wherever Eq 5 allows; and within the σ told for 68 ± 7 % of the pixels."""
@@ -177,7 +177,7 @@ def _covered(found: Floats, truth: Floats, sigma: Floats) -> float:
     return float(np.mean(np.abs(found - truth)[inside] <= sigma[inside]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("snr", SNRS)
 def test_sigmas_hold_on_a_scene_with_edges_and_a_leaning_board(seed: int, snr: float) -> None:
@@ -190,7 +190,7 @@ def test_sigmas_hold_on_a_scene_with_edges_and_a_leaning_board(seed: int, snr: f
     assert covered == pytest.approx(0.68, abs=0.07)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_beyond_what_equation_5_allows_is_unknown() -> None:
     """A board at 200 m moves by a sixth of a pixel over the aperture: it can't be told from infinity."""
     scene = shown("far strips", 7, 50.0)
@@ -201,7 +201,7 @@ def test_beyond_what_equation_5_allows_is_unknown() -> None:
     assert known[5.0] > 0.9
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3, 4])
 @pytest.mark.parametrize("snr", [50.0, 100.0])
 def test_refocus_against_the_simulator_s_own(seed: int, snr: float) -> None:

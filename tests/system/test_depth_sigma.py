@@ -24,7 +24,7 @@ from dappled.products.opened import OpenedFrame
 from tests.simulated.calibration import from_frame
 from tests.system.test_depth import BORDER, CAMERA, MASK, SCALE, sampled, say, with_snr
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 TEXTURE_SIDE = 2048
 
 

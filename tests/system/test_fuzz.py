@@ -58,7 +58,7 @@ def liar(seed: int) -> Iterator[int]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
 def test_a_body_that_answers_with_noise(seed: int, tmp_path: Path) -> None:
     """PTP answers are parsed in the camera's process; it may die of them, the daemon says so and refuses requests."""
     with liar(seed) as port, flying(settings_of(tmp_path, camera={"port": f"ptpip:127.0.0.1:{port}:{port}"})) as daemon:

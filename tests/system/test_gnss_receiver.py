@@ -67,7 +67,7 @@ def recorded_bytes(flight: Path) -> int:
 
 
 @pytest.mark.alone
-@pytest.mark.slow
+@pytest.mark.long
 def test_marks_time_the_frames_and_the_stream_comes_out_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

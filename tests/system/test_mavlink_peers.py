@@ -64,7 +64,7 @@ def run(script: str, folder: Path, *arguments: object) -> subprocess.Popen[bytes
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("through_the_autopilot", [False, True])
 def test_mavsdk_as_client(camera: Camera, tmp_path: Path, through_the_autopilot: bool) -> None:
     """On a link of its own, and through the autopilot, which forwards between its ports as ArduPilot does."""
@@ -106,7 +106,7 @@ def test_mavsdk_as_client(camera: Camera, tmp_path: Path, through_the_autopilot:
     assert camera.iso() == "200"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shots(
     camera: Camera, tmp_path: Path
 ) -> None:
@@ -125,7 +125,7 @@ def test_mavsdk_as_autopilot_whose_system_is_adopted_and_whose_triggers_are_shot
     assert flight_report.balance(camera.flying.service.folder).by_source == {"mavlink:7/1": 3}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mavproxys_camera_module(camera: Camera, tmp_path: Path) -> None:
     with MavProxy(camera.port(1), tmp_path) as proxy:
         proxy.until(r"loaded \d+ settings")

@@ -45,7 +45,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
             command.send_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize(
+    ("width", "height"), [SIZES[0], *(pytest.param(*size, marks=pytest.mark.long) for size in SIZES[1:])]
+)
 def test_a_recording_is_looked_at_and_nothing_on_its_page_waits_for_a_daemon(
     chromium: Browser, recording: Daemon, width: int, height: int
 ) -> None:
@@ -79,6 +81,7 @@ def test_a_recording_is_looked_at_and_nothing_on_its_page_waits_for_a_daemon(
     assert watched.wrong == []
 
 
+@pytest.mark.long
 def test_a_recording_whose_command_has_ended_says_so(chromium: Browser, tmp_path: Path) -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "dappled", "open", "--no-browser", "--json"],

@@ -11,7 +11,7 @@ from dappled.mocks.soak import soak
 from dappled.mocks.soak.supervised import Resources
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.alone
 @pytest.mark.timeout(400)
 def test_the_counts_balance_after_two_minutes_of_trouble() -> None:

@@ -24,7 +24,7 @@ def _psnr(error: np.ndarray) -> float:
     return float(-10 * np.log10(np.mean(error[..., BORDER:-BORDER, BORDER:-BORDER] ** 2)))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [3])
 def test_a_masked_raf_is_calibrated_and_decoded(seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     body = MaskedFinePix(seed)

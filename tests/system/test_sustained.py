@@ -11,7 +11,7 @@ from tests.benchmarks import program
 
 @pytest.mark.parametrize(
     ("seconds", "rate", "megabytes"),
-    [(2.0, 8.0, 1.0), pytest.param(20.0, 4.0, 11.0, marks=[pytest.mark.slow, pytest.mark.alone])],
+    [(2.0, 8.0, 1.0), pytest.param(20.0, 4.0, 11.0, marks=[pytest.mark.long, pytest.mark.alone])],
 )
 def test_frames_come_faster_than_they_can_be_decoded(
     tmp_path: Path, seconds: float, rate: float, megabytes: float

@@ -22,7 +22,7 @@ SEED, FRAMES, GROUND_M = 8, 3, 12.5
 
 
 @pytest.mark.alone
-@pytest.mark.slow  # 12 s; and its tolerance is of milliseconds, which a machine busy with other tests does not keep
+@pytest.mark.long  # 12 s; and its tolerance is of milliseconds, which a machine busy with other tests does not keep
 def test_tags_hold_the_true_time_place_and_attitude(tmp_path: Path, sockets: Path) -> None:
     """The body's latency is 60 ± 15 ms, the vehicle flies 4 m/s and sways; the autopilot's clock drifts by 50 ppm."""
     truth = tmp_path / "truth"

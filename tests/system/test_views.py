@@ -54,7 +54,7 @@ def _without_noise(camera: MaskedCamera) -> MaskedCamera:
     [
         (3, False, True),
         *(
-            pytest.param(s, m, noisy, marks=pytest.mark.slow)
+            pytest.param(s, m, noisy, marks=pytest.mark.long)
             for m in (False, True)
             for s in (3, 4, 5)
             for noisy in (False, True)
@@ -73,7 +73,7 @@ def test_views_of_the_reference_camera(seed: int, mono: bool, noisy: bool, tmp_p
     assert reached.views_db >= reached.mean_db + wanted.above_mean_db, reached
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [21, 22])
 def test_views_of_the_reference_camera_on_the_full_sensor(seed: int, tmp_path: Path) -> None:
     camera = reference_camera(seed, scene="bench")
@@ -83,7 +83,7 @@ def test_views_of_the_reference_camera_on_the_full_sensor(seed: int, tmp_path: P
         assert reached.views_db >= reached.mean_db + wanted.above_mean_db, reached
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_same_bytes_come_out_for_any_number_of_workers(tmp_path: Path) -> None:
     camera = reference_camera(3, scale=0.5, scene="bench")
     (tmp_path / "bench.dng").write_bytes(camera.bench_frame().file)
@@ -100,7 +100,7 @@ def test_the_same_bytes_come_out_for_any_number_of_workers(tmp_path: Path) -> No
     assert len(outcomes) == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [6, 7])
 def test_views_of_a_scene_with_hardly_any_parallax_are_no_worse_than_their_mean(seed: int, tmp_path: Path) -> None:
     reached = _score(reference_camera(seed, scale=0.5, scene="terrain"), tmp_path, least_disparity_px=0.0)
@@ -123,7 +123,7 @@ def test_the_mask_s_installation_is_found(tmp_path: Path) -> None:
         assert math.hypot(*fit.lattice.ky) == pytest.approx(shadow_per_px, rel=2e-5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_told_of_views_where_the_frame_is_clipped(tmp_path: Path) -> None:
     white, frame, calibration = tmp_path / "white.dng", tmp_path / "frame.dng", tmp_path / "calibration.toml"
     shot = ["--scale", "0.25", "--rays"]

@@ -89,7 +89,7 @@ def test_a_subscriber_that_was_killed_and_started_again_ends_with_every_frame(tm
 
 
 @pytest.mark.alone
-@pytest.mark.slow  # depth has the lowest priority of all: beside two tests that compute, a map takes over a minute
+@pytest.mark.long  # depth has the lowest priority of all: beside two tests that compute, a map takes over a minute
 def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> None:
     """As the schema says, with disparities that are known in most of the picture, and a sigma wherever they are."""
     endpoint = f"ipc://{sockets}/depth"

@@ -89,7 +89,7 @@ def rust(folder: Path) -> list[str]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-@pytest.mark.parametrize("made", [python, cpp, rust])
+@pytest.mark.parametrize("made", [python, *(pytest.param(one, marks=pytest.mark.long) for one in (cpp, rust))])
 def test_a_reader_reads_a_live_stream(made: Callable[[Path], list[str]], tmp_path: Path, sockets: Path) -> None:
     """Each line names the frame, the shape and the mean of the first slice, as `dappled watch` keeps them."""
     folder = tmp_path / "reader"

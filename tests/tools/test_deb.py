@@ -22,7 +22,7 @@ def ask(*words: str | Path, **environment: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(600)
 def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path: Path) -> None:
     if shutil.which("dpkg-deb") is None:

@@ -29,7 +29,7 @@ def test_a_notebook_is_kept_small_with_its_pictures(path: Path) -> None:
     assert "/tmp/" not in json.dumps(kept)  # no name of the machine that ran it
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=[path.stem for path in NOTEBOOKS])
 def test_a_notebook_runs_from_the_top(path: Path) -> None:

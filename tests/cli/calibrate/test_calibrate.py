@@ -87,7 +87,7 @@ def test_tables_law_and_pair_of_files(
     assert "geometric explains these frames" in text
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_frame_in_between_is_predicted_to_a_fraction_of_a_bin_and_searched_no_farther_than_its_exif_is_rounded(
     frames: Frames, profile: Path, tmp_path: Path
 ) -> None:
@@ -105,7 +105,7 @@ def test_a_frame_in_between_is_predicted_to_a_fraction_of_a_bin_and_searched_no_
     assert all(b >= a for a, b in zip(near, far, strict=True))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frames_of_the_other_law_choose_it_and_refuse_the_one_that_is_asked_for(
     frames: Frames, profile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

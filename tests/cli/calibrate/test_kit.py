@@ -143,7 +143,7 @@ def test_exchanged_masks_are_seen(kit: Path, told: Told) -> None:
     assert "bare: no frame without a mask" in err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_prints_of_two_sizes_disagree(kit: Path, told: Told, tmp_path: Path) -> None:
     for stop in STOPS:
         shot = _shot("diagonal", 28.0, stop, scale=1.03)

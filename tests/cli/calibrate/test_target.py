@@ -48,7 +48,7 @@ def test_targets_lead_to_metres(folder: Path, capsys: pytest.CaptureFixture[str]
     assert told["focal_length_mm"] == 50.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second frame says that the lens was zoomed in between."""
     recipe = Recipe("reference-36mm", "reference-5x5", calibration=str(folder / "c.toml"))

@@ -16,7 +16,7 @@ def _a_path_for_all() -> Iterator[None]:
     program("autopilot_cell")._sampled.cache_clear()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)  # 40 s alone; it only computes, and may share the machine
 def test_every_trigger_is_one_shot_and_every_sigma_is_true() -> None:
     matrix, world = program("autopilots"), program("autopilot_cell")

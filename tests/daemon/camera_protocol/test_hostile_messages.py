@@ -306,7 +306,7 @@ def test_a_client_that_dies_in_the_middle_of_a_packet_leaves_the_camera_to_the_n
 
 
 @pytest.mark.parametrize(
-    "seconds", [3, pytest.param(60, marks=[pytest.mark.slow, pytest.mark.alone, pytest.mark.timeout(180)])]
+    "seconds", [3, pytest.param(60, marks=[pytest.mark.long, pytest.mark.alone, pytest.mark.timeout(180)])]
 )
 def test_five_thousand_messages_a_second_drown_no_wish_and_fill_no_memory(seconds: int) -> None:
     with Camera() as camera, Peer(camera.links.port(0)) as gcs:

@@ -173,7 +173,7 @@ def test_what_exif_shows() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3, 4))])
 def test_a_flight_is_placed_as_well_as_promised_and_says_so(seed: int) -> None:
     """The body's latency has σ = 10 ms: 15 cm and 0.30° at this speed and turn, and a fifteenth by chance."""
     figures: dict[str, Any] = program("pose").measure(300, seed)

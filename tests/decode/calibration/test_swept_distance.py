@@ -89,7 +89,7 @@ def test_focal_lengths_that_contradict_the_stops_leave_large_errors(one_length: 
     assert not any(fit.distance_fitted for fit in found.fits)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("lengths", [(50.0,), (28.0, 85.0)])
 def test_the_standard_errors_contain_the_truth(lengths: tuple[float, ...]) -> None:
     """Zooms rounded to a millimetre, stops 2 % off and of any shape, an exit pupil at the focal length or beyond."""

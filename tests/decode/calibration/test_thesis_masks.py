@@ -59,7 +59,7 @@ def test_a_mask_of_the_thesis_is_found_behind_a_round_stop(name: str, body: Body
     assert _holds(shot)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", MASKS)
 @pytest.mark.parametrize("body", [CANON, FUJI], ids=["450D", "S5200"])
 @pytest.mark.parametrize("scene", ["white", "texture", "boards"])
@@ -130,7 +130,7 @@ def test_a_frame_without_a_mask_is_refused_although_it_should_show_one() -> None
     assert shows_no_carriers(bare(shot), shot.film, law="fd")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("part", range(4))
 def test_no_wrong_lattice_in_two_hundred_seeds(part: int) -> None:
     """Half of the frames have a film before the sensor, half none: nothing but the right lattice may come out."""
@@ -142,7 +142,7 @@ def test_no_wrong_lattice_in_two_hundred_seeds(part: int) -> None:
             assert shows_no_carriers(bare(shot), shot.film), seed
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_carriers_in_thirty_ordinary_photographs() -> None:
     for number in range(30):
         frame = photograph(number)

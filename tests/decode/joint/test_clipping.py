@@ -107,7 +107,7 @@ def test_the_share_of_each_patch_that_is_clipped() -> None:
     np.testing.assert_array_equal(np.argwhere(shares > 0), [[4, 2], [4, 3], [5, 2], [5, 3]])
 
 
-@pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.long)])
 def half_open(request: pytest.FixtureRequest) -> HalfOpen:
     """Half the ideal aperture, one pixel in a hundred at white."""
     scene = RaySum(finest=BAND, snr=100, kappa=0.5, seed=request.param, covers="apart", shape=(240, 280))
@@ -116,7 +116,7 @@ def half_open(request: pytest.FixtureRequest) -> HalfOpen:
     return HalfOpen(scene, plane, np.minimum(plane, np.float32(white)), (plane >= white).astype(np.float32), true)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_clipped_beside_the_masks_dark_places_is_told_by_these(half_open: HalfOpen) -> None:
     """Views are nearly those of a sensor without a white, and slices those of the file."""
     decoder, knows = half_open.decoders()

@@ -58,7 +58,7 @@ def test_noise_is_kept_out_of_views_by_the_disparities_that_are_there() -> None:
     [
         (RaySum(finest=BAND, snr=50, shape=(220, 260), covers="apart"), 0.58),
         *(
-            pytest.param(RaySum(shape=(440, 520), covers="apart", **kind), least, marks=pytest.mark.slow)
+            pytest.param(RaySum(shape=(440, 520), covers="apart", **kind), least, marks=pytest.mark.long)
             for kind, least in (
                 ({"finest": BAND, "snr": 100, "seed": 2}, 0.53),
                 ({"exponent": 1.1, "seed": 3}, 0.53),
@@ -84,11 +84,11 @@ def test_two_thirds_of_errors_are_within_the_standard_error(scene: RaySum, least
         (RaySum(finest=BAND, snr=500, shape=(220, 260), covers="apart"), "independent"),
         (RaySum(finest=BAND, snr=100, shape=(220, 260), covers="apart"), "joint"),
         pytest.param(
-            RaySum(finest=BAND, snr=300, shape=(440, 520), covers="apart"), "independent", marks=pytest.mark.slow
+            RaySum(finest=BAND, snr=300, shape=(440, 520), covers="apart"), "independent", marks=pytest.mark.long
         ),
-        pytest.param(RaySum(finest=BAND, snr=200, shape=(440, 520), covers="apart"), "joint", marks=pytest.mark.slow),
-        pytest.param(RaySum(exponent=1.5, shape=(220, 260), covers="apart"), "joint", marks=pytest.mark.slow),
-        pytest.param(RaySum(snr=1000, shape=(220, 260)), "joint", marks=pytest.mark.slow),
+        pytest.param(RaySum(finest=BAND, snr=200, shape=(440, 520), covers="apart"), "joint", marks=pytest.mark.long),
+        pytest.param(RaySum(exponent=1.5, shape=(220, 260), covers="apart"), "joint", marks=pytest.mark.long),
+        pytest.param(RaySum(snr=1000, shape=(220, 260)), "joint", marks=pytest.mark.long),
     ],
 )
 def test_the_views_of_a_clean_frame_are_of_the_better_model(scene: RaySum, model: str) -> None:
@@ -97,7 +97,7 @@ def test_the_views_of_a_clean_frame_are_of_the_better_model(scene: RaySum, model
     assert found.joint > found.quick - 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_detail_that_folds_in_from_beyond_the_band_does_not_spoil_the_views() -> None:
     found = _reached(RaySum(exponent=1.1))
     assert found.joint > max(found.quick + 4, found.mean + 4), found
@@ -111,7 +111,7 @@ def test_a_frame_without_noise_or_folded_detail_is_inverted_as_before() -> None:
     assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 60
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("round_", [False, True])
 def test_a_continuous_stop_s_unmeasured_orders_belong_to_the_model(seed: int, round_: bool) -> None:
@@ -119,13 +119,13 @@ def test_a_continuous_stop_s_unmeasured_orders_belong_to_the_model(seed: int, ro
     assert found.joint > max(found.quick + 2.5, found.mean + 3.5), found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_beyond_the_range_of_disparities_is_not_smeared() -> None:
     found = _reached(RaySum(boards=(45.0,), finest=BAND, snr=100))
     assert found.joint > found.mean + 1, found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_frame_without_texture_has_views_like_its_mean() -> None:
     scene = RaySum(contrast=0.0, boards=(6.0,), snr=100)
     plane, true = scene.expose()
@@ -161,7 +161,7 @@ def test_few_slices_don_t_blow_rounding_up() -> None:
     assert np.abs(made.views - scene).max() < 0.3
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_clipped_light_that_goes_astray_is_not_taken_for_parallax() -> None:
     """Clipping bends the mask's waves, and at half the ideal aperture weak orders decide how far views differ."""
     scene = RaySum(finest=BAND, snr=100, kappa=0.5, contrast=0.3)
@@ -176,7 +176,7 @@ def test_clipped_light_that_goes_astray_is_not_taken_for_parallax() -> None:
     assert found[1] > found[0] + 1.5, found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_without_parallax_has_its_mean_picture_for_every_view() -> None:
     """At the ideal aperture the mask's waves average out: the frame is the scene. Its straight edges have detail beyond
     the band, which stands in the other slices as parallax would."""
@@ -230,13 +230,13 @@ def test_a_thing_before_a_background_near_the_focus_keeps_its_parallax() -> None
     assert found.joint > 44.8, found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_thing_beyond_all_ranges_beside_others_within_is_not_smeared() -> None:
     found = _reached(RaySum(boards=(2.0, 100.0), finest=BAND, snr=100))
     assert found.joint > max(found.quick - 1, found.mean + 10), found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scene_beyond_all_ranges_is_told() -> None:
     scene = RaySum(boards=(90.0,), finest=BAND, snr=100)
     plane, _ = scene.expose()

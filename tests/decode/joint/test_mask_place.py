@@ -84,7 +84,7 @@ def test_a_mask_in_its_place_is_left_there() -> None:
     assert found.doubt(15.5) is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(3, 11))
 def test_no_scene_moves_a_mask(seed: int) -> None:
     chance = np.random.default_rng(seed)

@@ -55,7 +55,7 @@ def test_views_beat_lftoolbox_s_at_every_offset(shared_data: Path) -> None:
     assert all(ours > theirs + 0.3 for ours, theirs in zip(reached, LFTOOLBOX_DB, strict=True)), reached
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_colour_views_have_the_grey_views_as_their_mean(shared_data: Path) -> None:
     folder = shared_data / "lenslet/lytro_like"
     coloured = Darkroom(_recipe(folder, colour=True)).decode(folder / "raw.png").light_field.views
@@ -72,7 +72,7 @@ def test_a_colour_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
         Darkroom(Recipe("auto", "lenslet", cfa="RGGX")).decode(tmp_path / "frame.npy")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_lytro_container_gives_the_same_light_field_as_its_pixels_in_a_png(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "lenslet/lytro_like"
     for name in ("raw", "white"):

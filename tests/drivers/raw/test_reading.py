@@ -324,7 +324,7 @@ def test_a_lenslet_photograph(shared_data: Path) -> None:
     assert frame.mosaic.shape == (960, 1280)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["tif", "png"])
 def test_a_frame_of_200_megapixels_is_read(tmp_path: Path, kind: str) -> None:
     """Pillow's own limit is 179."""

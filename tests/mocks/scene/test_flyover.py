@@ -49,7 +49,7 @@ def bowtie_centre(grey: NDArray[np.float32], near: tuple[float, float]) -> tuple
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_painted_targets_are_found_where_the_pose_projects_them(terrain: TerrainScene) -> None:
     seen = 0
     for number, target in enumerate(terrain.ground.targets):

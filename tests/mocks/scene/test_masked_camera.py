@@ -242,7 +242,7 @@ def test_wrong_options_are_refused(flying: MaskedCamera) -> None:
         reference_camera(1, law="magic")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_full_sensor_makes_a_frame() -> None:
     shot = reference_camera(1).expose(3.0, 1)
     assert shot.raw.shape == (2776, 3688)

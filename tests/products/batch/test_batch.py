@@ -387,7 +387,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
         yield made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_scheduler_without_workers_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "_WORKERS_S", 0.2)
@@ -395,7 +395,7 @@ def test_a_scheduler_without_workers_is_a_sentence(tmp_path: Path, monkeypatch: 
         list(workers.on_cluster([job("1")], answer, alone.address()))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_makes_the_same_bytes_as_the_pool(cluster: Cluster, flight: Flown, tmp_path: Path) -> None:
     url = cluster.address()
     assert main(words(flight, tmp_path / "pool", "--workers", "2")) == 0
@@ -405,7 +405,7 @@ def test_a_cluster_makes_the_same_bytes_as_the_pool(cluster: Cluster, flight: Fl
     assert len(pool) == 6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cluster_that_loses_a_worker_loses_nothing(cluster: Cluster, tmp_path: Path) -> None:
     jobs: Sequence[Job] = [job(f"dies-once:{tmp_path}/a"), *(job(str(n)) for n in range(10))]
     done = list(workers.on_cluster(jobs, answer, cluster.address()))

@@ -299,7 +299,7 @@ def test_attributes_of_a_wrong_kind_are_named(group: Path, name: str, value: obj
 # --- large and honest
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("kind", [".zarr", ".npz", ".h5"])
 def test_a_light_field_of_half_a_gigabyte_opens(tmp_path: Path, kind: str) -> None:
     rng, field = np.random.default_rng(4), light_field(views=5)

@@ -22,7 +22,7 @@ from tests.products.handover.handed import NAMES, close, true_world
 from tests.system.peers.mavproxy import PYTHON
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.long,
     pytest.mark.peers,
     pytest.mark.skipif(not PYTHON.exists(), reason="pycolmap is not set up: run `make peers`"),
 ]

@@ -104,7 +104,7 @@ def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pyte
     assert sorted(path for path in short_flight.folder.rglob("*")) == before  # the recording is as it was
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_neighbouring_frames_have_one_colour(short_flight: Flown, tmp_path: Path) -> None:
     assert main(words(short_flight, tmp_path, "--each", "--as", "cog")) == 0
     pictures = []
@@ -157,7 +157,7 @@ def test_terrain_and_difference(short_flight: Flown, tmp_path: Path, capsys: pyt
         assert np.nanmax(np.abs(read.read(1))) < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frames_are_laid_on_heights_that_they_showed_themselves(short_flight: Flown, tmp_path: Path) -> None:
     """Where each pixel really lies the simulation knows; on flat ground what stands up leans."""
     assert main(words(short_flight, tmp_path, "--as", "terrain", "--gsd", "0.05")) == 0
@@ -201,7 +201,7 @@ def later_flight(short_flight: Flown, tmp_path: Path) -> Path:
     return begun.folder.path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frames_and_control_points_are_the_first_flights_alone(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:
@@ -214,7 +214,7 @@ def test_frames_and_control_points_are_the_first_flights_alone(
     assert (tmp_path / "maps" / "difference.tif").is_file()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_control_point_of_a_frame_that_is_left_out_is_noted(
     short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -246,7 +246,7 @@ def test_a_base_map_elsewhere_leaves_the_recorded_poses(short_flight: Flown, tmp
     assert report["files"] == ["footprints.geojson"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:
@@ -259,7 +259,7 @@ def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     assert why.startswith(f"no difference to {later_flight}: no two frames")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_several_flights_are_each_compared_with_the_first(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:
@@ -298,7 +298,7 @@ def test_a_change_on_the_ground_stands_out_of_another_hours_light() -> None:
         difference.of_pictures(first, elsewhere)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_frames_that_cant_be_placed_are_named_and_the_flight_goes_on(tmp_path: Path, short_flight: Flown) -> None:
     """A frame without a tag, one without a position, one that looks at the horizon, and a good one."""
     raw = sorted((short_flight.folder / "frames").iterdir())[0].read_bytes()

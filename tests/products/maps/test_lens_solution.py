@@ -116,7 +116,7 @@ def test_flat_ground_seen_from_one_height_does_not_tell_the_distance() -> None:
     assert found.sigmas[0] > 0.5 * LENS_SIGMAS[0]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.peers
 @pytest.mark.skipif(not PYTHON.exists(), reason="pycolmap is not set up: run `make peers`")
 def test_colmap_finds_the_same_lens_from_the_same_sightings(tmp_path: Path) -> None:

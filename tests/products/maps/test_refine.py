@@ -29,7 +29,7 @@ from tests.products.flown import Flown
 from tests.products.maps.test_eye import eye_at
 from tests.products.maps.test_self_calibration import control
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 TIMES = tuple(1.0 + 0.6 * k for k in range(5))
 
 

@@ -62,7 +62,7 @@ def control(made: Flown, path: Path) -> Path:
     return path
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_flight_tells_its_lens(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The profile is 2 % and 0.3 mm wrong; the simulated lens is 50 mm from the sensor's middle, without distortion."""
     made = short_flight

@@ -198,7 +198,7 @@ def test_wrong_calls_get_a_sentence(more: list[str], said: str, capsys: pytest.C
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("height_m", [5.0, 10.0, 20.0, 40.0])
 def test_one_frame_is_better_than_a_plane(height_m: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A slope of five σ (Eq 5: σ grows with the square of the height) across a quarter of the reference sensor."""
