@@ -34,12 +34,16 @@ class Level(IntEnum):
 class Code(StrEnum):
     """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""
 
+    CAMERA_CLOCK_FAR = "camera.clock_far"
     CARD_CHANGED = "card.changed"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"
     FRAME_UNCONFIRMED = "frame.unconfirmed"
     LINK_SAME_IDS = "link.same_ids"
+    PICTURE_NAMES_DISAGREE = "picture.names_disagree"
     PICTURE_ON_CARD = "picture.on_card"
+    PICTURE_RIVAL_SHOTS = "picture.rival_shots"
+    PICTURE_UNDATED = "picture.undated"
     TIME_WEEK_ROLLOVER = "time.week_rollover"
 
 

@@ -10,6 +10,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
+from dappled import picture_order
 from dappled.cli.arguments import metres, positive
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.lightfield import LightField
@@ -56,7 +57,9 @@ def frames(given: Sequence[Path]) -> list[Path]:
             continue
         flight = (path / "flight.toml").is_file()
         folder = path / "frames" if flight else path
-        inside = sorted(one for one in folder.iterdir() if _is_frame(one) and (not flight or one.stem.isdigit()))
+        inside = picture_order.by_name(
+            (one for one in folder.iterdir() if _is_frame(one) and (not flight or one.stem.isdigit())), Path.as_posix
+        )
         if not inside:
             kinds = ", ".join(FRAME_SUFFIXES)
             raise DappledError(f"{folder} holds no frame ({kinds}): name frames, a folder of frames, or a flight")

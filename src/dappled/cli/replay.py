@@ -26,6 +26,7 @@ from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
+from dappled.findings import told
 from dappled.flight import LIVE, layout
 from dappled.flight.checks import flight_check
 
@@ -97,6 +98,8 @@ def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight)) if is_flight else {}
     recipe = _recipe(arguments, facts, settings)
     recording = _recording(arguments, is_flight)
+    for one in recording.findings:
+        print(f"{one.level.word}: {told(one)}", file=sys.stderr)
     flown = _as_recorded(arguments, facts, recipe)
     progress = PrintedProgress(as_json=arguments.json)
     with ExitStack() as stack:

@@ -18,8 +18,10 @@ from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayP
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
+from dappled.findings import told
 from dappled.flight import Cause, FlightError, Shot
 from tests.daemon.fakes import FakeCamera, FakeDecoder, failed, fired, good, rig
+from tests.simulated.finepix import picture
 
 
 def record(flights: Path) -> Path:
@@ -146,6 +148,20 @@ def test_a_folder_of_frames(tmp_path: Path) -> None:
     found = replay.of_folder(tmp_path, "*", None, 1_000, 2.0)
     assert [one.camera_name for one in found.files] == ["a.png", "b.png"]
     assert [shot.wished_utc_ns for shot in found.shots] == [1_000, 2_000_001_000]
+
+
+def test_a_folder_s_frames_stand_by_time_or_as_cameras_count(tmp_path: Path) -> None:
+    for name in ("IMG_0001.png", "IMG_0002.png", "IMG_9998.png", "IMG_9999.png"):
+        (tmp_path / name).write_bytes(b"undated")
+    found = replay.of_folder(tmp_path, "*", None, 0, 1.0)
+    assert [one.camera_name[4:8] for one in found.files] == ["9998", "9999", "0001", "0002"]
+    assert found.findings == ()
+    for name, taken_s in (("frame_2.RAF", 120), ("frame_10.RAF", 130), ("frame_11.RAF", 60)):
+        (tmp_path / name).write_bytes(picture(1, 6.3, taken_s))
+    found = replay.of_folder(tmp_path, "*.RAF", None, 0, 1.0)
+    assert [one.camera_name for one in found.files] == ["frame_11.RAF", "frame_2.RAF", "frame_10.RAF"]
+    said = "picture frame_11.RAF: its name comes after frame_10.RAF, but it was taken 70 s earlier, and time counts"
+    assert [told(one).rpartition(": ")[0] for one in found.findings] == [said]
 
 
 @pytest.mark.parametrize(

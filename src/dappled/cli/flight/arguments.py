@@ -78,6 +78,7 @@ def configure_pickup(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--pair", action="append", default=[], type=_pair, metavar="INDEX=NAME", help="this file belongs to this shot"
     )
+    parser.add_argument("--anyway", action="store_true", help="exit 0 also where something is in doubt")
     parser.add_argument("--dry-run", action="store_true", help="only say what would be done")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from dappled import findings
 from dappled.cli import sealing
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import pickup
@@ -15,13 +16,15 @@ from dappled.daemon.replay.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.errors import counted
+from dappled.findings import Level
 
 
 def run(flight: Path, arguments: argparse.Namespace) -> int:
     source = parse_source(arguments.source, PtpSource)
     choice = Choice(dict(arguments.pair), arguments.offset, arguments.any_clock, arguments.by_order)
     try:
-        proposal = pickup.propose(flight, source, choice)
+        with tqdm(unit="B", unit_scale=True, disable=None, delay=1.0, desc="comparing") as bar:
+            proposal = pickup.propose(flight, source, choice, bar.update)
         picked = None
         if not arguments.dry_run:
             total = sum(group.main.size for _, group in proposal.pairs)
@@ -31,7 +34,7 @@ def run(flight: Path, arguments: argparse.Namespace) -> int:
     finally:
         source.close()
     (_print_json if arguments.json else _print)(flight, proposal, picked)
-    return 1 if proposal.missing or proposal.doubts else 0
+    return 1 if proposal.missing or (proposal.doubts and not arguments.anyway) else 0
 
 
 def _print(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
@@ -39,8 +42,8 @@ def _print(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
     for index, group in proposal.pairs:
         others = "".join(f" and {other.base}" for other in group.companions)
         print(f"shot {index:6d}  {word} {group.main.name}{others}  {proposal.reasons[index]}")
-    for text in proposal.doubts:
-        print(f"in doubt:    {text}")
+    for one in findings.in_order(proposal.findings):
+        print(f"{'in doubt' if one.level > Level.NOTE else one.level.word}:".ljust(13) + findings.told(one))
     for index in proposal.missing:
         print(f"shot {index:6d}  has no file")
     if proposal.strangers:
@@ -69,7 +72,8 @@ def _print_json(flight: Path, proposal: Proposal, picked: Picked | None) -> None
                     }
                     for index, group in proposal.pairs
                 ],
-                "doubts": list(proposal.doubts),
+                "findings": [one.to_json() for one in findings.in_order(proposal.findings)],
+                "doubts": [findings.told(one) for one in findings.in_order(proposal.doubts)],
                 "missing": list(proposal.missing),
                 "strangers": list(proposal.strangers),
                 "there_already": proposal.there_already,

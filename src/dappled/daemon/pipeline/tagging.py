@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol, Self
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, clocks
@@ -76,13 +76,22 @@ class Zoom:
         return f"the focal length is {focal_length_mm:g} mm; it was {before[1]:g} mm at frame {before[0]}"
 
 
-def tag(frame: Frame, exposure: ExposureTime, settings: FrameSettings, *, camera: str, mask: str, pose: Pose) -> Tag:
-    """All that is known of a frame, in one record."""
+def tag(
+    frame: Frame,
+    exposure: ExposureTime,
+    settings: FrameSettings,
+    *,
+    camera: str,
+    mask: str,
+    pose: Pose,
+    doubt: str = "",
+) -> Tag:
+    """All that is known of a frame, in one record. `doubt` says why it may be another shot's."""
     return Tag(
         index=frame.index,
         utc_ns=exposure.utc_ns,
         utc_sigma_ns=exposure.sigma_ns,
-        time_source=exposure.source,
+        time_source=f"{exposure.source}; in doubt: {doubt}" if doubt else exposure.source,
         focal_length_mm=settings.focal_length_mm,
         f_number=settings.f_number,
         exposure_s=settings.exposure_s,
@@ -147,10 +156,9 @@ class Tagging:
         # The time of a file that may belong to another shot says nothing about the camera's clock.
         if pending.fired and not pending.doubt and (shown := clocks.camera_time(settings.taken)):
             self._camera_clock = self._camera_clock.learnt(*shown, exposure)
-        if pending.doubt:
-            exposure = replace(exposure, source=f"{exposure.source}; in doubt: {pending.doubt}")
         camera = camera_name(self._names.camera, settings.model)
-        pending.tag = tag(frame, exposure, settings, camera=camera, mask=self._names.mask, pose=pose)
+        mask, doubt = self._names.mask, pending.doubt
+        pending.tag = tag(frame, exposure, settings, camera=camera, mask=mask, pose=pose, doubt=doubt)
         self._ends.writer.tagged(pending.tag)
         pending.body_c = settings.temperature_c
         pending.rates_rad_s = self._rates(pose)

@@ -15,17 +15,21 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from dappled import durable
 from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency, clocks, recorded_vehicles
 from dappled.daemon.pipeline import tagging
 from dappled.daemon.pipeline.tagging import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry, tagging_rules
+from dappled.drivers.camera import CameraError
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
-from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching, in_order, match
+from dappled.drivers.wired import matching
+from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import DappledError, counted
+from dappled.findings import Code, Finding, Level, Subject, finding, text, told
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
 from dappled.flight.seal_key import SealKey
@@ -38,8 +42,8 @@ class PickupError(DappledError):
 @dataclass(frozen=True, slots=True)
 class Choice:
     """What a person says about the matching. `pairs`: image index → file name (or its last part). `offset_s`: the
-    camera's clock minus UTC. `any_clock`: it may be off by more than a day. `by_order`: take files in the order of
-    their names where there are as many as shots."""
+    camera's clock minus UTC. `any_clock`: it may be off by more than a day. `by_order`: take files in their order where
+    there are as many as shots."""
 
     pairs: Mapping[int, str] = field(default_factory=dict)
     offset_s: float | None = None
@@ -49,19 +53,24 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What would be picked up: `pairs` (image index, file), each for a reason; what is open, and why.
+    """What would be picked up: `pairs` (image index, file), each for a reason; what was found, such as a doubt.
 
     `missing`: shots without a file. `strangers`: files that belong to no shot of the flight. `there_already`: files
-    that the flight has. `offset_s`: the camera's clock minus UTC, as the pairs show it.
+    whose bytes the flight has. `offset_s`: the camera's clock minus UTC, as the pairs show it.
     """
 
     pairs: tuple[tuple[int, FileGroup], ...]
     reasons: Mapping[int, str]
-    doubts: tuple[str, ...]
+    findings: tuple[Finding, ...]
     missing: tuple[int, ...]
     strangers: tuple[str, ...]
     there_already: int
     offset_s: float | None
+
+    @property
+    def doubts(self) -> list[Finding]:
+        """What a person should look at."""
+        return [one for one in self.findings if one.level > Level.NOTE]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,46 +82,56 @@ class Picked:
     zooms: tuple[str, ...]
 
 
-def propose(flight: Path, source: FileSource, choice: Choice) -> Proposal:
-    """Which files belong to which shots. Changes nothing. Raises PickupError, FlightError, CameraError."""
+def propose(
+    flight: Path, source: FileSource, choice: Choice, progress: Callable[[int], Any] = lambda _: None
+) -> Proposal:
+    """Which files belong to which shots. Changes nothing. `progress` gets the bytes that were compared. Raises
+    PickupError, FlightError, CameraError."""
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
         if "closed_utc_ns" not in ledger.facts():
             raise PickupError(f"{flight} is still being recorded, or was never closed: stop the daemon first")
         rows = {row.shot.index: row for row in ledger.shots()}
-        frames = ledger.frames()
+        had = ledger.frames() + ledger.companions()
+        files = {row.sha256: (row.size, row if isinstance(row, Frame) else None) for row in reversed(ledger.files())}
     found = groups(source.list())
-    had = {(frame.camera_name.lower(), frame.size): frame for frame in frames}
-    known = {group.main.name: had.get((group.main.base.lower(), group.main.size)) for group in found}
-    fresh = [group for group in found if known[group.main.name] is None]
+    same = _same(source, [group.main for group in found], files, progress)
+    known = {name: row for name, row in same.items() if row is not None}
+    fresh = [group for group in found if group.main.name not in known]
     times = {group.main.name: source.taken_s(group.main) for group in found}
     waiting = [
         _fired(row) for row in rows.values() if row.state == "failed" and row.fired_called_monotonic_ns is not None
     ]
-    chosen = _chosen(choice, fresh, rows)
+    chosen = _chosen(choice, fresh, known, rows)
     taken = {group.main.name for group in chosen.values()}
     shots = [shot for shot in waiting if shot.index not in chosen]
-    files = [DatedFile(group.main.name, times[group.main.name]) for group in fresh if group.main.name not in taken]
+    left = [DatedFile(group.main.name, times[group.main.name]) for group in fresh if group.main.name not in taken]
     anchors = [
         (times[name], _fired(rows[frame.index]))
         for name, frame in known.items()
-        if frame is not None and rows[frame.index].fired_called_monotonic_ns is not None
+        if rows[frame.index].fired_called_monotonic_ns is not None
     ]
     offset_s = choice.offset_s if choice.offset_s is not None else _offset(anchors)
-    matched = _matched(shots, files, choice, offset_s)
+    matched = _matched(shots, left, choice, offset_s)
     by_name = {group.main.name: group for group in fresh}
     pairs = [(index, by_name[name]) for index, name in matched.pairs] + list(chosen.items())
     reason = _reason(choice, matched)
     reasons = {index: "as you said" if index in chosen else reason for index, _ in pairs}
-    doubtful = {text.split(" ", 1)[0] for text in matched.doubts}
+    doubtful = {one.subject.which for one in matched.doubts}
+    nobodys = [name for name in matched.files if name not in doubtful]
+    offset_s = matched.offset_s if matched.offset_s is not None else offset_s
+    dated = [DatedFile(name, time_s) for name, time_s in times.items()]
+    named = [(index, group.main.name) for index, group in pairs]
+    off = matching.disagreeing(named, [_fired(rows[index]) for index, _ in pairs], dated, offset_s)
+    changed = _changed_card([group.main for group in found], same, had)
     return Proposal(
         tuple(sorted(pairs, key=lambda pair: pair[0])),
         reasons,
-        matched.doubts,
+        (*changed, *matched.doubts, *off),
         matched.shots,
-        tuple(name for name in matched.files if name not in doubtful),
-        len(found) - len(fresh),
-        matched.offset_s if matched.offset_s is not None else offset_s,
+        tuple(name for name in nobodys if name not in same),
+        len(known) + sum(name in same for name in nobodys),
+        offset_s,
     )
 
 
@@ -149,9 +168,15 @@ def bring(
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
         stack.callback(recorder.close)
+        for one in proposal.findings:
+            if one.code is Code.CARD_CHANGED:
+                ledger.add_event("card changed", told(one))
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
             ledger.add_event("picked up", f"{group.main.name}: {proposal.reasons[number]}", number)
+            doubt = next((text(one) for one in proposal.doubts if one.subject == Subject("frame", number)), "")
+            if doubt:
+                ledger.add_event("doubt", doubt, number)
             for other in group.companions:
                 _accompany(recorder, source, number, other, clock.utc_ns())
                 companions += 1
@@ -162,7 +187,8 @@ def bring(
             exposure = clocks.owned(exposure, row.shot, latency)
             exposure, pose = telemetry.pose(number, exposure)
             camera = camera_name(names.get("camera", "auto"), facts_of.model)
-            ledger.add_tag(tagging.tag(frame, exposure, facts_of, camera=camera, mask=names.get("mask", ""), pose=pose))
+            mask = names.get("mask", "")
+            ledger.add_tag(tagging.tag(frame, exposure, facts_of, camera=camera, mask=mask, pose=pose, doubt=doubt))
             index.put(IndexEntry(number, folder.name, frame.name, "safe"))
             if zoomed := zoom.look(number, facts_of.focal_length_mm):
                 zooms.append(f"frame {number}: {zoomed}")
@@ -187,7 +213,48 @@ def _offset(anchors: list[tuple[float | None, FiredShot]]) -> float | None:
     return median(offsets) if offsets else None
 
 
-def _chosen(choice: Choice, fresh: list[FileGroup], rows: Mapping[int, ShotRow]) -> dict[int, FileGroup]:
+def _same(
+    source: FileSource,
+    found: list[FoundFile],
+    had: Mapping[str, tuple[int, Frame | None]],
+    progress: Callable[[int], Any],
+) -> dict[str, Frame | None]:
+    """The files whose bytes the flight has, by name, with the frame that they are; None for a stray.
+
+    `had`: size and frame by hash. Only files of a size that it has are read. Raises CameraError.
+    """
+    sizes = {size for size, _ in had.values()}
+    same = {}
+    for one in found:
+        if one.size in sizes:
+            sha256 = _sha256(source, one)
+            progress(one.size)
+            if sha256 in had:
+                same[one.name] = had[sha256][1]
+    return same
+
+
+def _sha256(source: FileSource, found: FoundFile) -> str:
+    blob = source.open(found)
+    try:
+        return durable.hash_descriptor(blob.fd, blob.size)
+    except (OSError, EOFError) as error:
+        raise CameraError(f"{found.name} can't be read: {error}") from error
+    finally:
+        blob.close()
+
+
+def _changed_card(found: list[FoundFile], same: Mapping[str, Frame | None], had: list[Frame]) -> list[Finding]:
+    """That this card isn't the one which files came from: it has other bytes under their names, and not theirs."""
+    here = {row.sha256 for row in same.values() if row is not None}
+    names = {row.camera_name.lower() for row in had if row.sha256 not in here}
+    other = [one.name for one in found if one.name not in same and one.base.lower() in names]
+    return [finding(Code.CARD_CHANGED, Subject("card"), pictures=len(other), first=other[0])] if other else []
+
+
+def _chosen(
+    choice: Choice, fresh: list[FileGroup], known: Mapping[str, Frame], rows: Mapping[int, ShotRow]
+) -> dict[int, FileGroup]:
     chosen: dict[int, FileGroup] = {}
     for index, name in choice.pairs.items():
         row = rows.get(index)
@@ -198,6 +265,9 @@ def _chosen(choice: Choice, fresh: list[FileGroup], rows: Mapping[int, ShotRow])
         if row.fired_called_monotonic_ns is None:
             raise PickupError(f"--pair {index}={name}: shot {index} never fired, according to the flight: {row.reason}")
         fitting = [group for group in fresh if name in (group.main.name, group.main.base)]
+        frames = [frame.index for full, frame in known.items() if name in (full, full.rpartition("/")[2])]
+        if frames and not fitting:
+            raise PickupError(f"--pair {index}={name}: its bytes are the frame of shot {frames[0]} already")
         if len(fitting) != 1:
             raise PickupError(f"--pair {index}={name}: {len(fitting)} new files have this name; give the full name")
         chosen[index] = fitting[0]
@@ -206,14 +276,23 @@ def _chosen(choice: Choice, fresh: list[FileGroup], rows: Mapping[int, ShotRow])
 
 def _matched(shots: list[FiredShot], files: list[DatedFile], choice: Choice, offset_s: float | None) -> Matching:
     if choice.by_order:
-        pairs = in_order(shots, files)
+        pairs = matching.in_order(shots, files)
         if pairs is None:
             raise PickupError(
                 f"--by-order needs as many files as shots: {counted(len(shots), 'shot')}, {counted(len(files), 'file')}"
             )
-        return Matching(pairs, (), (), ())
+        return Matching(pairs, (), (), tuple(_against(files)))
     plausible_s = math.inf if choice.any_clock else PLAUSIBLE_S
-    return match(shots, files, offset_s=offset_s, plausible_s=plausible_s)
+    return matching.match(shots, files, offset_s=offset_s, plausible_s=plausible_s)
+
+
+def _against(files: list[DatedFile]) -> list[Finding]:
+    """Where the order of names contradicts the times most."""
+    against = matching.by_time(files).against
+    if against is None:
+        return []
+    before, name, earlier_s = against
+    return [finding(Code.PICTURE_NAMES_DISAGREE, Subject("picture", name), before=before, earlier_s=earlier_s)]
 
 
 def _reason(choice: Choice, matched: Matching) -> str:

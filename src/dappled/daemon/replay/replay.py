@@ -11,7 +11,7 @@ from pathlib import Path
 from time import sleep
 from typing import Any, Self
 
-from dappled import __version__, confined, durable
+from dappled import __version__, confined, durable, picture_order
 from dappled.clock import RecordedClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
@@ -21,8 +21,11 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
+from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot
+from dappled.drivers.wired.matching import seconds
 from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import (
     LIVE,
     Cause,
@@ -47,7 +50,7 @@ class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
     each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
     `Telemetry`); `elsewhere` another platform or other versions that it was recorded with; `rules` those it was
-    tagged by."""
+    tagged by; `findings` what was found in a folder of frames."""
 
     root: Path
     shots: Sequence[Shot]
@@ -58,6 +61,7 @@ class RecordedFlight:
     vehicles: Sequence[tuple[int, int]] = ()
     elsewhere: str | None = None
     rules: int = TAGGING_RULES
+    findings: tuple[Finding, ...] = ()
 
 
 def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
@@ -120,13 +124,16 @@ def _elsewhere(recorded: Mapping[str, str]) -> str | None:
 def of_folder(
     folder: Path, match: str, telemetry: Path | None, start_utc_ns: int | None, interval_s: float
 ) -> RecordedFlight:
-    """Frames in a folder, in the order of their names; the first at `start_utc_ns` (None: the telemetry's first
-    position, or 1970 without telemetry), the others at `interval_s` after each other. A single .tlog (or, without
-    one, a single .bin of ArduPilot or .ulg of PX4) in the folder is the telemetry, where none is named."""
+    """Frames in a folder, in the order of their EXIF's times or else of their names; the first at `start_utc_ns` (None:
+    the telemetry's first position, or 1970 without telemetry), the others at `interval_s` after each other. A single
+    .tlog (or, without one, a single .bin of ArduPilot or .ulg of PX4) in the folder is the telemetry, where none is
+    named."""
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
-    paths = [path for path in sorted(folder.glob(match)) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
+    named = [path for path in folder.glob(match) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
+    ordered = picture_order.by_time(named, Path.as_posix, _taken_s)
+    paths = ordered.items
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     if start_utc_ns is None:
@@ -146,7 +153,20 @@ def of_folder(
         shots.append(shot)
         files.append(RecordedShot(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
-    return RecordedFlight(folder, shots, files, expected, telemetry, {})
+    found: tuple[Finding, ...] = ()
+    if ordered.against is not None:  # the better evidence decides
+        before, name, earlier_s = ordered.against
+        code, subject = Code.PICTURE_NAMES_DISAGREE, Subject("picture", Path(name).name)
+        found = (finding(code, subject, Level.NOTE, before=Path(before).name, earlier_s=earlier_s),)
+    return RecordedFlight(folder, shots, files, expected, telemetry, {}, findings=found)
+
+
+def _taken_s(path: Path) -> float | None:
+    try:
+        with path.open("rb") as file:
+            return seconds(read_exif(file).taken)
+    except OSError as error:
+        raise ReplayError(f"{path} can't be read: {error.strerror}") from None
 
 
 def _only_log(folder: Path) -> Path | None:

@@ -7,12 +7,17 @@ as doubtful, never guessed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from statistics import median
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dappled import picture_order
+from dappled.findings import Code, Finding, Subject, finding
+from dappled.picture_order import PicturesInOrder
 
 WINDOW_S = 1.6
 """How much offsets of true pairs differ: by the whole second of the camera's time, and the spread of its latency."""
@@ -40,7 +45,7 @@ class DatedFile:
 
 @dataclass(frozen=True, slots=True)
 class Matching:
-    """`pairs` are certain. `shots` and `files` are left over; each doubtful file has a sentence in `doubts`.
+    """`pairs` are certain. `shots` and `files` are left over; each doubtful file has a finding in `doubts`.
 
     `offset_s` is the camera's clock minus that of the shots, None where no pair is certain.
     """
@@ -48,7 +53,7 @@ class Matching:
     pairs: tuple[tuple[int, str], ...]
     shots: tuple[int, ...]
     files: tuple[str, ...]
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
     offset_s: float | None = None
 
 
@@ -64,12 +69,8 @@ def match(
     `offset_s` is the camera's clock minus the shots' where it is known; else every offset up to `plausible_s` is tried.
     """
     shots = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
-    dated = sorted((f for f in files if f.taken_s is not None), key=lambda f: (f.taken_s, f.name))
-    doubts = [
-        f"{f.name} has no time: name its shot with --pair, or pair all files with --by-order"
-        for f in files
-        if f.taken_s is None
-    ]
+    dated = by_time([f for f in files if f.taken_s is not None]).items
+    doubts = [finding(Code.PICTURE_UNDATED, Subject("picture", f.name)) for f in files if f.taken_s is None]
     fired = np.array([shot.fired_s for shot in shots], dtype=np.float64)
     taken = np.array([f.taken_s for f in dated], dtype=np.float64)
     if not len(fired) or not len(taken):
@@ -78,10 +79,10 @@ def match(
     starts = _starts(offsets, offset_s, plausible_s)
     if not len(starts):
         days = abs(float(np.median(offsets))) / 86400
-        doubts.append(f"the camera's clock is {days:.0f} days away from the flight's: do these files belong to it?")
+        doubts.append(finding(Code.CAMERA_CLOCK_FAR, Subject("camera"), days=days))
         return _left(shots, files, (), doubts, None)
     sure, possible = _best(offsets, starts)
-    doubts += _doubts(shots, dated, sure, possible)
+    doubts += _rivals(shots, dated, sure, possible)
     pairs = tuple((shots[i].index, dated[j].name) for i, j in sure)
     middle = float(np.median([offsets[i, j] for i, j in sure])) if sure else None
     return _left(shots, files, pairs, doubts, middle)
@@ -91,9 +92,28 @@ def in_order(shots: Sequence[FiredShot], files: Sequence[DatedFile]) -> tuple[tu
     """Pair by order alone where there are as many shots as files; else return None."""
     if len(shots) != len(files):
         return None
-    by_time = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
-    by_name = sorted(files, key=lambda f: f.name)
-    return tuple((shot.index, f.name) for shot, f in zip(by_time, by_name, strict=True))
+    fired = sorted(shots, key=lambda shot: (shot.fired_s, shot.index))
+    return tuple((shot.index, f.name) for shot, f in zip(fired, by_time(files).items, strict=True))
+
+
+def by_time(files: Sequence[DatedFile]) -> PicturesInOrder[DatedFile]:
+    """The files in the order in which they were taken."""
+    return picture_order.by_time(files, lambda f: f.name, lambda f: f.taken_s)
+
+
+def disagreeing(
+    pairs: Iterable[tuple[int, str]], shots: Sequence[FiredShot], files: Sequence[DatedFile], offset_s: float | None
+) -> list[Finding]:
+    """The pairs that the camera's clock doesn't confirm: they differ from `offset_s` (None: from their median)."""
+    fired, taken = {shot.index: shot.fired_s for shot in shots}, {f.name: f.taken_s for f in files}
+    times = [(index, fired[index], taken[name]) for index, name in pairs if index in fired]
+    offsets = {index: taken_s - fired_s for index, fired_s, taken_s in times if taken_s is not None}
+    middle_s = offset_s if offset_s is not None else median(offsets.values()) if offsets else 0.0
+    return [
+        finding(Code.FRAME_CLOCK_DISAGREES, Subject("frame", index), off_s=one_s - middle_s)
+        for index, one_s in offsets.items()
+        if abs(one_s - middle_s) > WINDOW_S
+    ]
 
 
 def seconds(taken: str | None) -> float | None:
@@ -178,26 +198,26 @@ def _longest(fits: NDArray[np.bool_]) -> NDArray[np.int64]:
     return table
 
 
-def _doubts(
+def _rivals(
     shots: Sequence[FiredShot], files: Sequence[DatedFile], sure: list[tuple[int, int]], possible: NDArray[np.bool_]
-) -> list[str]:
+) -> list[Finding]:
     settled = {j for _, j in sure}
-    sentences = []
+    found = []
     for j, one in enumerate(files):
         if j in settled:
             continue
         candidates = [str(shots[int(i)].index) for i in np.nonzero(possible[:, j])[0]]
         if candidates:
             which = " or ".join(candidates[:4]) + (" …" if len(candidates) > 4 else "")
-            sentences.append(f"{one.name} may be of shot {which}: order, count and time don't decide it")
-    return sentences
+            found.append(finding(Code.PICTURE_RIVAL_SHOTS, Subject("picture", one.name), shots=which))
+    return found
 
 
 def _left(
     shots: Sequence[FiredShot],
     files: Sequence[DatedFile],
     pairs: tuple[tuple[int, str], ...],
-    doubts: Sequence[str],
+    doubts: Sequence[Finding],
     offset_s: float | None,
 ) -> Matching:
     indices, names = {index for index, _ in pairs}, {name for _, name in pairs}

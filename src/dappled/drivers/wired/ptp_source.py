@@ -14,6 +14,7 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
+from dappled import picture_order
 from dappled.drivers.camera import Blob, CameraError
 from dappled.drivers.child_process import (
     ChannelError,
@@ -125,7 +126,7 @@ class _Files:
         session = self._session = self._open(self._settings)
         rows = [
             (f"{file.folder}/{file.name}", *session.about(file))
-            for file in sorted(session.files(), key=lambda file: (file.folder, file.name))
+            for file in picture_order.by_name(session.files(), lambda file: f"{file.folder}/{file.name}")
             if file.name.lower().endswith(SUFFIXES)
         ]
         return Blob.of(json.dumps(rows).encode(), "listing")

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
+from dappled import picture_order
 from dappled.drivers.camera import Blob, CameraError
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.wired.matching import seconds
@@ -79,7 +80,7 @@ def groups(found: list[FoundFile]) -> list[FileGroup]:
     for files in by_stem.values():
         main, *others = sorted(files, key=lambda one: (not one.raw, one.name))
         made.append(FileGroup(main, tuple(others)))
-    return sorted(made, key=lambda group: group.main.name)
+    return picture_order.by_name(made, lambda group: group.main.name)
 
 
 class FolderSource:
@@ -93,7 +94,7 @@ class FolderSource:
         try:
             if not self.folder.is_dir():
                 raise CameraError(f"{self.folder} is not there: check the path, or mount the card")
-            return sorted(self._walk(), key=lambda one: one.name)
+            return picture_order.by_name(self._walk(), lambda one: one.name)
         except OSError as error:
             raise CameraError(f"{self.folder} can't be read: {error.strerror}") from None
 

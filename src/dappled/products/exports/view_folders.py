@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from dappled import picture_order
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.pictures import open_picture
@@ -31,7 +32,7 @@ def read(folder: Path) -> LightField:
     The light field has no slices, and `cameras` among its attributes. If the folder contains HCI's `input_Cam….png`,
     other pictures are ignored. Raises ViewFolderError.
     """
-    files = sorted(p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS)
+    files = picture_order.by_name((p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS), Path.as_posix)
     files = [p for p in files if p.name.startswith("input_Cam")] or files
     side = math.isqrt(len(files))
     if side == 0 or side * side != len(files):

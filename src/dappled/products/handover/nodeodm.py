@@ -21,7 +21,7 @@ from http.client import HTTPException
 from pathlib import Path
 from typing import Any, TypeVar
 
-from dappled import durable
+from dappled import durable, picture_order
 from dappled.bounds.parsing import parse_json
 from dappled.errors import DappledError, printable
 from dappled.products.maps.georeference import Progress
@@ -86,10 +86,10 @@ def _refusal(answer: Path) -> str:
 def pictures(folder: Path) -> list[Path]:
     """The pictures of a folder in order, and geo.txt where it is there. Raises NodeOdmError where there are none."""
     try:
-        inside = sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+        inside = [path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")]
     except OSError as error:
         raise NodeOdmError(f"{folder} can't be read: {error.strerror}; name the folder of the pictures") from None
-    found = [path for path in inside if path.suffix.lower() in PICTURES]
+    found = picture_order.by_name((path for path in inside if path.suffix.lower() in PICTURES), Path.as_posix)
     if len(found) < 2:
         raise NodeOdmError(
             f"{folder} holds {len(found) or 'no'} picture{'s' * (len(found) != 1)} ({', '.join(PICTURES)}), and "
