@@ -35,7 +35,7 @@ def console() -> Iterator[str]:
             f'[record]\ndirectory = "{place}/flights"\n[publish]\nslices = "ipc://{place}/slices"\n'
             '[console]\nbind = "127.0.0.1:0"\n'
         )
-        command = [sys.executable, "-m", "dappled", "run", "--simulate", "--seed", "3", "--config", str(settings)]
+        command = [sys.executable, "-P", "-m", "dappled", "run", "--simulate", "--seed", "3", "--config", str(settings)]
         process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
         try:
             assert process.stderr is not None

@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from bootstrap import ROOT, fetch_uv, find_uv
-from install import FLOWN, service_files
+from install import COMMAND, FLOWN, service_files
 
 HOME = Path("/usr/lib/dappled")
 PYTHONS = {"bookworm": "3.11", "trixie": "3.13"}
@@ -44,7 +44,7 @@ set -e
 if [ "$1" = configure ]; then
   command -v systemd-sysusers >/dev/null && systemd-sysusers dappled.conf
   command -v systemd-tmpfiles >/dev/null && systemd-tmpfiles --create dappled.conf || true
-  PYTHONPATH={HOME} python3 -c "{FLOWN}"
+  PYTHONPATH={HOME} python3 -P -c "{FLOWN}"
   if [ -d /run/systemd/system ]; then
     systemctl daemon-reload || true
     udevadm control --reload || true
@@ -96,9 +96,7 @@ def build(arch: str, suite: str, out: Path) -> Path:
     command = Path("/usr/bin/dappled")
     settings = Path("/etc/dappled/dappled.toml")
     texts = service_files(Path("/usr"), Path("/etc"), command)
-    texts[command] = (
-        f'#!/bin/sh\nPYTHONPATH={HOME}${{PYTHONPATH:+:$PYTHONPATH}} exec /usr/bin/python3 -m dappled "$@"\n'
-    )
+    texts[command] = COMMAND.format(home=HOME, python="/usr/bin/python3")
     texts[settings] = (ROOT / "systemd" / "dappled.toml").read_text(encoding="utf-8")
     texts[Path("/usr/share/doc/dappled/copyright")] = (ROOT / "LICENSE").read_text(encoding="utf-8")
     texts[HOME / "packaged"] = "This copy of dappled belongs to a Debian package.\n"  # see dappled.errors.PACKAGED

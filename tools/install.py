@@ -21,6 +21,8 @@ from bootstrap import ROOT, fetch_uv, find_uv
 
 SYSTEMD = ROOT / "systemd"
 MANIFEST = "lib/dappled/installed.json"
+COMMAND = '#!/bin/sh\nPYTHONPATH={home} exec {python} -P -m dappled "$@"\n'
+"""`-P`, and no PYTHONPATH but its own: a folder that somebody else filled must not lend it modules."""
 FLOWN = "import dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process"
 """Makes bytecode of what a flight loads, not of every dialect of MAVLink: the service itself may not write there."""
 
@@ -74,7 +76,7 @@ def install(place: Place, python: str, in_system: bool) -> int:
         written.append(path)
 
     command = place.prefix / "bin/dappled"
-    put(command, f'#!/bin/sh\nexec {home}/bin/python -m dappled "$@"\n')
+    put(command, COMMAND.format(home="", python=home / "bin/python"))
     place.at(command).chmod(0o755)
     for path, text in service_files(place.prefix, place.sysconfdir, command).items():
         put(path, text)
@@ -143,7 +145,7 @@ def environment(uv: str, python: str, home: Path) -> None:
         call(uv, "pip", "install", "-q", "--no-deps", *into, str(wheel))
     for tests in [path for path in home.glob("lib/python3*/site-packages/*/**/tests") if path.is_dir()]:
         shutil.rmtree(tests)
-    call(str(home / "bin/python"), "-c", FLOWN)
+    call(str(home / "bin/python"), "-P", "-c", FLOWN)
 
 
 def call(*words: str) -> None:

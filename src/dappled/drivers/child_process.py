@@ -212,6 +212,12 @@ def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
 # --- in the parent
 
 
+def python_module(module: str, *arguments: str) -> list[str]:
+    """Return the command that runs a module with this Python. `-P`: Python would look for modules in the current folder
+    first, and that may be a stranger's."""
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
 def start_child(
     module: str,
     *arguments: str,
@@ -229,7 +235,7 @@ def start_child(
     with other:
         try:
             process = subprocess.Popen(
-                [sys.executable, "-m", module, str(other.fileno()), str(os.getpid()), *arguments],
+                python_module(module, str(other.fileno()), str(os.getpid()), *arguments),
                 pass_fds=(other.fileno(), *descriptors),
                 stdin=subprocess.DEVNULL,
                 process_group=0,  # the terminal's ^C is the daemon's to act on, also while this one loads

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import SystemClock
+from dappled.drivers.child_process import python_module
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.mocks.autopilot.on_request import OnRequest
 from dappled.mocks.autopilot.path import FlightPath, TruePose
@@ -306,16 +307,7 @@ class Autopilot:
 
         It was booted `booted_s` before the flight began; less than zero: in flight. `more` are options of the
         process, such as `--forward` and further ports (`--url=…`)."""
-        command = [
-            sys.executable,
-            "-m",
-            "dappled.mocks.autopilot.autopilot",
-            "--with-parent",
-            "--url",
-            url,
-            "--seed",
-            str(seed),
-        ]
+        command = python_module("dappled.mocks.autopilot.autopilot", "--with-parent", "--url", url, "--seed", str(seed))
         command += ["--start-monotonic-ns", str(start_monotonic_ns), "--jitter", str(jitter_s)]
         command += [f"--booted={booted_s}", *more]
         return cls(subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0))

@@ -17,6 +17,7 @@ import sys
 from collections.abc import Sequence
 
 from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundStationError, Outcome
+from dappled.drivers.child_process import python_module
 from dappled.drivers.mavlink import LinkError, MavlinkMessage, mavlink
 
 MANNERS = {
@@ -57,7 +58,7 @@ class GroundStation:
         cls, url: str, count: int, interval_s: float = 0.0, timeout_s: float = 60.0, manners: Sequence[str] = ()
     ) -> GroundStation:
         """Start one that asks for `count` photographs; its lines (JSON) are read by `wait`. See MANNERS."""
-        command = [sys.executable, "-m", "dappled.mocks.autopilot.ground_station", "--url", url, "--count", str(count)]
+        command = python_module("dappled.mocks.autopilot.ground_station", "--url", url, "--count", str(count))
         command += ["--interval", str(interval_s), "--timeout", str(timeout_s)]
         command += [text for one in manners for text in ("--manners", one)]
         return cls(

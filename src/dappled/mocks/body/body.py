@@ -23,6 +23,7 @@ from pathlib import Path
 
 from dappled.clock import SystemClock
 from dappled.config import profiles
+from dappled.drivers.child_process import python_module
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
@@ -105,7 +106,7 @@ class SimulatedBody:
     @classmethod
     def start(cls, options: BodyOptions | None = None) -> SimulatedBody:
         """Start a body's process. Raises BodyError where it ends, or doesn't listen within five minutes."""
-        command = [sys.executable, "-m", "dappled.mocks.body.body", *(options or BodyOptions()).arguments()]
+        command = python_module("dappled.mocks.body.body", *(options or BodyOptions()).arguments())
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         assert process.stdout is not None  # asked for above
         lines = _Lines(process.stdout.fileno())

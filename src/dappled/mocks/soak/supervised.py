@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
+
+from dappled.drivers.child_process import python_module
 
 END_S = 20.0
 
@@ -41,7 +42,7 @@ class Supervised:
     """`dappled run --config FILE`, kept alive. Its output goes to `log`. Use as a context manager."""
 
     def __init__(self, config: Path, log: Path) -> None:
-        self._command = [sys.executable, "-m", "dappled", "run", "--config", str(config)]
+        self._command = python_module("dappled", "run", "--config", str(config))
         self._log = log
         self._process: subprocess.Popen[bytes] | None = None
         self.lives = 0

@@ -9,13 +9,13 @@ import select
 import signal
 import socket
 import subprocess
-import sys
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
 from dappled.config import settings as configuration
+from dappled.drivers.child_process import python_module
 from dappled.mocks.simulation import Simulation
 from dappled.mocks.soak.supervised import Supervised
 
@@ -119,7 +119,7 @@ class Troubles:
         """Start a subscriber that connects, receives something, and then hangs or dies."""
         if len(self._subscribers) >= 4:
             _end(self._subscribers.pop(0))
-        command = [sys.executable, "-m", "dappled", "watch", self._stream, "--timeout", "600"]
+        command = python_module("dappled", "watch", self._stream, "--timeout", "600")
         subscriber = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
         self._subscribers.append(subscriber)
         assert subscriber.stdout is not None

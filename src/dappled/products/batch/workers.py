@@ -23,7 +23,10 @@ from dappled.products.batch.batch import Done, Job
 from dappled.products.extras import need
 
 ATTEMPTS = 3  # a frame that kills this many workers is given up
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1")
+_ENVIRONMENT = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "GDAL_NUM_THREADS"), "1"),
+    "PYTHONSAFEPATH": "1",  # multiprocessing starts `python -c`, which takes modules from the current folder first
+}
 _PATIENCE_S = 10.0  # for the scheduler to answer
 _WORKERS_S = 60.0  # for its first worker to be there
 JOB_S = 900.0  # a frame takes seconds: a worker that has not answered for so long hangs
@@ -124,7 +127,7 @@ def _hired(make: Make) -> _Worker:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_work, args=(there, make), daemon=True)
-    with _environment(_ONE_THREAD):
+    with _environment(_ENVIRONMENT):
         process.start()
     there.close()
     return _Worker(process, here)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json
+from dappled.drivers.child_process import python_module
 from dappled.errors import first_line
 from dappled.products.exports import packed_arrays
 
@@ -48,18 +49,10 @@ def read(
     """
     with tempfile.TemporaryDirectory(prefix="dappled-", ignore_cleanup_errors=True) as folder:
         out = Path(folder, "arrays")
+        wanted = (*names, *(f"{name}{_MAY_LACK}" for name in also))
         try:
             done = subprocess.run(
-                [
-                    sys.executable,
-                    "-m",
-                    _MODULE,
-                    str(path),
-                    str(out),
-                    text_name,
-                    *names,
-                    *(f"{name}{_MAY_LACK}" for name in also),
-                ],
+                python_module(_MODULE, str(path), str(out), text_name, *wanted),
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 timeout=_PATIENCE_S + path.stat().st_size / _BYTES_A_SECOND,
