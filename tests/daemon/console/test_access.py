@@ -92,9 +92,22 @@ def test_the_token_opens(rules: Access, headers: dict[str, str], code: int) -> N
 
 
 def test_a_globe_brings_the_token_in_its_address(rules: Access) -> None:
-    assert status(rules, "GET", "/kml", HOST, f"token={TOKEN}") == 200
+    assert status(rules, "GET", "/kml", HOST, f"token={rules.reading_token}") == 200
+    assert status(rules, "GET", "/kml/7.png", HOST, f"token={rules.reading_token}") == 200
     assert status(rules, "GET", "/kml", HOST) == 401
-    assert status(rules, "GET", "/api/state", HOST, f"token={TOKEN}") == 401  # others' addresses end in logs
+    assert status(rules, "GET", "/kml", HOST, f"token={TOKEN}") == 403  # addresses end in logs
+    assert status(rules, "GET", "/api/state", HOST, f"token={TOKEN}") == 401
+
+
+def test_the_token_of_a_globes_address_opens_nothing_else(rules: Access) -> None:
+    reads = rules.reading_token
+    assert TOKEN not in reads
+    for headers in ({"authorization": f"Bearer {reads}"}, {"cookie": f"{access.COOKIE}={reads}"}):
+        assert status(rules, "GET", "/api/state", {**HOST, **headers}) in (401, 403)
+        assert status(rules, "POST", "/api/shoot", {**OURS, **headers}) in (401, 403)
+    assert status(rules, "POST", "/api/shoot", OURS, f"token={reads}") == 401
+    assert rules.try_token(reads, "10.0.0.9") is not None
+    assert Access("another-token-of-many-letters").reading_token != reads
 
 
 def test_guesses_are_few() -> None:
@@ -105,24 +118,49 @@ def test_guesses_are_few() -> None:
         for n in range(access.GUESSES + 2)
     ]
     assert codes == [403] * access.GUESSES + [429, 429]
-    refusal = rules.try_token(TOKEN, "10.0.0.9")  # the right one waits too: else guesses went on
-    assert refusal is not None
-    assert refusal.status == 429
     clock.advance(access.GUESS_WINDOW_S + 1)
-    assert rules.try_token(TOKEN, "10.0.0.9") is None
+    refusal = rules.try_token("guess", "10.0.0.9")
+    assert refusal is not None
+    assert refusal.status == 403
     assert rules.refused == access.GUESSES + 3
+
+
+def test_the_right_token_is_let_in_whatever_was_guessed() -> None:
+    rules = Access(TOKEN)
+    for number in range(access.GUESSES + 2):
+        rules.try_token(f"guess {number}", "10.0.0.9")
+    assert rules.try_token(TOKEN, "10.0.0.9") is None
+
+
+@pytest.mark.parametrize(("site", "code"), [("cross-site", 403), ("same-site", 403), ("same-origin", 429), ("", 429)])
+def test_guesses_that_pages_of_other_sites_make_a_browser_bring_are_not_its_users(
+    rules: Access, site: str, code: int
+) -> None:
+    headers = {**HOST, **({"sec-fetch-site": site} if site else {})}
+    for number in range(access.GUESSES):
+        assert status(rules, "GET", "/kml", headers, f"token={number}") == 403
+    assert status(rules, "GET", "/kml", headers, "token=x") == code
+
+
+def test_guesses_in_an_address_are_none_at_the_login(rules: Access) -> None:
+    for number in range(access.GUESSES + 1):
+        rules.judge(ConsoleRequest("GET", "/kml", HOST, f"token={number}", "10.0.0.9"))
+    refusal = rules.try_token("mistyped", "10.0.0.9")
+    assert refusal is not None
+    assert refusal.status == 403
 
 
 @pytest.mark.parametrize(
     ("stranger", "operator", "code"),
-    [("10.0.0.9", "10.0.0.8", 200), ("2001:db8::1", "2001:db8:1::1", 200), ("2001:db8::1", "2001:db8::2", 429)],
+    [("10.0.0.9", "10.0.0.8", 403), ("2001:db8::1", "2001:db8:1::1", 403), ("2001:db8::1", "2001:db8::2", 429)],
 )
-def test_a_strangers_guesses_keep_nobody_else_out(stranger: str, operator: str, code: int) -> None:
+def test_guesses_count_for_the_network_that_they_come_from(stranger: str, operator: str, code: int) -> None:
     rules = Access(TOKEN)
     for guess in range(access.GUESSES + 1):
         rules.try_token(f"guess {guess}", stranger)
-    refusal = rules.judge(ConsoleRequest("GET", "/metrics", {**HOST, "authorization": f"Bearer {TOKEN}"}, "", operator))
-    assert (200 if refusal is None else refusal.status) == code
+    refusal = rules.try_token("mistyped", operator)
+    assert refusal is not None
+    assert refusal.status == code
 
 
 def test_addresses_that_guess_are_not_remembered_without_end() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import re
 import socket
 import threading
 import time
@@ -362,6 +363,27 @@ def test_a_globe_gets_link_overlay_and_picture(rig: Rig) -> None:
         assert f"{rig.url}/kml/4.png" in latest
         assert "<LatLonBox>" in latest
         assert client.get("/kml/4.png").headers["content-type"] == "image/png"
+
+
+def test_a_globes_addresses_carry_the_token_that_only_reads(tmp_path: Path) -> None:
+    studio = Studio(None, camera_pose.NADIR.ravel().tolist())
+    token, endpoint = "sesame-sesame-sesame", f"ipc://{tmp_path}/s"
+    channel, other = ProcessChannel.pair()
+    app = ConsoleApp(Feed(endpoint, endpoint, Hub(), studio), studio, DaemonChannel(channel), Access(token), None)
+
+    async def globe_asks() -> None:
+        transport = httpx.ASGITransport(app.asgi())
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:1") as client:
+            link = (await client.get("/kml", headers={"authorization": f"Bearer {token}"})).text
+            assert token not in link
+            address = re.findall(r"http://127.0.0.1:1(/kml/latest.kml\?token=[^<]+)", link)[0]
+            assert (await client.get(address)).status_code == 200
+            assert (await client.get(address.replace("/kml/latest.kml", "/api/state"))).status_code == 401
+
+    asyncio.run(globe_asks())
+    other.close()
+    app.close()
+    channel.close()
 
 
 def events(lines: Iterator[str], kind: str) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import http.client
+import logging
 import socket
 import threading
 import time
@@ -17,9 +18,11 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse, StreamingResponse
 from starlette.routing import Route
 
+from dappled.clock import RecordedClock
 from dappled.daemon.console import connection
 from dappled.daemon.console.__main__ import configuration
 from dappled.daemon.console.connection import Connection
+from dappled.refusals import RefusalLog
 
 WHOLE = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 ENDLESS = b"GET /endless HTTP/1.1\r\nHost: x\r\n\r\n"
@@ -29,7 +32,8 @@ SLOW = b"POST / HTTP/1.1\r\nHost: x\r\nContent-Length: 100\r\n\r\n{"
 async def hello(request: Request) -> PlainTextResponse:
     with contextlib.suppress(ClientDisconnect):
         await request.body()
-    return PlainTextResponse("hello")
+    client = request.client
+    return PlainTextResponse("hello", headers={"x-client": client.host if client else ""})
 
 
 async def endless(_: Request) -> StreamingResponse:
@@ -141,3 +145,35 @@ def test_a_page_that_does_not_read_is_let_go(port: int, crowd: Crowd) -> None:
             assert time.monotonic() < until, "never let go"
             threading.Event().wait(0.05)
     assert sum(ended(one) for one in held) >= 1
+
+
+@pytest.mark.parametrize(
+    ("says", "reason"),
+    [
+        (b"nonsense\r\n\r\n", "a request that is not HTTP"),
+        (
+            b"GET / HTTP/1.1\r\nHost: x\r\nConnection: upgrade\r\nUpgrade: websocket\r\n\r\n",
+            "a request for another protocol than HTTP",
+        ),
+    ],
+)
+def test_requests_that_cant_be_read_are_one_line_of_the_log(
+    crowd: Callable[[int, bytes], list[socket.socket]],
+    says: bytes,
+    reason: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(Connection, "refusals", RefusalLog(logging.getLogger("test"), RecordedClock(10**18)))
+    for _ in range(5):
+        for one in crowd(8, says):
+            assert one.recv(100).startswith(b"HTTP/1.1 ")
+            one.close()
+    assert caplog.messages == [f"127.0.0.1: refused: {reason}"]
+
+
+def test_a_client_is_who_connects_not_who_it_says(port: int) -> None:
+    one = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+    one.request("GET", "/", headers={"X-Forwarded-For": "10.0.0.8", "X-Forwarded-Proto": "https"})
+    assert one.getresponse().getheader("x-client") == "127.0.0.1"
+    one.close()

@@ -39,7 +39,6 @@ def main() -> int:
     """Serve until the daemon ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
     logging.basicConfig(level=logging.WARNING, handlers=[systemd.handler()])
-    logging.getLogger("uvicorn.error").addFilter(worth_logging)
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     reuse_large_blocks()
@@ -72,6 +71,7 @@ async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mappin
 
 def configuration(served: ASGIApp) -> uvicorn.Config:
     """The server's configuration: few connections, which are closed when they ask for nothing."""
+    logging.getLogger("uvicorn.error").addFilter(worth_logging)
     return uvicorn.Config(
         served,
         log_config=None,
@@ -81,6 +81,7 @@ def configuration(served: ASGIApp) -> uvicorn.Config:
         http=Connection,
         loop="asyncio",
         server_header=False,
+        proxy_headers=False,  # X-Forwarded-For is whatever the client says
         backlog=BACKLOG,
         timeout_keep_alive=10,
         timeout_graceful_shutdown=1,
@@ -91,7 +92,10 @@ def configuration(served: ASGIApp) -> uvicorn.Config:
 
 def worth_logging(record: logging.LogRecord) -> bool:
     """Whether a line of uvicorn's is no mere sign of the end: it cancels requests that are not answered by then, such
-    as one that waits for the decoder, and logs a traceback of each."""
+    as one that waits for the decoder, and logs a traceback of each. It warns only of what a peer sends, each time anew:
+    `Connection` counts that."""
+    if record.levelno == logging.WARNING:
+        return False
     error = record.exc_info[1] if record.exc_info else None
     return not isinstance(error, asyncio.CancelledError) and "graceful shutdown" not in record.getMessage()
 
@@ -110,6 +114,7 @@ async def _until_gone(daemon: DaemonChannel, rules: Access, hub: Hub, server: uv
     while not daemon.gone.is_set():
         await asyncio.sleep(1.0)
         rules.settle()
+        Connection.refusals.settle()
         try:
             await loop.run_in_executor(None, daemon.ask, {"do": "nothing"})
         except DappledError as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import hmac
 import ipaddress
 import logging
@@ -22,11 +23,12 @@ from dappled.refusals import RefusalLog
 
 log = logging.getLogger(__name__)
 COOKIE = "dappled"
-GUESSES, GUESS_WINDOW_S = 10, 60.0  # from one address
-GUESSERS = 1024  # addresses that are remembered
+GUESSES, GUESS_WINDOW_S = 10, 60.0  # from one address, in one way
+GUESSERS = 1024  # that are remembered
 BODY_BYTES = 4096
 _LENGTH_DIGITS = 10
 _PATH_CHARACTERS = 80
+_OWN_SITES = (None, "none", "same-origin")  # Sec-Fetch-Site of what no page of another site made the browser ask for
 _OTHER_HOST = "it asked for a host name that is not in console.hosts"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
@@ -69,9 +71,10 @@ class Access:
     ) -> None:
         own = socket.gethostname()
         self._token = token
+        self.reading_token = _reading(token)
         self._names = {name.lower() for name in (*names, "localhost", own, f"{own}.local")}
         self._clock = clock or SystemClock()
-        self._guesses: OrderedDict[str, deque[float]] = OrderedDict()
+        self._guesses: OrderedDict[tuple[str, str], deque[float]] = OrderedDict()
         self._refusals = RefusalLog(log, self._clock)
         self.refused = 0
 
@@ -96,20 +99,28 @@ class Access:
         self._refusals.settle()
 
     def try_token(self, token: str, client: str) -> Refusal | None:
-        """None for the right token. Wrong ones are limited for each address; other addresses are not affected."""
-        now, client = self._clock.monotonic_ns() / 1e9, network_of(client)
-        guesses = self._guesses.get(client, deque())
-        if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
-            self.refused += 1
-            self._refusals.refused(client, "too many wrong tokens")
-            return Refusal(429, "too many wrong tokens: wait a minute")
-        if not self._token or self._right(token):
+        """None for the right token, as somebody typed it."""
+        return self._tried("login", token, self._token, client)
+
+    def _tried(self, way: str, token: str, right: str, client: str, site: str | None = None) -> Refusal | None:
+        """None for the right token, whatever was guessed before: else whoever guesses could keep its owner out. Wrong
+        ones are limited for each address and way to bring them. Those that pages of other sites make a browser bring
+        are none of its user's (`site`: Sec-Fetch-Site), and aren't counted."""
+        if not right or _same(token, right):
             return None
-        self._guesses.setdefault(client, deque(maxlen=GUESSES)).append(now)
-        self._guesses.move_to_end(client)
+        self.refused += 1
+        if site not in _OWN_SITES:
+            self._refusals.refused(client, "a wrong token, brought by a page of another site")
+            return Refusal(403, "this is not the token")
+        now, guesser = self._clock.monotonic_ns() / 1e9, (network_of(client), way)
+        guesses = self._guesses.setdefault(guesser, deque(maxlen=GUESSES))
+        self._guesses.move_to_end(guesser)
         if len(self._guesses) > GUESSERS:
             self._guesses.popitem(last=False)
-        self.refused += 1
+        if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
+            self._refusals.refused(client, "too many wrong tokens")
+            return Refusal(429, "too many wrong tokens: wait a minute")
+        guesses.append(now)
         self._refusals.refused(client, "a wrong token")
         return Refusal(403, "this is not the token")
 
@@ -143,16 +154,18 @@ class Access:
         guarded = request.path.startswith(("/api/", "/kml", "/metrics")) and request.path != "/api/login"
         if not guarded or not self._token:
             return None
-        if self._right(_cookie(request.headers.get("cookie", ""))):
+        if _same(_cookie(request.headers.get("cookie", "")), self._token):
             return None
+        site = request.headers.get("sec-fetch-site")
         bearer = request.headers.get("authorization", "").partition(" ")
-        given = bearer[2] if bearer[0].lower() == "bearer" else ""
-        if request.path.startswith("/kml") and not given:  # a virtual globe has no cookie
-            given = (parse_qs(request.query).get("token") or [""])[0]
-        return self.try_token(given, request.client) if given else Refusal(401, "the console asks for its token")
-
-    def _right(self, token: str) -> bool:
-        return hmac.compare_digest(token.encode("utf-8", "surrogatepass"), self._token.encode())
+        if bearer[0].lower() == "bearer" and bearer[2]:
+            return self._tried("header", bearer[2], self._token, request.client, site)
+        given = (parse_qs(request.query).get("token") or [""])[0] if request.path.startswith("/kml") else ""
+        if not given:
+            return Refusal(401, "the console asks for its token")
+        if _same(given, self._token):  # addresses end in logs, histories and files that are passed on
+            return Refusal(403, "an address may hold only the token that reads: open /kml where you are logged in")
+        return self._tried("address", given, self.reading_token, request.client, site)
 
 
 class RequestGuard:
@@ -189,6 +202,16 @@ class RequestGuard:
 def refused(refusal: Refusal) -> Response:
     """The answer for a refusal."""
     return JSONResponse({"error": refusal.text}, status_code=refusal.status)
+
+
+def _reading(token: str) -> str:
+    """The token that opens nothing but the pages of a virtual globe: it can't be turned back into `token`."""
+    digest = hmac.digest(token.encode(), b"dappled: reads only", "sha256")
+    return base64.urlsafe_b64encode(digest[:24]).decode("ascii") if token else ""
+
+
+def _same(token: str, right: str) -> bool:
+    return hmac.compare_digest(token.encode("utf-8", "surrogatepass"), right.encode())
 
 
 def _cookie(header: str) -> str:

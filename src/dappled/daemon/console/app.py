@@ -255,7 +255,7 @@ class ConsoleApp:
 
     async def _kml_link(self, request: Request) -> Response:
         self._hub.globe_asked()
-        return Response(network_link_kml(_absolute(request, "/kml/latest.kml")), media_type=KML_MEDIA_TYPE)
+        return Response(network_link_kml(self._absolute(request, "/kml/latest.kml")), media_type=KML_MEDIA_TYPE)
 
     async def _kml_latest(self, request: Request) -> Response:
         self._hub.globe_asked()
@@ -265,23 +265,22 @@ class ConsoleApp:
                 one = await self._rectified(frame, _GLOBE_BOUNDS_PX)
             except FeedError:  # it is not decoded: the globe shows the track alone
                 one = None
-        picture = _absolute(request, f"/kml/{frame}.png")
+        picture = self._absolute(request, f"/kml/{frame}.png")
         return Response(latest_kml(f"frame {frame}", picture, one, self._feed.track()), media_type=KML_MEDIA_TYPE)
 
     async def _kml_picture(self, request: Request) -> Response:
         self._hub.globe_asked()
         return _file(await self._rectified_png(_frame(request), _GLOBE_PICTURE_PX, sharp=True), "x.png")
 
+    def _absolute(self, request: Request, path: str) -> str:
+        """An address for a globe, which has no cookie: with the token that only reads, where one is needed."""
+        tail = "" if self._rules.open else f"?token={self._rules.reading_token}"
+        return f"{request.url.scheme}://{request.headers['host']}{path}{tail}"
+
 
 def _answered(answer: dict[str, Any]) -> Response:
     answer.pop("number", None)
     return JSONResponse(answer, status_code=200 if answer.get("ok") else 409)
-
-
-def _absolute(request: Request, path: str) -> str:
-    token = request.query_params.get("token")
-    tail = f"?token={token}" if token else ""
-    return f"{request.url.scheme}://{request.headers['host']}{path}{tail}"
 
 
 def _file(data: bytes, name: str) -> Response:

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import socket
 from typing import Any, cast
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from dappled.refusals import RefusalLog
 
 CONNECTIONS = 64  # with more, an idle one is closed
 BACKLOG = 32  # asyncio accepts so many at once, before the limits below see any of them
@@ -25,6 +28,7 @@ class Connection(H11Protocol):
 
     request_s = REQUEST_S
     unread_s = UNREAD_S
+    refusals = RefusalLog(logging.getLogger(__name__))
     _waiting: asyncio.TimerHandle | None = None
     _unread: asyncio.TimerHandle | None = None
     _number = 0
@@ -60,6 +64,16 @@ class Connection(H11Protocol):
         if self._unread is not None:
             self._unread.cancel()
             self._unread = None
+
+    def send_400_response(self, msg: str) -> None:
+        self._refused("a request that is not HTTP")
+        super().send_400_response(msg)
+
+    def _unsupported_upgrade_warning(self) -> None:
+        self._refused("a request for another protocol than HTTP")
+
+    def _refused(self, reason: str) -> None:
+        self.refusals.refused(str(self._address() or "a console's peer"), reason)
 
     @property
     def idle(self) -> bool:
