@@ -44,6 +44,7 @@ class Code(StrEnum):
     PICTURE_ON_CARD = "picture.on_card"
     PICTURE_RIVAL_SHOTS = "picture.rival_shots"
     PICTURE_UNDATED = "picture.undated"
+    TIME_WEEK_MENDED = "time.week_mended"
     TIME_WEEK_ROLLOVER = "time.week_rollover"
 
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from dappled.daemon.navigation import Telemetry, UtcCorrection, machine_clock
 from dappled.daemon.navigation.clocks import UtcLearner
-from dappled.daemon.navigation.machine_clock import FLOOR_NS
+from dappled.drivers.gnss.utc_choice import RELEASED_NS, ROLLOVER_NS
 from dappled.drivers.mavlink import mavlink
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 
-NOW_NS = FLOOR_NS + 10**18
+NOW_NS = RELEASED_NS + 10**16
 
 
 class Notes:
@@ -61,7 +62,7 @@ def test_where_the_kernel_may_not_be_asked_timesyncd_s_mark_tells(tmp_path: Path
 
 
 def test_a_clock_that_was_never_set_is_not_believed(tmp_path: Path) -> None:
-    assert not machine_clock.machine_knows_utc(FLOOR_NS - 1, synchronised=lambda: True, root=tmp_path)
+    assert not machine_clock.machine_knows_utc(RELEASED_NS - 1, synchronised=lambda: True, root=tmp_path)
     assert not machine_clock.utc_known("auto", 10**18)
 
 
@@ -147,3 +148,66 @@ def test_the_autopilots_satellites_tell_what_is_missing() -> None:
     assert found is not None
     assert found.correction_ns == pytest.approx(truth_ns - 100 * 10**9, abs=6e6)
     assert 0 < found.sigma_ns < 10**7
+
+
+def heard(unix_minus_truth_s: Callable[[float], float | None], *, upto_s: float, our_ns: int = 100 * S) -> Telemetry:
+    """Telemetry of an autopilot whose SYSTEM_TIME is so far from the truth at each time. Our clock begins at
+    `our_ns`."""
+    telemetry = Telemetry()
+    for number, (t_s, message) in enumerate(flight(FlightPath(3), BootTime(), 0, upto_s)):
+        if message.get_type() == "SYSTEM_TIME":
+            off_s = unix_minus_truth_s(t_s)
+            message.time_unix_usec = 0 if off_s is None else TRUTH_NS // 1000 + round((t_s + off_s) * 1e6)
+        message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
+        telemetry.feed(number, (our_ns + round(t_s * S)) // 1000, message)
+    return telemetry
+
+
+TRUTH_NS = 1_790_000_000 * S
+
+
+def test_an_early_utc_is_given_up_when_later_messages_disagree() -> None:
+    """A real-time clock is 37 s slow for 8 s, then the satellites' time is known."""
+    notes = Notes()
+    learner = UtcLearner(notes, known=False)
+    for upto_s in (5.0, 7.5, 12.0, 14.0):
+        learner.look(heard(lambda t_s: -37.0 if t_s < 8 else 0.0, upto_s=upto_s).utc_correction())
+    assert [one.correction_ns / S for one in notes.noted] == pytest.approx(
+        [(TRUTH_NS - 100 * S) / S - 37, (TRUTH_NS - 100 * S) / S], abs=0.006
+    )
+
+
+def test_one_wrong_message_moves_no_utc() -> None:
+    found = heard(lambda t_s: 5.0 if 8 <= t_s < 9 else 0.0, upto_s=8.5).utc_correction()
+    assert found is not None
+    assert found.correction_ns == pytest.approx(TRUTH_NS - 100 * S, abs=6e6)
+
+
+def test_a_time_without_a_fix_does_not_replace_the_satellites() -> None:
+    learner = UtcLearner(notes := Notes(), known=False)
+    learner.look(UtcCorrection(0, 100, "test", by_fix=True))
+    learner.look(UtcCorrection(37 * S, 100, "test"))
+    learner.look(UtcCorrection(-37 * S, 100, "test", by_fix=True))
+    assert [one.correction_ns for one in notes.noted] == [0, -37 * S]
+
+
+@pytest.mark.parametrize("year", [2007, 2015, 2050])
+def test_a_date_before_the_release_or_after_the_next_rollover_is_no_utc(year: int) -> None:
+    off_s = (year - 2026) * 365.25 * 86400
+    telemetry = heard(lambda _: off_s, upto_s=4.0)
+    assert telemetry.utc_correction() is None
+    assert telemetry.doubts(104 * S)
+
+
+def test_a_gps_week_that_rolled_over_is_mended_where_the_machine_agrees() -> None:
+    """A machine whose clock shows about the right date, and one that shows 1970."""
+    off_s = -ROLLOVER_NS / S
+    agreed = heard(lambda _: off_s, upto_s=4.0, our_ns=TRUTH_NS - 3600 * S)
+    found = agreed.utc_correction()
+    assert found is not None
+    assert found.correction_ns == pytest.approx(3600 * S, abs=6e6)
+    assert agreed.doubts(TRUTH_NS - 3596 * S) == ()
+    alone = heard(lambda _: off_s, upto_s=4.0)
+    assert alone.utc_correction() is None
+    (doubt,) = alone.doubts(104 * S)
+    assert "1024 weeks later would be 2026-09-21" in doubt

@@ -34,7 +34,6 @@ CONTACT_SOURCE = "hot shoe"
 LATENCY_SOURCE = "trigger call + body latency"
 REQUEST_SOURCE = "wish + body latency"
 TAGGING_RULES = 6  # recorded with each flight. 1: those of flights that were recorded without a number
-_UTC_BETTER = 2
 _UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
 _REACH_1_NS = 50_000_000
 CAMERA_SOURCE = "camera clock (EXIF)"
@@ -455,7 +454,8 @@ def in_doubt(exposure: ExposureTime, clock: BootClock | None) -> ExposureTime:
 
 
 class UtcLearner:
-    """Records the autopilot's UTC once it is known, and again when it is twice as precise.
+    """Records the autopilot's UTC once it is known, and again when it is twice as precise, or contradicts what was
+    recorded: an early value of a real-time clock is given up, but not one by satellites for one without.
 
     Where the machine's own clock is believed nothing is recorded; `doubt` reports a difference.
     """
@@ -475,7 +475,7 @@ class UtcLearner:
         self._last = found or self._last
         if self._known or found is None:
             return
-        if self.learnt is None or found.sigma_ns * _UTC_BETTER <= self.learnt.sigma_ns:
+        if self.learnt is None or found.replaces(self.learnt):
             log.info("UTC is %+.3f s from this machine's, by %s", found.correction_ns / 1e9, found.source)
             self._notes.learn_utc(found.correction_ns, found.sigma_ns, found.source)
             self.learnt = found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from dappled import findings
 from dappled.daemon.navigation.vehicle_history import VehicleHistory
 
 _SHOWN_NS = 60 * 10**9
@@ -18,6 +19,8 @@ def doubts(history: VehicleHistory, utc_ns: int) -> Iterator[str]:
             yield "the autopilot's clock does not run steadily: poses are in doubt"
         else:
             yield f"the autopilot's clock stepped by {step.step_ns / 1e9:+.3f} s: poses next to that are in doubt"
+    if (date := time.utc.doubt()) is not None:
+        yield f"{findings.text(date)}: it is not used"
     if counts.impossible and utc_ns - counts.impossible_ns <= _SHOWN_NS:
         yield "the autopilot sends impossible positions, attitudes or times: they are not used"
     if counts.jumps and utc_ns - counts.jump_ns <= _SHOWN_NS:

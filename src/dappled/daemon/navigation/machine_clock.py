@@ -6,7 +6,8 @@ import ctypes
 from collections.abc import Callable
 from pathlib import Path
 
-FLOOR_NS = 1_735_689_600 * 10**9  # 2025: a clock that shows less has never been set
+from dappled.drivers.gnss.utc_choice import RELEASED_NS
+
 _TIMEX_BYTES = 512  # more than any kernel's struct timex
 
 
@@ -17,7 +18,7 @@ def machine_knows_utc(utc_ns: int, *, synchronised: Callable[[], bool] | None = 
     A single-board computer without these shows the time of its last shutdown. A systemd service with `ProtectClock=`
     may not ask the kernel, so systemd-timesyncd's mark counts as well.
     """
-    if utc_ns < FLOOR_NS:
+    if utc_ns < RELEASED_NS:
         return False
     if (synchronised or kernel_synchronised)() or (root / "run/systemd/timesync/synchronized").exists():
         return True

@@ -242,11 +242,12 @@ class Telemetry:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
         with self._lock:
             clock = self._history.clock(self._packets)
-            unix_minus_boot_ns, now_boot_ns = self._history.time.unix_minus_boot_ns, self._history.time.now_boot_ns
+            unix_minus_boot_ns, now_boot_ns = self._history.time.utc.offset_ns, self._history.time.now_boot_ns
+            by_fix = self._history.has_fix()
         if clock is None or unix_minus_boot_ns is None or now_boot_ns is None:
             return None
         correction_ns = unix_minus_boot_ns + now_boot_ns - clock.utc_ns(now_boot_ns)
-        return UtcCorrection(correction_ns, round(clock.sigma_ns), f"SYSTEM_TIME, clocks by {clock.source}")
+        return UtcCorrection(correction_ns, round(clock.sigma_ns), f"SYSTEM_TIME, clocks by {clock.source}", by_fix)
 
     def statistics(self) -> TelemetryStatistics:
         """Counters."""

@@ -27,6 +27,7 @@ _HIGHEST_MM = 10**8
 _ONE_JUMP_NS = 10**9
 _ARRIVED_NS, _ARRIVED_FEW, _ARRIVED_MOST = 5 * 10**9, 10, 1024
 _SOONER_NS, _SOONER_SHARE = 60_000_000, 5.0
+_UTC_STEP_NS = 50_000_000
 MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
 
 
@@ -475,11 +476,18 @@ class ArrivalSteps:
 
 @dataclass(frozen=True, slots=True)
 class UtcCorrection:
-    """What to add to this machine's UTC to get the autopilot's (from its satellites), ± 1 σ."""
+    """What to add to this machine's UTC to get the autopilot's, ± 1 σ. `by_fix`: its receiver had a fix."""
 
     correction_ns: int
     sigma_ns: int
     source: str
+    by_fix: bool = False
+
+    def replaces(self, older: UtcCorrection) -> bool:
+        """Whether it is twice as precise, or contradicts one that was not better founded."""
+        if abs(self.correction_ns - older.correction_ns) > 3 * math.hypot(self.sigma_ns, older.sigma_ns) + _UTC_STEP_NS:
+            return self.by_fix or not older.by_fix
+        return self.sigma_ns * 2 <= older.sigma_ns
 
 
 class UtcNotes(Protocol):

@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from dappled.daemon.navigation import samples as telemetry_samples
+from dappled.daemon.navigation.autopilot_utc import AutopilotUtc
 from dappled.daemon.navigation.clocks import (
     TAGGING_RULES,
     BootClock,
@@ -21,6 +22,7 @@ from dappled.daemon.navigation.clocks import (
     from_timesync,
     step_ns,
 )
+from dappled.daemon.navigation.excerpts import around_instant, between, latest
 from dappled.daemon.navigation.ground_height import ground_sample
 from dappled.daemon.navigation.jumps import JumpFinder
 from dappled.daemon.navigation.samples import (
@@ -34,9 +36,7 @@ from dappled.daemon.navigation.samples import (
     GnssSample,
     GroundSample,
     Jump,
-    N,
     PositionSample,
-    S,
     Sample,
     keep,
     prune,
@@ -53,37 +53,8 @@ _ALIVE_NS, _ANSWERS_COME_NS = 5 * 10**9, 10**9
 _SILENT_NS = 10 * 10**9  # an autopilot that has answered within this time shows its steps by its answers
 _LOOKED_AT = 64  # answers: more than come in the ten seconds that `step_ns` looks back
 _MOST_BOOT_NS = 2**62  # differences of such times fit 64 bits
-_FEW, _AUTOPILOT = 3, 1
+_FEW, _AUTOPILOT, _FIX_3D = 3, 1, 3
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the epoch's first packet, the last packets
-
-
-def between(history: Sequence[N], first: int, limit: int) -> Sequence[N]:
-    """Those of the packets first <= number < limit."""
-    return history[place_of(history, first) : place_of(history, limit)]
-
-
-def place_of(history: Sequence[telemetry_samples.Numbered], number: int) -> int:
-    """Where packet `number` would stand."""
-    return bisect_left(history, number, key=lambda sample: sample.number)
-
-
-def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
-    """Those that arrived in the last `window_ns` before the last one."""
-    if not history:
-        return history
-    since = history[-1].stamp_ns - window_ns
-    return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
-
-
-def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
-    """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
-    none. `boot_ns` of the history must rise."""
-    at = bisect_left(history, boot_ns, key=lambda sample: sample.boot_ns)
-    sides = tuple(history[max(0, at - 1) : at + 1])
-    if len(sides) == 2 and sides[1].boot_ns - sides[0].boot_ns <= gap_ns:
-        return sides
-    nearest = min(sides, key=lambda sample: abs(sample.boot_ns - boot_ns), default=None)
-    return () if nearest is None or abs(nearest.boot_ns - boot_ns) > NEAREST_NS else (nearest,)
 
 
 class AutopilotTime:
@@ -107,7 +78,8 @@ class AutopilotTime:
         self._back_since_ns: int | None = None
         self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
-        self.unix_minus_boot_ns: int | None = None
+        self.unix_minus_boot_ns: int | None = None  # as the autopilot has it, for other messages with its UTC
+        self.utc = AutopilotUtc()
         self.reboots = 0
 
     def believe(self, number: int, stamp_ns: int, boot_ns: int) -> bool:
@@ -126,6 +98,7 @@ class AutopilotTime:
             self._requests.clear()
             self._arrivals.forget()
             self.unix_minus_boot_ns = None
+            self.utc = AutopilotUtc()
             self.now_boot_ns = boot_ns
         self._back_since_ns = None
         self.now_boot_ns = boot_ns if self.now_boot_ns is None else max(self.now_boot_ns, boot_ns)
@@ -184,12 +157,13 @@ class AutopilotTime:
             if one.step_ns is not None and abs(one.since_ns - utc_ns) <= _UNSTEADY_NS
         ]
 
-    def system_time(self, message: MavlinkMessage) -> None:
-        """Take a SYSTEM_TIME of the autopilot."""
-        if message.time_unix_usec > telemetry_samples.EPOCH_US and message.time_boot_ms > 0:
-            self.unix_minus_boot_ns = message.time_unix_usec * 1000 - (
-                message.time_boot_ms * 10**6 + telemetry_samples.HALF_MS_NS
-            )
+    def system_time(self, stamp_ns: int, message: MavlinkMessage) -> bool:
+        """Take a SYSTEM_TIME of the autopilot. Whether its date can't be true."""
+        if message.time_unix_usec <= telemetry_samples.EPOCH_US or message.time_boot_ms <= 0:
+            return False
+        unix_ns, boot_ns = message.time_unix_usec * 1000, message.time_boot_ms * 10**6 + telemetry_samples.HALF_MS_NS
+        self.unix_minus_boot_ns = unix_ns - boot_ns
+        return not self.utc.take(unix_ns, boot_ns, stamp_ns)
 
     def timesync(self, number: int, stamp_ns: int, message: MavlinkMessage, *, from_autopilot: bool) -> bool:
         """Take a TIMESYNC, request or answer. Whether it is an answer to us that can't be true."""
@@ -357,6 +331,10 @@ class VehicleHistory:
         """Messages about the hot shoe, from the packets below `limit` of the epoch of an instant."""
         return between(self._feedbacks, *self.time.span(limit, utc_ns))
 
+    def has_fix(self) -> bool:
+        """Whether the receiver's last message says a fix: then UTC is the satellites'."""
+        return bool(self._receiver) and self._receiver[-1].reported.fix_type >= _FIX_3D
+
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
         seconds."""
@@ -423,8 +401,8 @@ class VehicleHistory:
             self.gimbals.feed(number, stamp_ns, message)
 
     def _system_time(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
-        if self._ours(message):
-            self.time.system_time(message)
+        if self._ours(message) and self.time.system_time(stamp_ns, message):
+            self.counts.refuse(stamp_ns)
 
     def _timesync(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self.time.timesync(number, stamp_ns, message, from_autopilot=self._ours(message)):

@@ -24,6 +24,7 @@ from dappled.daemon.navigation import recorded_vehicles
 from dappled.daemon.replay.in_order import paired_in_order
 from dappled.daemon.replay.replay import own_log
 from dappled.decode.array_types import Floats
+from dappled.drivers.gnss.utc_choice import LOGS_FROM_NS
 from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.drivers.mavlink.log_packets import LoggedTrigger, TriggerLog
 from dappled.errors import DappledError
@@ -38,7 +39,6 @@ _STEADY_US = 100_000  # a link that delays less places a log so well
 _WINDOW_US = 15_000_000  # of SYSTEM_TIME: the one that was delayed least counts
 _MOST_NAMED = 3
 _MOST_PASSED_OVER = 256
-_UTC_FROM_US = 1_483_228_800 * 10**6  # 2017: an earlier time is not known yet
 _START = mavlink.MAV_CMD_IMAGE_START_CAPTURE
 _READ = {
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
@@ -240,7 +240,7 @@ def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside
         if message is None or message.get_srcSystem() not in systems or message.get_srcComponent() != 1:
             continue
         name = message.get_type()
-        if name == "SYSTEM_TIME" and message.time_unix_usec >= _UTC_FROM_US and message.time_boot_ms:
+        if name == "SYSTEM_TIME" and message.time_unix_usec * 1000 >= LOGS_FROM_NS and message.time_boot_ms:
             boot_us = message.time_boot_ms * 1000
             found.times.append((boot_us, message.time_unix_usec - boot_us, stamp_us))
         elif name == "CAMERA_TRIGGER":
