@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from dappled.errors import DappledError
+from dappled.findings import Finding
 
 BodyState = Literal["absent", "starting", "ready", "busy", "faulted"]
 
@@ -234,7 +235,15 @@ class SettingsChanged:
     refused: str = ""
 
 
-CameraEvent = StateChanged | Fired | ShotFailed | Deferred | Arrival | Companion | SettingsChanged
+@dataclass(frozen=True, slots=True)
+class Noticed:
+    """The driver found something that ends no shot: the card was changed, or a picture stays on it."""
+
+    finding: Finding
+    monotonic_ns: int
+
+
+CameraEvent = StateChanged | Fired | ShotFailed | Deferred | Arrival | Companion | SettingsChanged | Noticed
 
 
 class ShutterTrigger(Protocol):

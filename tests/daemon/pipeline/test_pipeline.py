@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from dappled import findings
 from dappled.config.settings import DecodeSettings, MaskSettings, Settings
 from dappled.daemon.health import go_no_go
 from dappled.daemon.health import record as health
@@ -27,9 +28,10 @@ from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
-from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred
+from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred, Noticed
 from dappled.drivers.raw import law_check
 from dappled.drivers.raw.recipe import LawDecision, of_flight
+from dappled.findings import Code, Subject, finding
 from dappled.flight import FlightError, Recording, ShotState, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import FakeCamera, Rig, arrival, eventually, failed, fired, good, rig
@@ -131,6 +133,22 @@ def test_a_file_of_nobody_is_a_stray(tmp_path: Path) -> None:
         eventually(lambda: len(one.flight.ledger.strays()) == 2, "two strays")
     assert not one.shots
     assert flight_check.check(one.flight.folder.path).intact
+
+
+def test_what_a_driver_notices_is_written_down(tmp_path: Path) -> None:
+    on_card = finding(Code.PICTURE_ON_CARD, Subject("picture", "/DCIM/IMG_0004.CR2"))
+
+    def script(shot: int) -> list[CameraEvent | Exception]:
+        return [Noticed(finding(Code.CARD_CHANGED, Subject("card")), 1), *good(shot), Noticed(on_card, 2)]
+
+    with rig(tmp_path, script) as one:
+        one.request(1)
+        one.ended(0)
+        eventually(lambda: any(text.startswith("picture.on_card") for text in one.events()), "both")
+        told = [text for text in one.events() if text.startswith(("card.", "picture."))]
+    assert told == [
+        f"{each.code.value}: {findings.told(each)}" for each in (finding(Code.CARD_CHANGED, Subject("card")), on_card)
+    ]
 
 
 def test_an_empty_file_fails_the_shot(tmp_path: Path) -> None:

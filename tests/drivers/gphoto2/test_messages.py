@@ -15,6 +15,7 @@ from dappled.drivers.camera import (
     Companion,
     Fired,
     Identity,
+    Noticed,
     Setting,
     SettingsChanged,
     ShotFailed,
@@ -22,6 +23,7 @@ from dappled.drivers.camera import (
 )
 from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel
 from dappled.drivers.gphoto2.messages import EventSender, event_message, lost_file, message_event
+from dappled.findings import Code, Finding, Subject
 
 Ends = tuple[ProcessChannel, ProcessChannel]
 
@@ -42,6 +44,7 @@ events = st.one_of(
     st.builds(StateChanged, states, st.text(), numbers, identities),
     st.builds(Fired, numbers, numbers, numbers),
     st.builds(ShotFailed, numbers, st.text(), numbers),
+    st.builds(Noticed, st.builds(Finding, st.sampled_from(Code), st.builds(Subject, st.text(), numbers)), numbers),
 )
 
 

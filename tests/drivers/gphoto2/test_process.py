@@ -16,6 +16,7 @@ from dappled.drivers.camera import (
     Companion,
     Fired,
     Identity,
+    Noticed,
     Setting,
     SettingName,
     SettingsChanged,
@@ -31,14 +32,17 @@ from dappled.drivers.gphoto2.protocol import (
     CameraFile,
     CameraNews,
     CaptureComplete,
+    CardContents,
     Fetched,
     FileAdded,
+    HeldError,
     LostError,
     RefusedError,
     SessionError,
     SettingTurned,
 )
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.findings import Code
 from dappled.testing import content, of_shots
 
 FOLDER = "/store/DCIM/100CANON"
@@ -60,6 +64,7 @@ class FakeCamera:
     errors: dict[str, list[SessionError]] = field(default_factory=dict)
     taken: dict[CameraFile, int] = field(default_factory=dict)
     shown: tuple[Setting, ...] = ()
+    label: str = "SD"
     triggered: int = 0
     opened: int = 0
     closed: int = 0
@@ -92,8 +97,8 @@ class FakeCamera:
         self._stumble("files")
         return frozenset(file for file in self.card if not file.in_memory)
 
-    def taken_s(self, file: CameraFile) -> int | None:
-        return self.taken.get(file)
+    def contents(self) -> CardContents:
+        return CardContents({file: self.about(file) for file in self.files()}, self.label)
 
     def about(self, file: CameraFile) -> tuple[int, int | None]:
         return len(self.card[file]), self.taken.get(file)
@@ -116,6 +121,9 @@ class FakeCamera:
 
     def close(self) -> None:
         self.closed += 1
+
+    def changes_card(self, label: str = "SD") -> None:
+        self.card, self.taken, self.label = {}, {}, label
 
     def adds(self, file: CameraFile, data: bytes = b"picture", *, tells: bool = True) -> None:
         self.card[file] = data
@@ -183,6 +191,15 @@ def states(events: list[CameraEvent]) -> list[tuple[str, str]]:
 
 def arrivals(events: list[CameraEvent]) -> list[Arrival]:
     return [event for event in events if isinstance(event, Arrival)]
+
+
+def noticed(events: list[CameraEvent]) -> list[tuple[Code, str | int]]:
+    return [(event.finding.code, event.finding.subject.which) for event in events if isinstance(event, Noticed)]
+
+
+def brought(events: list[CameraEvent]) -> list[tuple[int | None, bytes, bool]]:
+    """Shot, bytes, and whether there is a doubt, of each frame and stray."""
+    return [(one.shot, content(one), "doubt" in one.facts) for one in arrivals(events)]
 
 
 def looked(harness: Harness, seconds: float = 0.0) -> list[str]:
@@ -432,6 +449,140 @@ def test_without_a_body_s_time_a_file_that_may_be_late_is_marked(ready: Harness)
     (came,) = arrivals(shot_on(ready, 3, None, 2))
     assert "doubt" not in came.facts  # files come in order
     came.blob.close()
+
+
+def body_s(harness: Harness) -> int:
+    return harness.clock.monotonic_ns() // 10**9 + 4900
+
+
+def three_shots(harness: Harness) -> None:
+    for shot in (1, 2, 3):
+        assert brought(shot_on(harness, shot, body_s(harness), shot)) == [(shot, b"%d" % shot, False)]
+        harness.turn(2.0)
+
+
+def made(harness: Harness, number: int, data: bytes, *, tells: bool = True) -> None:
+    """The body makes a picture now."""
+    harness.camera.taken[on_card(number)] = body_s(harness)
+    harness.camera.adds(on_card(number), data, tells=tells)
+
+
+@pytest.mark.parametrize("cut", [False, True])
+@pytest.mark.parametrize("label", ["SD", "another"])
+def test_a_card_that_numbers_from_0001_again_brings_its_files(ready: Harness, cut: bool, label: str) -> None:
+    three_shots(ready)
+    ready.camera.changes_card(label)
+    told: list[CameraEvent] = []
+    if cut:
+        ready.camera.errors["news"] = [LostError("the door is open")]
+        told += ready.turn()
+        made(ready, 1, b"by hand", tells=False)
+        told += ready.turn(0.3)
+        assert brought(told) == [(None, b"by hand", False)]
+    for number in (2, 3):
+        ready.fire(2 + number)
+        told += ready.turn()
+        made(ready, number, b"again")
+        events = ready.turn()
+        told += events
+        assert brought(events) == [(2 + number, b"again", False)]
+        told += ready.turn(2.0)
+    assert noticed(told) == [(Code.CARD_CHANGED, "")]
+
+
+def test_a_card_that_comes_back_brings_nothing_twice(ready: Harness) -> None:
+    three_shots(ready)
+    first, taken = ready.camera.card, ready.camera.taken
+    for card, times in (({}, {}), (first, taken)):
+        ready.camera.card, ready.camera.taken = dict(card), dict(times)
+        ready.camera.errors["news"] = [LostError("the door is open")]
+        ready.turn()
+        events = ready.turn(0.3)
+        assert (brought(events), noticed(events)) == ([], [(Code.CARD_CHANGED, "")])
+
+
+def test_older_pictures_on_another_card_stay_there(ready: Harness) -> None:
+    three_shots(ready)
+    ready.camera.changes_card()
+    for number in range(1, 400):
+        ready.camera.adds(on_card(number), b"a year ago", tells=False)
+        ready.camera.taken[on_card(number)] = body_s(ready) - 365 * 86400
+    ready.camera.errors["news"] = [LostError("the door is open")]
+    ready.turn()
+    events = ready.turn(0.3)
+    assert (brought(events), noticed(events)) == ([], [(Code.CARD_CHANGED, "")])
+
+
+@pytest.mark.parametrize("lost", ["event", "transfer"])
+def test_a_picture_by_hand_does_not_become_the_next_shot_s(harness: Harness, lost: str) -> None:
+    """Its event was lost, and its shot's too, or the link is cut: both are found when the card is listed."""
+    harness.camera.adds(on_card(9999), b"old", tells=False)
+    harness.turn()
+    three_shots(harness)
+    made(harness, 4, b"by hand", tells=False)
+    assert brought(harness.turn(8.0)) == []
+    harness.fire(4)
+    harness.turn()
+    made(harness, 5, b"its own", tells=lost == "transfer")
+    if lost == "transfer":
+        harness.camera.errors["fetch"] = [LostError("cut")]
+    events = harness.turn(steps=1)
+    events += harness.turn(10.1)
+    assert brought(events) == [(None, b"by hand", False), (4, b"its own", False)]
+
+
+def test_a_picture_whose_event_was_swallowed_is_found_on_the_card(ready: Harness) -> None:
+    three_shots(ready)
+    made(ready, 4, b"by hand", tells=False)
+    assert brought(shot_on(ready, 4, body_s(ready), 5)) == [(4, b"5", False)]
+    assert brought(ready.turn(4.5)) == []  # further shots come first
+    opened = ready.camera.opened
+    assert brought(ready.turn(1.0)) == [(None, b"by hand", False)]
+    ready.turn(20.0)
+    assert ready.camera.opened == opened + 1  # once
+
+
+def test_a_shot_is_fired_where_the_body_is_still_closing_for_the_listing(ready: Harness) -> None:
+    three_shots(ready)
+    made(ready, 4, b"by hand", tells=False)
+    assert brought(shot_on(ready, 4, body_s(ready), 5)) == [(4, b"5", False)]
+    ready.camera.errors["open"] = [HeldError("busy")]
+    assert states(ready.turn(5.5, steps=1)) == []
+    ready.fire(5)
+    assert of_shots(ready.turn(0.3)) == [(Fired, 5), (Arrival, None)]
+
+
+def test_what_stays_on_the_card_is_named_at_the_end(ready: Harness) -> None:
+    three_shots(ready)
+    made(ready, 4, b"by hand", tells=False)
+    ready.channel.send({"do": "stop"})
+    ready.loop.run()
+    events = []
+    while (message := ready.channel.receive(0.0)) is not None:
+        events.append(message_event(message))
+    assert noticed(events) == [(Code.PICTURE_ON_CARD, f"{FOLDER}/IMG_0004.CR2")]
+
+
+def test_an_announced_file_on_a_card_that_was_taken_out_is_named(ready: Harness) -> None:
+    three_shots(ready)
+    made(ready, 4, b"by hand")
+    ready.camera.errors["fetch"] = [LostError("the door is open")]
+    ready.turn(steps=1)
+    ready.camera.changes_card()
+    events = ready.turn(0.3)
+    assert noticed(events) == [(Code.CARD_CHANGED, ""), (Code.PICTURE_ON_CARD, f"{FOLDER}/IMG_0004.CR2")]
+
+
+def test_a_bad_picture_by_hand_does_not_cost_the_shot_s_own(ready: Harness) -> None:
+    three_shots(ready)
+    ready.fire(4)
+    ready.turn()
+    made(ready, 4, b"by hand")
+    ready.camera.errors["fetch"] = [RefusedError("announced 7 and sent 6")] * 3
+    events = ready.turn(steps=5)
+    assert noticed(events) == [(Code.PICTURE_ON_CARD, f"{FOLDER}/IMG_0004.CR2")]
+    made(ready, 5, b"its own")
+    assert brought(ready.turn()) == [(4, b"its own", False)]
 
 
 RAW_AND_JPEG = (Setting("image_format", "RAW + Large Fine JPEG", ("RAW", "RAW + Large Fine JPEG")),)

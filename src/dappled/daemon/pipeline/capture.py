@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+from dappled import findings
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import FlightWriter
@@ -23,6 +24,7 @@ from dappled.drivers.camera import (
     Companion,
     Deferred,
     Fired,
+    Noticed,
     SettingsChanged,
     ShotFailed,
     StateChanged,
@@ -337,6 +339,9 @@ class Capture:
                 self._deferred(event)
             elif isinstance(event, SettingsChanged):
                 self._ends.tell(self._observer.settings_changed, event)
+            elif isinstance(event, Noticed):
+                log.warning("%s", findings.told(event.finding))
+                self._writer.event(event.finding.code.value, findings.told(event.finding))
         except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
             report(log, "capture", error)
 

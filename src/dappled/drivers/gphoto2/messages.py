@@ -20,27 +20,36 @@ from dappled.drivers.camera import (
     Deferred,
     Fired,
     Identity,
+    Noticed,
     Setting,
     SettingsChanged,
     ShotFailed,
     StateChanged,
 )
 from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel
+from dappled.findings import Finding
 
 LATE_LIMIT = 16
-"""How many late shots and files are remembered."""
+"""How many late shots are remembered."""
+SEEN_LIMIT = 512
+"""How many files a dead process' successor is told of: all of them are one argument of its command line."""
 _SEND_S = 5.0
+
+
+SeenFile = tuple[str, str, int, int | None]
 
 
 @dataclass(frozen=True, slots=True)
 class Carryover:
     """What a process that died leaves to the next: the body's serial number, the shots that were fired and have no file
-    yet, the offsets of the body's clock, and the (folder, name) of the files that came last."""
+    yet, the offsets of the body's clock, and folder, name, size and time of the files that came last. Pictures made
+    after `since_ns` (monotonic; None: unknown) are among these, or were not brought."""
 
     serial: str | None = None
     late: tuple[Claim, ...] = ()
     offsets_s: tuple[float, ...] = ()
-    seen: tuple[tuple[str, str], ...] = ()
+    seen: tuple[SeenFile, ...] = ()
+    since_ns: int | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Convert to plain values."""
@@ -50,8 +59,8 @@ class Carryover:
     def of_json(cls, value: Mapping[str, Any]) -> Carryover:
         """Read what `to_json` made."""
         late = tuple(Claim(**each) for each in value["late"])
-        seen = tuple((folder, name) for folder, name in value["seen"])
-        return cls(value["serial"], late, tuple(value["offsets_s"]), seen)
+        seen = tuple((folder, name, size, taken_s) for folder, name, size, taken_s in value["seen"])
+        return cls(value["serial"], late, tuple(value["offsets_s"]), seen, value["since_ns"])
 
 
 class EventSender:
@@ -105,10 +114,11 @@ def event_message(event: CameraEvent) -> ChannelMessage:
             return ChannelMessage({"is": "state", "state": state, "reason": reason, "ns": at_ns, "identity": who})
         case Fired(shot, called_ns, returned_ns):
             return ChannelMessage({"is": "fired", "shot": shot, "called_ns": called_ns, "returned_ns": returned_ns})
-        case ShotFailed(shot, reason, at_ns):
-            return ChannelMessage({"is": "failed", "shot": shot, "reason": reason, "ns": at_ns})
-        case Deferred(shot, reason, at_ns):
-            return ChannelMessage({"is": "deferred", "shot": shot, "reason": reason, "ns": at_ns})
+        case ShotFailed(shot, reason, at_ns) | Deferred(shot, reason, at_ns):
+            kind = "failed" if isinstance(event, ShotFailed) else "deferred"
+            return ChannelMessage({"is": kind, "shot": shot, "reason": reason, "ns": at_ns})
+        case Noticed(found, at_ns):
+            return ChannelMessage({"is": "noticed", "finding": found.to_json(), "ns": at_ns})
         case SettingsChanged(settings, at_ns, refused):
             each = [asdict(one) for one in settings]
             return ChannelMessage({"is": "settings", "settings": each, "ns": at_ns, "refused": refused})
@@ -150,13 +160,14 @@ def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> CameraEvent:
             return StateChanged(body["state"], body["reason"], body["ns"], who)
         case "fired":
             return Fired(body["shot"], body["called_ns"], body["returned_ns"])
-        case "failed":
-            return ShotFailed(body["shot"], body["reason"], body["ns"])
-        case "deferred":
-            return Deferred(body["shot"], body["reason"], body["ns"])
+        case "failed" | "deferred" as kind:
+            ended = ShotFailed if kind == "failed" else Deferred
+            return ended(body["shot"], body["reason"], body["ns"])
         case "settings":
             read = tuple(Setting(each["name"], each["value"], tuple(each["choices"])) for each in body["settings"])
             return SettingsChanged(read, body["ns"], body["refused"])
+        case "noticed":
+            return Noticed(Finding.from_json(body["finding"]), body["ns"])
         case "arrival" | "companion" as kind:
             (fd,) = fds
             made = Arrival if kind == "arrival" else Companion

@@ -11,6 +11,7 @@ order.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -45,6 +46,8 @@ _POLL_BUSY_S = 0.005
 _POLL_IDLE_S = 0.3
 _REOPEN_S = 0.25
 _HEAD_BYTES = 65536
+_QUIET_S = 5.0
+"""A card is listed anew only when the camera had nothing to do for so long: that takes a new session."""
 
 
 class CameraLoop:
@@ -73,6 +76,7 @@ class CameraLoop:
         try:
             while self.step():
                 pass
+            self._look_last()
         finally:
             if self._session is not None:
                 self._session.close()
@@ -89,9 +93,20 @@ class CameraLoop:
         except LostError as error:
             self._lose(str(error))
         self._sender.send(*self._state.fail_overdue(self._now_ns(), is_open=self._session is not None))
-        if self._session is None and self._state.current is None:
+        if self._is_away and self._state.current is None:
             self._sender.send(*self._state.fail_waiting(self._sender.reason, self._now_ns()))
         return True
+
+    def _look_last(self) -> None:
+        """Name the pictures that stay on the card."""
+        if self._session is None or not self._session.keeps_files or not self._state.unlisted:
+            return
+        self._session.close()
+        self._session = None
+        with contextlib.suppress(SessionError):
+            self._session = self._open_camera(self._settings, self._state.serial)
+            if self._session.identity.serial == self._state.serial:
+                self._sender.send(*self._state.left(self._session.contents(), self._now_ns()))
 
     def _patience_s(self) -> float:
         """Return how long to wait for a command before the camera is polled again."""
@@ -103,6 +118,11 @@ class CameraLoop:
 
     def _now_ns(self) -> int:
         return self._clock.monotonic_ns()
+
+    @property
+    def _is_away(self) -> bool:
+        """Whether there is no camera, and that was said."""
+        return self._session is None and self._sender.state not in ("ready", "busy")
 
     def _send_state(self, state: BodyState, reason: str = "") -> None:
         identity = None if self._session is None else self._session.identity
@@ -129,7 +149,7 @@ class CameraLoop:
         return True
 
     def _take(self, shot: int) -> None:
-        if self._session is None and self._state.current is None:
+        if self._is_away and self._state.current is None:
             reason = f"there is no camera to fire: {self._sender.reason or 'it is still being opened'}"
             self._sender.send(ShotFailed(shot, reason, self._now_ns()))
         else:
@@ -179,13 +199,17 @@ class CameraLoop:
         if self._state.trigger_due(self._now_ns()):
             self._trigger(session)
         self._listen(session)
-        self._fetch(session)
-        if session.keeps_files and self._state.search_due(self._now_ns()):
+        if not self._state.is_stale:
+            self._fetch(session)
+        searches = self._state.search_due(self._now_ns())
+        lists = self._state.is_stale or self._state.list_due(self._now_ns(), _QUIET_S)
+        if session.keeps_files and (searches or lists):
             # libgphoto2 remembers its listings: only a new session sees new files.
             session.close()
             self._session = None
-            self._open()
-            self._state.searched(self._now_ns())
+            self._open(quiet=not searches)
+            if searches:
+                self._state.searched(self._now_ns())
             session = self._session
             if session is None:
                 return
@@ -195,21 +219,23 @@ class CameraLoop:
         if not self._state.is_busy:
             self._viewfinder.turn(session, self._now_ns())
 
-    def _open(self) -> None:
+    def _open(self, *, quiet: bool = False) -> None:
+        """Open the camera. `quiet`: it was there just now; if it can't be opened, that is said of the next attempt."""
         if self._sender.state is None:
             self._send_state("starting")
         try:
             session = self._open_camera(self._settings, self._state.serial)
         except SessionError as error:
+            if quiet:
+                self._open_at_ns = self._now_ns() + round(_REOPEN_S * 1e9)
+                return
             self._open_at_ns = self._now_ns() + round(self._settings.timeouts.retry_s * 1e9)
             self._send_state("absent" if isinstance(error, AbsentError) else "faulted", str(error))
             return
         self._session = session
         self._state.opened(session.identity.serial, self._now_ns())
         if session.keeps_files:
-            found = session.files()
-            taken_s = {file: session.taken_s(file) for file in self._state.to_identify(found)}
-            self._state.listed(found, taken_s)
+            self._sender.send(*self._state.listed(session.contents(), self._now_ns()))
 
     def _lose(self, reason: str) -> None:
         """Close a session that is of no use any more."""
@@ -242,11 +268,16 @@ class CameraLoop:
         for news in session.news():
             match news:
                 case FileAdded(file):
-                    self._state.announced(file)
+                    self._state.announced(file, self._now_ns())
                 case CaptureComplete():
                     self._state.completed(self._now_ns())
                 case SettingTurned():
                     self._state.setting_turned(self._now_ns())
+        for file in self._state.to_compare():
+            facts = None
+            with contextlib.suppress(BusyError, RefusedError):
+                facts = session.about(file)
+            self._state.compared(file, facts, self._now_ns())
 
     def _fetch(self, session: Session) -> None:
         """Fetch the files that wait, until one can't be had; then send what waited too long for its pair."""
@@ -258,7 +289,8 @@ class CameraLoop:
                 self._sender.send(*self._state.not_fetched(file, str(error), self._now_ns()))
                 break
             now_ns = self._now_ns()
-            facts = {"folder": file.folder, "name": file.name, "fetch_ms": (now_ns - began_ns) / 1e6}
+            facts: dict[str, str | float | None] = {"folder": file.folder, "name": file.name}
+            facts |= {"fetch_ms": (now_ns - began_ns) / 1e6, "taken_s": fetched.taken_s}
             name = true_name(file.name, os.pread(fetched.blob.fd, _HEAD_BYTES, 0))
             arrival = Arrival(None, name, fetched.blob, now_ns, facts)
             self._sender.send(*self._state.fetched(file, arrival, fetched.taken_s))

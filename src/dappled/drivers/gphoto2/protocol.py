@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
 
 _MEMORY_FOLDER = "/"
+FileFacts: TypeAlias = tuple[int, int | None]
+"""A file's size in bytes, and when it was made by the body's clock, in seconds; None where the body doesn't say."""
 
 
 class SessionError(Exception):
@@ -48,9 +51,20 @@ class CameraFile:
 
 
 @dataclass(frozen=True, slots=True)
+class CardContents:
+    """The files on a card, each with its size in bytes and when it was made by the body's clock; and what the camera
+    says of the card itself (label and capacity), "" where it says nothing.
+
+    Two files of one name are the same where size and time are equal; libgphoto2 gives no number of a file.
+    """
+
+    files: Mapping[CameraFile, FileFacts]
+    card: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Fetched:
-    """A file's bytes, and when it was made by the body's own clock: seconds of a clock that may be wrong, or None where
-    the body doesn't report it."""
+    """A file's bytes, and when it was made by the body's own clock, as `FileFacts` has it."""
 
     blob: Blob
     taken_s: int | None = None
@@ -96,17 +110,17 @@ class Session(Protocol):
     def fetch(self, file: CameraFile) -> Fetched:
         """Fetch a file's bytes. Raises BusyError, RefusedError, LostError."""
 
-    def taken_s(self, file: CameraFile) -> int | None:
-        """Return when a file on the card was made, by the body's clock. Raises LostError."""
-
-    def about(self, file: CameraFile) -> tuple[int, int | None]:
-        """Return (size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
+    def about(self, file: CameraFile) -> FileFacts:
+        """Return size and time of a file on the card. Raises SessionError."""
 
     def delete(self, file: CameraFile) -> None:
         """Delete a file at the camera. Raises RefusedError, LostError."""
 
     def files(self) -> frozenset[CameraFile]:
         """List all files on the card, as they were when the session was opened or later. Raises LostError."""
+
+    def contents(self) -> CardContents:
+        """What is on the card, as `files` has it. Raises LostError."""
 
     def settings(self) -> tuple[Setting, ...]:
         """Read all settings that the camera has. Raises LostError."""

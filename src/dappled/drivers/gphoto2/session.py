@@ -21,8 +21,10 @@ from dappled.drivers.gphoto2.protocol import (
     CameraFile,
     CameraNews,
     CaptureComplete,
+    CardContents,
     Fetched,
     FileAdded,
+    FileFacts,
     HeldError,
     LostError,
     RefusedError,
@@ -263,17 +265,8 @@ class GPhoto2Session:
                 offset += os.pwrite(fd, view[offset:], offset)
             return len(view)
 
-    def taken_s(self, file: CameraFile) -> int | None:
-        """Return when a file was made, by the body's clock; None also for a file that is gone."""
-        try:
-            return _time(self._camera.file_get_info(file.folder, file.name).file)
-        except gp.GPhoto2Error as error:
-            if error.code in _LOST:
-                raise LostError(_sentence(error, f"report the size and time of {file.name}")) from error
-            return None
-
-    def about(self, file: CameraFile) -> tuple[int, int | None]:
-        """Return (size in bytes, when it was made by the body's clock) of a file on the card. Raises SessionError."""
+    def about(self, file: CameraFile) -> FileFacts:
+        """Return size and time of a file on the card."""
         try:
             info = self._camera.file_get_info(file.folder, file.name).file
         except gp.GPhoto2Error as error:
@@ -299,6 +292,25 @@ class GPhoto2Session:
         except gp.GPhoto2Error as error:
             raise LostError(_sentence(error, "list its card")) from error
         return frozenset(file for file in found if not file.in_memory)
+
+    def contents(self) -> CardContents:
+        """What is on the card. After a listing libgphoto2 knows sizes and times, too. A file that went meanwhile is
+        left out."""
+        found: dict[CameraFile, FileFacts] = {}
+        for file in self.files():
+            with contextlib.suppress(BusyError, RefusedError):
+                found[file] = self.about(file)
+        return CardContents(found, self._card())
+
+    def _card(self) -> str:
+        """What the camera says of its cards, "" where it says nothing."""
+        try:
+            stores = self._camera.get_storageinfo()
+        except gp.GPhoto2Error as error:
+            if error.code in _LOST:
+                raise LostError(_sentence(error, "say which card it has")) from error
+            return ""
+        return "; ".join(f"{one.basedir} {one.label} {one.description} {one.capacitykbytes}" for one in stores)
 
     def _turned(self, event: str) -> bool:
         """Whether an event says that a setting has another value than the one that was read. Reading makes events, too:

@@ -9,9 +9,9 @@ from typing import Any, Literal
 from dappled.drivers.camera import CameraError, check_options
 
 CaptureTarget = Literal["card", "ram"]
-NO_HOME = {"HOME": "/nonexistent"}
+NO_HOME = {"HOME": "/nonexistent", "TZ": "UTC0"}
 """For processes that load libgphoto2: it keeps settings (capture target, ...) under HOME, and would let one run change
-the next."""
+the next. It reads a body's time as that of this time zone where a file is announced, and as UTC where it is listed."""
 
 
 @dataclass(frozen=True, slots=True)

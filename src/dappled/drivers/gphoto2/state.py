@@ -6,7 +6,7 @@ Nothing here calls the camera. The loop reports what the camera did, and sends t
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dappled import findings
@@ -16,13 +16,16 @@ from dappled.drivers.camera import (
     CameraEvent,
     Companion,
     Fired,
+    Noticed,
     Setting,
     SettingsChanged,
     ShotFailed,
 )
+from dappled.drivers.gphoto2.known_card import KnownCard
 from dappled.drivers.gphoto2.messages import LATE_LIMIT, Carryover
-from dappled.drivers.gphoto2.protocol import CameraFile
+from dappled.drivers.gphoto2.protocol import CameraFile, CardContents, FileFacts
 from dappled.drivers.gphoto2.settings import Timeouts
+from dappled.findings import Code, Subject, finding
 
 _WAITING_LIMIT = 64
 _BUSY_RETRY_S = 0.05
@@ -32,7 +35,6 @@ _SETTINGS_S = 1.0
 shots)."""
 
 Stem = tuple[str, str]
-Held = tuple[CameraFile, Arrival, int | None]
 
 
 @dataclass(slots=True)
@@ -47,6 +49,17 @@ class CurrentShot:
     searched_ns: int | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class _Announced:
+    """When a file was announced or first listed, and since when that would have been seen (None: unknown)."""
+
+    seen_ns: int
+    since_ns: int | None
+
+
+Held = tuple[CameraFile, Arrival, int | None, _Announced]
+
+
 class CameraState:
     """The state of one camera. One thread uses it; `now_ns` is monotonic time.
 
@@ -56,6 +69,10 @@ class CameraState:
     A raw file and a JPEG of one exposure are one frame: the raw file is the frame and the JPEG its companion, whichever
     comes first. On a card they are matched by name (IMG_0042.CR2, IMG_0042.JPG). libgphoto2 invents the names of files
     in the camera's memory (capt0000.cr2, capt0001.jpg), so these are matched by order.
+
+    A file on a card is known by name, size and time: a card that was changed may number from 0001 again. Where a
+    picture may have been missed (its number was skipped, a shot failed, the link was cut), the card is listed anew, and
+    what is not known is fetched. What can't be fetched is named.
     """
 
     def __init__(self, timeouts: Timeouts, carryover: Carryover) -> None:
@@ -66,10 +83,15 @@ class CameraState:
         self._waiting: deque[int] = deque()
         self._late = deque(carryover.late, LATE_LIMIT)
         self._clock = BodyClock(carryover.offsets_s)
-        self._seen = frozenset(carryover.seen)
-        self._to_fetch: deque[CameraFile] = deque()
+        self._card = KnownCard(carryover.seen)
+        self._since_ns = carryover.since_ns  # pictures made before are known; None: unknown
+        self._to_fetch: dict[CameraFile, _Announced] = {}
+        self._to_compare: dict[CameraFile, None] = {}  # announced, and of a name that is known
         self._tries: dict[CameraFile, int] = {}
-        self._known: frozenset[CameraFile] | None = None  # files on the card that need no fetching; None: never listed
+        self._suspects: dict[CameraFile, _Announced] = {}  # announced, and other than was listed under their names
+        self._cut_off: tuple[CameraFile, ...] = ()  # announced and not fetched when the link broke
+        self._missed = False  # a picture may have been missed
+        self._quiet_ns = 0  # when something was last heard of a shot or a file
         self._held: dict[Stem, Held] = {}  # JPEGs that wait for the raw file beside them
         self._last_frame: tuple[Stem, bool, int] | None = None  # (stem, whether it is a JPEG, shot)
         self._settings_due_ns: int | None = None
@@ -87,12 +109,17 @@ class CameraState:
     def opened(self, serial: str, now_ns: int) -> None:
         """A session was opened. Another body than before has another card."""
         if self.serial != serial:
-            self.serial, self._known = serial, None
+            if self.serial is not None:
+                self._clock, self._since_ns, self._card = BodyClock(), None, KnownCard(())
+            self.serial = serial
         self._settings_due_ns = now_ns
 
     def lost(self, reason: str, now_ns: int, *, keeps_files: bool) -> list[CameraEvent]:
         """The session is gone. A fired shot whose file is on the card stays current; any other has failed."""
+        self._cut_off = (*self._cut_off, *(file for file in (*self._to_fetch, *self._suspects) if not file.in_memory))
         self._to_fetch.clear()
+        self._to_compare.clear()
+        self._suspects.clear()
         self._tries.clear()
         if self.current is not None and not (keeps_files and self.current.fired_ns is not None):
             return self.fail_current(reason, now_ns)
@@ -170,7 +197,7 @@ class CameraState:
             return []
         if now_ns - current.searched_ns > _ns(self._timeouts.complete_s):
             reason = "the camera finished without a file: perhaps it found no focus; look at it and its card"
-            return self.fail_current(reason, now_ns)
+            return self.fail_current(reason, now_ns, may_come=bool(self._clock.offsets_s))
         return []
 
     def fail_current(self, reason: str, now_ns: int, *, may_come: bool = False) -> list[CameraEvent]:
@@ -178,6 +205,7 @@ class CameraState:
         current, self.current = self.current, None
         if current is None:
             return []
+        self._missed, self._quiet_ns = self._missed or current.fired_ns is not None, now_ns
         if may_come and current.fired_ns is not None:
             self._late.append(Claim(current.shot, current.fired_ns))
         return [ShotFailed(current.shot, reason, now_ns)]
@@ -190,74 +218,131 @@ class CameraState:
 
     # --- files
 
-    def announced(self, file: CameraFile) -> None:
-        """The camera announced a file: fetch it unless it was fetched before."""
-        if file not in self._to_fetch and file not in (self._known or ()):
-            self._to_fetch.append(file)
+    def announced(self, file: CameraFile, now_ns: int) -> None:
+        """The camera announced a file: fetch it; one of a known name is compared first."""
+        self._quiet_ns = now_ns
+        if self._card.has_name(file):
+            self._to_compare[file] = None
+        else:
+            self._queue([file], now_ns)
 
-    def to_identify(self, found: frozenset[CameraFile]) -> list[CameraFile]:
-        """Return the files of a card listed for the first time that a late shot of an earlier process may have made.
+    def to_compare(self) -> list[CameraFile]:
+        """The files that were announced with a known name, once."""
+        files = list(self._to_compare)
+        self._to_compare.clear()
+        return files
 
-        These are the last ones that the earlier process did not bring; `listed` takes the times when they were made.
-        """
-        if self._known is not None or not self._late or not self._clock.offsets_s:
-            return []
-        unseen = (file for file in found if (file.folder, file.name) not in self._seen)
-        return sorted(unseen, key=_place)[-LATE_LIMIT:]
+    def compared(self, file: CameraFile, facts: FileFacts | None, now_ns: int) -> None:
+        """A file with a known name was looked at: another size or time is another picture, on another card. None: the
+        library knows it no more. Then the card is listed before anything is fetched."""
+        if facts is None or not self._card.has(file, facts):
+            self._suspects[file] = _Announced(now_ns, self._since_ns)
 
-    def listed(self, found: frozenset[CameraFile], taken_s: Mapping[CameraFile, int | None]) -> None:
-        """The card holds `found`: fetch what is new. Of a card listed for the first time only late shots' files are."""
-        if self._known is None:
-            self._known = found - {file for file, made_s in taken_s.items() if self._is_late_shots(made_s)}
-        self._to_fetch.extend(sorted(found - self._known - set(self._to_fetch), key=_place))
+    def listed(self, found: CardContents, now_ns: int) -> list[CameraEvent]:
+        """The card was listed: fetch what is new. On a card that is seen for the first time that is what was made since
+        its predecessor, or the predecessor of this process, was listed."""
+        told: list[CameraEvent] = []
+        only_recent = not self._card.is_listed
+        strange = [file for file, facts in found.files.items() if not self._card.has(file, facts)]
+        made = {file: self._made_since(found.files[file][1]) for file in strange}
+        old = any(self._made_since(taken_s) is False for _, taken_s in found.files.values())
+        if not only_recent and self._card.is_other(found, has_old=old):
+            only_recent = True
+            self._card.change()
+            self._last_frame = None
+            told.append(Noticed(finding(Code.CARD_CHANGED, Subject("card")), now_ns))
+            self._to_fetch |= {file: one for file, one in self._suspects.items() if file in found.files}
+            unsure = [file for file in strange if made[file] is None and file not in self._to_fetch]
+            told += [_on_card(file, now_ns) for file in (unsure if len(unsure) <= LATE_LIMIT else ())]
+        told += [_on_card(file, now_ns) for file in self._cut_off if file not in found.files]
+        fresh = [file for file in strange if made[file] or not only_recent]
+        self._cut_off = ()
+        self._suspects.clear()
+        self._queue(sorted(fresh, key=_place), now_ns)
+        self._card.list(found, self._to_fetch)
+        self._missed, self._since_ns = False, now_ns
+        return told
+
+    def left(self, found: CardContents, now_ns: int) -> list[CameraEvent]:
+        """The card was listed for the last time: name what was not brought."""
+        told = self.listed(found, now_ns)
+        waiting = [file for file in self._to_fetch if not file.in_memory]
+        return [*told, *(_on_card(file, now_ns) for file in waiting)]
+
+    def list_due(self, now_ns: int, quiet_s: float) -> bool:
+        """Whether a picture may have been missed, and the camera had nothing to do for so long."""
+        return self._missed and not self.is_busy and not self._to_fetch and now_ns - self._quiet_ns >= _ns(quiet_s)
+
+    @property
+    def is_stale(self) -> bool:
+        """Whether the library knows another card than the one that is in the camera."""
+        return bool(self._suspects)
+
+    @property
+    def unlisted(self) -> bool:
+        """Whether a shot or a file came after the card had been listed."""
+        return self._since_ns is not None and self._quiet_ns > self._since_ns
+
+    def _made_since(self, taken_s: int | None) -> bool | None:
+        """Whether a picture was made after the card had been listed last; None where that is not known."""
+        if taken_s is None or self._since_ns is None or not self._clock.offsets_s:
+            return None
+        return self._clock.off_s(Claim(0, self._since_ns), taken_s) >= -self._clock.limit_s
+
+    def _queue(self, files: Iterable[CameraFile], now_ns: int) -> None:
+        for file in files:
+            if file not in self._to_fetch:
+                self._to_fetch[file] = _Announced(now_ns, self._since_ns)
+                self._missed = self._card.count(file) or self._missed
 
     def next_file(self) -> CameraFile | None:
         """Return the file to fetch next; it stays first until `fetched` or `not_fetched`."""
-        return self._to_fetch[0] if self._to_fetch else None
+        return next(iter(self._to_fetch), None)
 
     def fetched(self, file: CameraFile, arrival: Arrival, taken_s: int | None) -> list[CameraEvent]:
         """A file was fetched; `taken_s` is the body's note of when it was made."""
-        self._to_fetch.popleft()
+        announced = self._to_fetch.pop(file)
         self._tries.pop(file, None)
+        self._quiet_ns = arrival.monotonic_ns
         if not file.in_memory:
-            self._settle(file)
+            self._card.settle(file, (arrival.blob.size, taken_s))
         self._settings_due_ns = arrival.monotonic_ns + _ns(_SETTINGS_S)
         if self._makes_pairs() and _is_jpeg(arrival.name) and self._main_shot(file) is None:
-            self._held[_stem(file)] = (file, arrival, taken_s)
+            self._held[_stem(file)] = (file, arrival, taken_s, announced)
             return []
-        return self._deliver(file, arrival, taken_s)
+        return self._deliver(file, arrival, taken_s, announced)
 
     def not_fetched(self, file: CameraFile, reason: str, now_ns: int) -> list[CameraEvent]:
         """A file could not be fetched: try again later, three times in all, then fail the current shot."""
-        self._to_fetch.popleft()
+        announced = self._to_fetch.pop(file)
         self._tries[file] = self._tries.get(file, 0) + 1
         if self._tries[file] < _TRIES and not file.in_memory:
-            self._to_fetch.append(file)
+            self._to_fetch[file] = announced
             return []
         del self._tries[file]
-        self._settle(file)
-        if self.current is None or self.current.fired_ns is None:
-            return []
-        stays = "" if file.in_memory else f"; it stays on the card as {file.folder}/{file.name}"
-        return self.fail_current(f"{reason}{stays}", now_ns)
+        if file.in_memory:
+            return self.fail_current(reason, now_ns) if self._is_fired else []
+        self._card.settle(file, None)
+        told = [_on_card(file, now_ns)]
+        if self._is_fired:  # the file may be a picture by hand, and the shot's own yet to come
+            told += self.fail_current(
+                f"{reason}; it stays on the card as {file.folder}/{file.name}", now_ns, may_come=True
+            )
+        return told
 
     def deleted(self, file: CameraFile) -> None:
         """A file was deleted: the camera may use its name again."""
-        if self._known is not None:
-            self._known -= {file}
+        self._card.deleted(file)
 
     def release_held(self, now_ns: int) -> list[CameraEvent]:
         """Deliver each JPEG that waited too long for a raw file as a frame of its own."""
         before_ns = now_ns - _ns(self._timeouts.complete_s)
-        overdue = [stem for stem, (_, arrival, _) in self._held.items() if arrival.monotonic_ns < before_ns]
+        overdue = [stem for stem, (_, arrival, _, _) in self._held.items() if arrival.monotonic_ns < before_ns]
         return [event for stem in overdue for event in self._deliver(*self._held.pop(stem))]
 
-    def _settle(self, file: CameraFile) -> None:
-        if self._known is not None:
-            self._known |= {file}
-
-    def _is_late_shots(self, taken_s: int | None) -> bool:
-        return taken_s is not None and any(self._clock.fits(claim, taken_s) for claim in self._late)
+    @property
+    def _is_fired(self) -> bool:
+        return self.current is not None and self.current.fired_ns is not None
 
     def _makes_pairs(self) -> bool:
         """Whether the camera is set to raw and JPEG: "RAW + Large Fine JPEG", "NEF+Fine"."""
@@ -270,26 +355,32 @@ class CameraState:
         stem, jpeg, shot = self._last_frame
         return shot if stem == _stem(file) and jpeg != _is_jpeg(file.name) else None
 
-    def _deliver(self, file: CameraFile, arrival: Arrival, taken_s: int | None) -> list[CameraEvent]:
+    def _deliver(
+        self, file: CameraFile, arrival: Arrival, taken_s: int | None, announced: _Announced
+    ) -> list[CameraEvent]:
         main = self._main_shot(file)
         if main is not None:
             return [Companion(main, arrival.name, arrival.blob, arrival.monotonic_ns, arrival.facts)]
-        frame = self._attributed(arrival, taken_s)
+        frame = self._attributed(file, arrival, taken_s, announced)
         self._last_frame = None if frame.shot is None else (_stem(file), _is_jpeg(file.name), frame.shot)
         held = self._held.pop(_stem(file), None)
         return [frame, *([] if held is None else self._deliver(*held))]
 
-    def _attributed(self, arrival: Arrival, taken_s: int | None) -> Arrival:
+    def _attributed(self, file: CameraFile, arrival: Arrival, taken_s: int | None, announced: _Announced) -> Arrival:
         """Say which shot made a frame. The current shot ends with its frame."""
         fired_ns = None if self.current is None else self.current.fired_ns
         current = None if self.current is None or fired_ns is None else Claim(self.current.shot, fired_ns)
-        clue = FileClue(taken_s, arrival.monotonic_ns)
+        clue = FileClue(taken_s, announced.seen_ns, announced.since_ns, *self._card.neighbours(file))
         found = attribute(clue, self._late, [] if current is None else [current], self._clock)
         self._clock = found.clock
         if current is not None and found.shot == current.shot:
             self.current = None
-        left = [] if found.doubt else [claim for claim in self._late if claim.shot != found.shot]
-        self._late = deque(left, LATE_LIMIT)  # files come in order: after one in doubt no older one is expected
+        left = [claim for claim in self._late if claim.shot != found.shot]
+        if found.doubt is not None and found.doubt.code is not Code.FRAME_CLOCK_DISAGREES:
+            left = []  # files come in order: no older one is expected
+        self._late = deque(left, LATE_LIMIT)
+        if found.shot is not None and found.doubt is None:
+            self._card.made(file, found.shot)
         facts = {**arrival.facts, **({"doubt": findings.text(found.doubt)} if found.doubt else {})}
         facts["body_offsets_s"] = list(self._clock.offsets_s)
         return Arrival(found.shot, arrival.name, arrival.blob, arrival.monotonic_ns, facts)
@@ -326,6 +417,10 @@ def _is_jpeg(name: str) -> bool:
 
 def _stem(file: CameraFile) -> Stem:
     return file.folder, "" if file.in_memory else file.name.rpartition(".")[0]
+
+
+def _on_card(file: CameraFile, now_ns: int) -> CameraEvent:
+    return Noticed(finding(Code.PICTURE_ON_CARD, Subject("picture", f"{file.folder}/{file.name}")), now_ns)
 
 
 def _ns(seconds: float) -> int:

@@ -65,7 +65,7 @@ class Eos450d:
         self._clock = clock
         self._lock = threading.Lock()  # held around all that follows
         self._session = self._working = False
-        self._releases = self._looks = 0
+        self._releases = self._looks = self._numbered = 0
         self._card = Card(card_bytes, faults, clock.utc_ns() // 10**9)
         self._properties = Properties(serial, pairs=pairs, f_number=f_number, exposure_s=exposure_s)
         self._handlers: dict[int, Handler] = {
@@ -100,6 +100,12 @@ class Eos450d:
         """Close the contact of the remote socket: an exposure, with or without a link. False if there is none."""
         with self._lock:
             return self._release(PtpRequest(Op.EOS_REMOTE_RELEASE, 0, ()), b"").code == ResponseCode.OK
+
+    def change_card(self) -> None:
+        """A hand changes the card for an empty one, on which names begin with 0001."""
+        with self._lock:
+            self._card.change()
+            self._numbered = self._releases
 
     def turn(self, what: str, value: int) -> None:
         """A hand turns something at the body, or something in it runs low; it announces that. Raises ValueError."""
@@ -212,7 +218,7 @@ class Eos450d:
             self._properties.announce(ptp.eos_status(0))
 
     def _store(self, data: bytes, extension: str, number: int, to_memory: bool) -> None:
-        stem = f"IMG_{number % 10000:04d}"
+        stem = f"IMG_{max(number - self._numbered, 1) % 10000:04d}"
         handle, parent = (2 * number, 0) if to_memory else (FOLDER + 2 * number, FOLDER)
         code = Format.JPEG if extension.lower() in ("jpg", "jpeg") else Format.RAW
         taken_s = self._clock.utc_ns() // 10**9

@@ -52,6 +52,10 @@ class Card:
         """The files on the card, in order."""
         return [each.name for each in self._objects.values() if each.parent == FOLDER]
 
+    def change(self) -> None:
+        """Another card of this size takes its place, with a folder and no file."""
+        self._objects = {handle: each for handle, each in self._objects.items() if handle in (DCIM, FOLDER)}
+
     @property
     def full(self) -> bool:
         """Whether there is no room for another frame like the largest."""
