@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from itertools import pairwise
 
 import pytest
 from hypothesis import given
@@ -16,6 +17,7 @@ from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameter, Parameters, code
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger, Spacing
 from dappled.drivers.camera import Setting, SettingName, check_change
@@ -665,3 +667,129 @@ def test_the_series_of_the_settings_begins_and_ends_by_command() -> None:
     assert rig.command(2003, 0, -1, -1) == mavlink.MAV_RESULT_ACCEPTED
     assert rig.series.statistics() is None
     assert Rig().command(2003, 1, -1, -1) == mavlink.MAV_RESULT_DENIED  # there is none in the settings
+
+
+def places_of_camera_ids() -> dict[int, int]:
+    """Which parameter of each command is a target camera id, by the texts of the installed dialect."""
+    texts = (
+        (command, place, text.lower())
+        for command, entry in mavlink.enums["MAV_CMD"].items()
+        for place, text in entry.param.items()
+    )
+    return {
+        command: place
+        for command, place, text in texts
+        if text.startswith("target camera id") or "component id of camera to address" in text
+    }
+
+
+CAMERA_IDS = places_of_camera_ids()
+
+
+def named(command: int, camera: float) -> tuple[float, ...]:
+    """A command's parameters that would do something, for this camera."""
+    p: dict[int, list[float]] = {
+        2000: [0, 2.0, 0, 3],
+        206: [5.0],
+        2003: [1],
+        530: [0, mavlink.CAMERA_MODE_IMAGE_SURVEY],
+        531: [2, 100.0],
+    }
+    parameters = [*p.get(command, []), *[0.0] * 7][:7]
+    parameters[CAMERA_IDS[command] - 1] = camera
+    return tuple(parameters)
+
+
+def busy(rig: Rig) -> tuple[object, ...]:
+    """What a command could have changed."""
+    return rig.shutter.statistics().interval_s, rig.series.statistics(), rig.component._status.mode, *rig.fired
+
+
+def test_the_dialect_has_the_target_camera_ids_that_are_known_of() -> None:
+    assert CAMERA_IDS == {
+        206: 4, 214: 3, 529: 2, 530: 1, 531: 3, 532: 3, 534: 1, 2000: 1, 2001: 1, 2003: 4, 2004: 4, 2005: 5, 2010: 1,
+        2500: 3, 2501: 2, 2502: 2, 2503: 2,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("command", CAMERA_IDS)
+def test_a_command_for_another_camera_is_denied_and_not_done(command: int) -> None:
+    """MAV_CMD_IMAGE_START_CAPTURE's text: all other values than 0 and the camera's own are denied, in a broadcast, too.
+    Which others are refused in a broadcast nobody says: they may be the autopilot's own."""
+    rig = Rig(configured=Spacing(2.0))
+    before = busy(rig)
+    for camera in (101, 2, 6, 7, 99, 255, -1, 0.5, math.inf):
+        assert rig.command(command, *named(command, camera)) == mavlink.MAV_RESULT_DENIED
+        to_all = mavlink.MAV_RESULT_DENIED if command in (2000, 2001) else None
+        assert rig.command(command, *named(command, camera), target=(0, 0)) == to_all
+        assert rig.command(command, *named(command, camera), target=(1, 0)) == to_all
+        assert rig.command(command, *named(command, 0), target=(1, 101)) is None
+    assert busy(rig) == before
+
+
+@pytest.mark.parametrize("command", CAMERA_IDS)
+@pytest.mark.parametrize("camera", [NAN, 100, 1])
+def test_a_command_for_this_camera_or_all_is_answered_as_one_without_a_camera_id(command: int, camera: float) -> None:
+    plain, rig = Rig(configured=Spacing(2.0)), Rig(configured=Spacing(2.0))
+    assert rig.command(command, *named(command, camera)) == plain.command(command, *named(command, 0))
+    assert busy(rig) == busy(plain)
+    if camera != 1:  # in a broadcast 1 is the autopilot's first camera
+        to_all = plain.command(command, *named(command, 0), target=(0, 0))
+        assert rig.command(command, *named(command, camera), target=(0, 0)) == to_all
+
+
+def test_a_stop_for_another_camera_leaves_the_series_running() -> None:
+    rig = Rig()
+    rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 2.0, 0)
+    for target in ((1, 100), (1, 0), (1, 101)):
+        rig.command(mavlink.MAV_CMD_IMAGE_STOP_CAPTURE, 101, target=target)
+        assert rig.shutter.statistics().interval_s == 2.0
+    rig.command(mavlink.MAV_CMD_IMAGE_STOP_CAPTURE, 100)
+    assert rig.shutter.statistics().interval_s is None
+
+
+def test_the_autopilots_requests_for_another_camera_are_not_counted_as_this_ones() -> None:
+    rig = Rig()
+    autopilot_heartbeat(rig, 1)
+    for number, camera in ((1, 0), (5, 101), (2, 0)):
+        rig.clock.advance(3)
+        capture = mavlink.MAVLink_command_long_message(1, 0, 2000, 0, camera, 0, 1, number, 0, 0, 0)
+        rig.hear(capture, AUTOPILOT)
+    rig.tick(3)
+    rig.tick(3)
+    assert rig.fired == [5, 6]
+    assert rig.lost_triggers == []
+
+
+@pytest.mark.parametrize("nothing", [0.0, NAN])
+def test_a_request_with_zeros_alone_is_one_photograph(nothing: float) -> None:
+    """As ArduPilot does; with an interval it runs until it is stopped."""
+    rig = Rig()
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, nothing, nothing, 0) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, nothing, nothing, 0) == mavlink.MAV_RESULT_ACCEPTED
+    assert rig.shutter.statistics().interval_s is None
+    assert rig.fired == [5]
+    assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0.5, 0) == mavlink.MAV_RESULT_ACCEPTED
+    assert (rig.shutter.statistics().interval_s, rig.shutter.statistics().interval_count) == (0.5, None)
+
+
+def test_the_status_is_sent_twice_a_second_at_most_unless_it_is_asked_for() -> None:
+    """A time lapse of 5 Hz changes it ten times a second."""
+    rig = Rig()
+    rig.tick(4)
+    sent: list[float] = []
+    last = 0
+    for step in range(100):
+        rig.component.state_changed()
+        rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 262)
+        assert len(rig.of("CAMERA_CAPTURE_STATUS")) == 1  # an answer
+        if step % 2 == 0 and step < 90:
+            rig.shutter.request(CaptureRequest("test", "console", step, acknowledged=False))
+            rig.shutter.settled(5 + step // 2, ok=True)
+        rig.tick(0.1)
+        for status in rig.of("CAMERA_CAPTURE_STATUS"):
+            sent.append(step / 10)
+            last = status.image_count
+    assert 10 < len(sent) <= 20
+    assert min(after - before for before, after in pairwise(sent)) >= 0.5
+    assert last == 5 + 45

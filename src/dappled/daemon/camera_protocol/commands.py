@@ -28,6 +28,28 @@ SHORTEST_NS = 100_000_000  # 10 Hz: nothing here changes faster
 LONGEST_US = 3.6e9
 LISTING_NS = 10 * 10**9
 _SEQUENCES = 16
+_ALL_CAMERAS, _ONLY_SENSOR = 0, 1
+_NAMES_CAMERA = {  # which parameter is the "target camera ID" (MAV_CMD)
+    mavlink.MAV_CMD_DO_SET_CAM_TRIGG_DIST: 4,
+    mavlink.MAV_CMD_DO_SET_CAM_TRIGG_INTERVAL: 3,
+    mavlink.MAV_CMD_RESET_CAMERA_SETTINGS: 2,
+    mavlink.MAV_CMD_SET_CAMERA_MODE: 1,
+    mavlink.MAV_CMD_SET_CAMERA_ZOOM: 3,
+    mavlink.MAV_CMD_SET_CAMERA_FOCUS: 3,
+    mavlink.MAV_CMD_SET_CAMERA_SOURCE: 1,
+    mavlink.MAV_CMD_IMAGE_START_CAPTURE: 1,
+    mavlink.MAV_CMD_IMAGE_STOP_CAPTURE: 1,
+    mavlink.MAV_CMD_DO_TRIGGER_CONTROL: 4,
+    mavlink.MAV_CMD_CAMERA_TRACK_POINT: 4,
+    mavlink.MAV_CMD_CAMERA_TRACK_RECTANGLE: 5,
+    mavlink.MAV_CMD_CAMERA_STOP_TRACKING: 1,
+    mavlink.MAV_CMD_VIDEO_START_CAPTURE: 3,
+    mavlink.MAV_CMD_VIDEO_STOP_CAPTURE: 2,
+    mavlink.MAV_CMD_VIDEO_START_STREAMING: 2,
+    mavlink.MAV_CMD_VIDEO_STOP_STREAMING: 2,
+}
+# Their texts want a broadcast that names a camera denied. The others may be the autopilot's own.
+_DENIED_TO_ALL = (mavlink.MAV_CMD_IMAGE_START_CAPTURE, mavlink.MAV_CMD_IMAGE_STOP_CAPTURE)
 _ZOOM_STEP, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = 0, 2, 3, 4
 
 
@@ -67,6 +89,22 @@ class Command:
         """Parameter 1 to 7 as an integer; the default where it is not finite."""
         return round(self.number(place, float(default)))
 
+    def concerns(self, component: int) -> bool:
+        """Whether it means the camera with this component id: by its target camera id, where it has one.
+
+        0 (and NaN) are all cameras, 7 to 255 the one with that component id. 1 to 6 are cameras of an autopilot; but
+        sent to one MAVLink camera, 1 is its first sensor, and there is no other (MAV_CMD_IMAGE_START_CAPTURE)."""
+        place = _NAMES_CAMERA.get(self.name)
+        camera = self.parameters[place - 1] if place else _ALL_CAMERAS
+        ours = (_ALL_CAMERAS, component) if self.broadcast else (_ALL_CAMERAS, component, _ONLY_SENSOR)
+        return math.isnan(camera) or camera in ours
+
+    @property
+    def photographs(self) -> int:
+        """How many MAV_CMD_IMAGE_START_CAPTURE asks for; 0: until it is stopped, which needs an interval."""
+        count = self.integer(3, 1)
+        return 1 if count == 0 and self.number(2) == 0 else count
+
     @property
     def of_autopilot(self) -> bool:
         """Whether an autopilot sent it."""
@@ -81,12 +119,13 @@ class Command:
 @dataclass(frozen=True, slots=True)
 class CommandAnswer:
     """The result of a command, messages that follow the acknowledgement, and text for the pilot. `new_shot`: it became
-    a shot of its own, and is no message more of a known one."""
+    a shot of its own, and is no message more of a known one. `to_all`: a refusal of a broadcast is sent, too."""
 
     result: int
     then: tuple[MavlinkMessage, ...] = ()
     words: str | None = None
     new_shot: bool = False
+    to_all: bool = False
 
 
 _NOT_OURS = CommandAnswer(DENIED)  # a broadcast to a camera that something else fires: it is left alone, unanswered
@@ -150,8 +189,9 @@ class CameraCommands:
         *,
         intervals: MessageIntervals,
         series: DistanceSeries,
+        component_id: int,
     ) -> None:
-        self._series = series
+        self._series, self._component_id = series, component_id
         self._shutter, self._clock, self._status, self._parameters = shutter, clock, status, parameters
         self._intervals = intervals
         self._steps = RecentRequests()
@@ -162,21 +202,27 @@ class CameraCommands:
 
     def answer(self, command: Command) -> CommandAnswer:
         """Do it, or say why not. Never raises for what a command says."""
+        if not self.concerns(command):
+            return CommandAnswer(DENIED, to_all=command.name in _DENIED_TO_ALL)
         handler = _COMMANDS.get(command.name)
         return CommandAnswer(UNSUPPORTED) if handler is None else handler(self, command)
+
+    def concerns(self, command: Command) -> bool:
+        """Whether it means this camera, and not another one behind the same address."""
+        return command.concerns(self._component_id)
 
     # photographs
 
     def fires(self, command: Command) -> bool:
         """Whether it asks for one photograph now."""
         if command.name == mavlink.MAV_CMD_IMAGE_START_CAPTURE:
-            return command.integer(3, 1) == 1
+            return command.photographs == 1 and self.concerns(command)
         return command.name == mavlink.MAV_CMD_DO_DIGICAM_CONTROL and command.integer(5) == 1
 
     def _start_capture(self, command: Command) -> CommandAnswer:
         if command.broadcast and not self._shutter.fires:
             return _NOT_OURS
-        count = command.integer(3, 1)
+        count = command.photographs
         request = CaptureRequest(
             command.source,
             "IMAGE_START_CAPTURE",

@@ -24,6 +24,7 @@ from dappled.daemon.camera_protocol.commands import (
     MessageIntervals,
 )
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
+from dappled.daemon.camera_protocol.feedback import CameraFeedback
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
 from dappled.daemon.camera_protocol.own_autopilot import LISTEN_NS, Links, OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters, ParameterServer
@@ -39,9 +40,8 @@ _HEARTBEATS, _HEARTBEATS_NS = 256, 5 * 10**9
 _KNOWN_NS = 2 * 10**9  # so long, and every station behind a port has been heard there
 _REPORTS = 256
 HEARTBEAT_NS = 10**9
-STATUS_NS = 100_000_000
+STATUS_NS = 600_000_000  # at most twice a second, and the last state within a second
 _OLD_IMAGES_A_TICK = 2
-_IMAGES = 2**16  # img_idx has 16 bits
 
 
 class ReportRoutes:
@@ -153,14 +153,17 @@ class Component:
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity
         self._shutter, self._clock = shutter, clock
         self._model, self._earlier = model, earlier
-        self._cam_idx = cam_idx
-        self._last_feedback: int | None = None
-        self._restarts = autopilot.restarts
-        self._stamps: deque[int] = deque(maxlen=64)
+        self._feedback = CameraFeedback(autopilot, clock, cam_idx=cam_idx, makes_shots=not shutter.fires)
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(
-            shutter, clock, self._status, parameters, intervals=self._intervals, series=series
+            shutter,
+            clock,
+            self._status,
+            parameters,
+            intervals=self._intervals,
+            series=series,
+            component_id=links.component_id,
         )
         self._parameters = ParameterServer(parameters)
         self._files = FtpServer(self._status)
@@ -222,7 +225,7 @@ class Component:
         echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
         answer = CommandAnswer(ACCEPTED) if echo else self._commands.answer(command)
         self._count_trigger(command, new=answer.new_shot)
-        if not command.broadcast or answer.result == ACCEPTED:  # a broadcast is never refused
+        if not command.broadcast or answer.result == ACCEPTED or answer.to_all:  # another one may do what is for all
             self._acknowledge(command, answer.result)
             self._results.append((command, answer.result))
         for message in answer.then:
@@ -238,12 +241,14 @@ class Component:
         `new`: the command became a shot of its own."""
         if not command.of_autopilot or command.system != self._identity.system_id:
             return
+        if not self._commands.concerns(command):
+            return  # the numbers of another camera
         if not self._identity.is_ardupilot():
             if new:
                 self._autopilot.numbers["CAMERA_TRIGGER"].unnumbered(self._clock.monotonic_ns())
         elif command.name != mavlink.MAV_CMD_IMAGE_START_CAPTURE:
             return
-        elif command.integer(3, 1) == 1 and (number := command.integer(4)) > 0:
+        elif command.photographs == 1 and (number := command.integer(4)) > 0:
             self._autopilot.numbers["CAMERA_FEEDBACK"].heard(number, self._clock.monotonic_ns(), self._here)
 
     def _here(self) -> str:
@@ -278,7 +283,7 @@ class Component:
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
         numbers, now_ns = self._autopilot.numbers[name], self._clock.monotonic_ns()
         if name == "CAMERA_FEEDBACK":
-            ours = self._is_trigger(message)
+            ours = self._feedback.is_trigger(message, self._here)
             if ours and self._shutter.fires:
                 numbers.reported(sequence, now_ns, self._here)
             if not ours or self._shutter.fires:
@@ -306,38 +311,6 @@ class Component:
         if not decision.accepted:
             self.say(f"no photo: {decision.reason}")
             self.state_changed()
-
-    def _is_trigger(self, feedback: MavlinkMessage) -> bool:
-        """Whether a CAMERA_FEEDBACK reports a trigger of our camera, and not another one's again.
-
-        ArduPilot sends one for each of its cameras at every trigger or contact of one. The others repeat their last
-        time, or have neither time nor number. Without a time, or before the autopilot's clock is known, a number that
-        is newer than the last one shows a trigger; the first number of all may be a repeated one, and is told as lost.
-        """
-        if feedback.cam_idx != self._cam_idx:
-            return False
-        if self._restarts != self._autopilot.restarts:
-            self._restarts, self._last_feedback = self._autopilot.restarts, None
-        time_us, image, known = int(feedback.time_usec), int(feedback.img_idx), self._last_feedback
-        newer = image == 1 and known != 1
-        if known is not None:
-            newer = newer or 0 < (image - known) % _IMAGES < _IMAGES // 2
-        if known is None or newer:
-            self._last_feedback = image
-        if time_us in self._stamps:
-            return False
-        if time_us:
-            self._stamps.append(time_us)
-        stale = self._autopilot.is_stale(time_us) if time_us else None
-        why = ""
-        if stale and newer and known is not None:
-            why = "reported more than 5 s late"
-        elif stale is None and known is None and image > 1:
-            why = "the first report heard, without a time that is known: perhaps another camera's"
-        if why and not self._shutter.fires:
-            numbers = self._autopilot.numbers["CAMERA_FEEDBACK"]
-            numbers.late(image, self._clock.monotonic_ns(), lambda: f"{why}, {self._here()}")
-        return newer if stale is None else not stale
 
     def _parameter(self, packet: Packet) -> None:
         message = packet.message

@@ -1,0 +1,57 @@
+"""Which CAMERA_FEEDBACK reports a trigger of this camera."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+from dappled.clock import Clock
+from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
+from dappled.drivers.mavlink import MavlinkMessage
+
+_IMAGES = 2**16  # img_idx has 16 bits
+
+
+class CameraFeedback:
+    """The CAMERA_FEEDBACK of our autopilot. `cam_idx` is the camera's number there; `makes_shots`: each trigger that is
+    reported is a shot, as something else fires the camera."""
+
+    def __init__(self, autopilot: OwnAutopilot, clock: Clock, *, cam_idx: int, makes_shots: bool) -> None:
+        self._autopilot, self._clock = autopilot, clock
+        self._cam_idx, self._makes_shots = cam_idx, makes_shots
+        self._last: int | None = None
+        self._restarts = autopilot.restarts
+        self._stamps: deque[int] = deque(maxlen=64)
+
+    def is_trigger(self, feedback: MavlinkMessage, where: Callable[[], str]) -> bool:
+        """Whether it reports a trigger of our camera, and not another one's again. `where` says when and where that is
+        noticed.
+
+        ArduPilot sends one for each of its cameras at every trigger or contact of one. The others repeat their last
+        time, or have neither time nor number. Without a time, or before the autopilot's clock is known, a number that
+        is newer than the last one shows a trigger; the first number of all may be a repeated one, and is told as lost.
+        """
+        if feedback.cam_idx != self._cam_idx:
+            return False
+        if self._restarts != self._autopilot.restarts:
+            self._restarts, self._last = self._autopilot.restarts, None
+        time_us, image, known = int(feedback.time_usec), int(feedback.img_idx), self._last
+        newer = image == 1 and known != 1
+        if known is not None:
+            newer = newer or 0 < (image - known) % _IMAGES < _IMAGES // 2
+        if known is None or newer:
+            self._last = image
+        if time_us in self._stamps:
+            return False
+        if time_us:
+            self._stamps.append(time_us)
+        stale = self._autopilot.is_stale(time_us) if time_us else None
+        why = ""
+        if stale and newer and known is not None:
+            why = "reported more than 5 s late"
+        elif stale is None and known is None and image > 1:
+            why = "the first report heard, without a time that is known: perhaps another camera's"
+        if why and self._makes_shots:
+            numbers = self._autopilot.numbers["CAMERA_FEEDBACK"]
+            numbers.late(image, self._clock.monotonic_ns(), lambda: f"{why}, {where()}")
+        return newer if stale is None else not stale
