@@ -1,6 +1,7 @@
 """MAVLink links: packets in and out over UDP, TCP and serial, logged, and signed where there is a key.
 
-`links` receives and sends packets, `channels` opens connections, `signing` signs and verifies.
+`links` receives and sends packets, `channels` opens connections, `peers` says who is sent what, `framing` cuts bytes
+into packets, `signing` signs and verifies.
 """
 
 from dappled.drivers.mavlink.channels import LinkError, parse

@@ -8,10 +8,12 @@ import socket
 import termios
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
+from dappled.drivers.mavlink.peers import Peers, Shown, Source
 from dappled.errors import DappledError
 
 LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
@@ -28,8 +30,9 @@ _SCHEMES: dict[str, LinkKind] = {
 _CHUNK = 65536
 _OUTBOX_LIMIT = 65536
 _GONE_S = 5
-_PEERS_LIMIT = 16
-_PEER_SILENT_S = 60.0
+_DRAINED = 512  # datagrams at once, so that the kernel's buffer holds those that come meanwhile
+_KERNEL_BYTES = 4 << 20
+_SO_RCVBUFFORCE = 33  # socket(7)
 _NO_DATAGRAM = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED)  # the last: no program listens there yet
 _NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO, errno.ENETDOWN, errno.ENETUNREACH,
               errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENONET)  # fmt: skip
@@ -109,6 +112,9 @@ class ByteChannel(Protocol):
     def read(self) -> bytes | None:
         """Return what has come, b"" for nothing yet, None when the other side has closed. Raises OSError when
         broken."""
+
+    def shown(self, evidence: Shown) -> None:
+        """A packet of what was read last was judged. Under the link's lock."""
 
     def write(self, data: bytes) -> bool:
         """Send without blocking. False: not sent (no receiver, or the buffer is full). Raises OSError when broken."""
@@ -191,14 +197,11 @@ class _Udp:
         return (self._sock.fileno(),)
 
     def read(self) -> bytes | None:
-        try:
-            data, peer = self._sock.recvfrom(_CHUNK)
-        except OSError as error:
-            if error.errno in _NO_DATAGRAM:
-                return b""
-            raise
-        self._heard(peer)
-        return data
+        received = self._receive()
+        return b"" if received is None else received[0]
+
+    def shown(self, evidence: Shown) -> None:
+        return
 
     def wants_write(self) -> bool:
         return False
@@ -212,37 +215,74 @@ class _Udp:
     def close(self) -> None:
         self._sock.close()
 
-    def _heard(self, peer: tuple[str, int]) -> None:
-        return
-
-    def _send(self, data: bytes, peer: tuple[str, int]) -> bool:
+    def _receive(self) -> tuple[bytes, Source] | None:
         try:
-            self._sock.sendto(data, peer)
+            data, source = self._sock.recvfrom(_CHUNK)
+        except OSError as error:
+            if error.errno in _NO_DATAGRAM:
+                return None
+            raise
+        return data, source
+
+    def _send(self, data: bytes, to: Source) -> bool:
+        try:
+            self._sock.sendto(data, to)
         except OSError:  # no program listens there, or the network is down: the next packet tries again
             return False
         return True
 
 
 class UdpIn(_Udp):
-    """Listen, and answer every peer that was heard in the last minute (at most 16)."""
+    """Listen, and send to the peers that have proven themselves. What they send is read before what strangers send."""
 
     def __init__(self, sock: socket.socket) -> None:
         super().__init__(sock)
-        self._peers: dict[tuple[str, int], float] = {}
+        self._peers = Peers()
+        self._known, self._strange = deque[tuple[bytes, Source]](), deque[tuple[bytes, Source]]()
+        self._waiting = Counter[Source]()  # in `_strange`: a peer that proves itself meanwhile keeps its order
+        self._last: tuple[bytes, Source] | None = None
+        for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):  # the first one passes the kernel's limit, where it may
+            try:
+                sock.setsockopt(socket.SOL_SOCKET, option, _KERNEL_BYTES)
+            except PermissionError:
+                continue
+            break
+
+    def read(self) -> bytes | None:
+        if not self._known and len(self._strange) < _DRAINED:
+            self._drain()
+        if self._known:
+            self._last = self._known.popleft()
+        elif self._strange:
+            self._last = self._strange.popleft()
+            self._waiting[self._last[1]] -= 1
+            if not self._strange:
+                self._waiting.clear()
+        else:
+            self._last = None
+        return b"" if self._last is None else self._last[0]
+
+    def shown(self, evidence: Shown) -> None:
+        if self._last is not None:
+            data, source = self._last
+            self._peers.shown(source, len(data), evidence, time.monotonic_ns())
 
     def write(self, data: bytes) -> bool:
-        silent = time.monotonic() - _PEER_SILENT_S
-        for peer, heard in list(self._peers.items()):
-            if heard < silent and len(self._peers) > 1:
-                self._peers.pop(peer, None)
-        sent = [self._send(data, peer) for peer in list(self._peers)]
+        sent = [self._send(data, source) for source in self._peers.receivers(len(data), time.monotonic_ns())]
         return any(sent)
 
-    def _heard(self, peer: tuple[str, int]) -> None:
-        self._peers.pop(peer, None)
-        self._peers[peer] = time.monotonic()
-        if len(self._peers) > _PEERS_LIMIT:
-            self._peers.pop(next(iter(self._peers)))
+    def _drain(self) -> None:
+        now_ns = time.monotonic_ns()
+        for _ in range(_DRAINED):
+            received = self._receive()
+            if received is None:
+                return
+            source = received[1]
+            if self._peers.is_proven(source, now_ns) and not self._waiting[source]:
+                self._known.append(received)
+            else:
+                self._strange.append(received)
+                self._waiting[source] += 1
 
 
 class UdpOut(_Udp):
@@ -283,6 +323,9 @@ class ByteStream:
             return os.read(self._fd, _CHUNK) or None
         except BlockingIOError:
             return b""
+
+    def shown(self, evidence: Shown) -> None:
+        return
 
     def write(self, data: bytes) -> bool:
         if len(self._waiting) + len(data) > _OUTBOX_LIMIT:
@@ -338,6 +381,9 @@ class TcpServer:
             self._replace_client()
             return b""
         return data
+
+    def shown(self, evidence: Shown) -> None:
+        return
 
     def write(self, data: bytes) -> bool:
         try:

@@ -5,21 +5,18 @@ from __future__ import annotations
 import logging
 import select
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from operator import or_
-from typing import Any, Protocol
-
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, open_channel, parse
+from dappled.drivers.mavlink.framing import Framed, Framer, MavlinkMessage, PacketParser, is_signed, mavlink, pack
 from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningStatistics
 from dappled.workers import Loop
 
-# `mavlink` holds the message classes, for the whole project: version 2 on the wire, and ArduPilot's dialect, which
-# contains `common`.
 __all__ = [
     "Framed",
     "Framer",
@@ -36,12 +33,7 @@ __all__ = [
     "pack",
 ]
 
-MavlinkMessage = Any  # pymavlink's message classes have no common typed base
-
 log = logging.getLogger(__name__)
-_MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
-_SIGNED = 0x01
-_MAX_ID_1 = 255
 _REOPEN_S = 1.0
 _POLL_S = 0.2
 
@@ -80,124 +72,6 @@ class PacketReceiver(Protocol):
 
     def on_packet(self, packet: Packet) -> None:
         """Act on a packet, quickly; may call `PacketSender.send`."""
-
-
-class PacketParser:
-    """Parse whole packets and verify their checksums, not their signatures. One for each stream: it keeps state."""
-
-    def __init__(self) -> None:
-        self._parser = mavlink.MAVLink(None)
-
-    def __call__(self, raw: bytes) -> MavlinkMessage | None:
-        """Return the message, or None where the bytes are not one sound packet. An unknown id is `MAVLink_unknown`."""
-        try:
-            return self._parser.decode(bytearray(raw))
-        except (mavlink.MAVError, IndexError):  # IndexError: no bytes at all
-            return None
-
-
-@dataclass(frozen=True, slots=True)
-class Framed:
-    """The bytes of one packet as they came, and its message."""
-
-    raw: bytes
-    message: MavlinkMessage
-
-    @property
-    def version(self) -> int:
-        """MAVLink 1 or 2."""
-        return 1 if self.raw[0] == _MAGIC_1 else 2
-
-
-class Framer:
-    """Cut bytes into packets. Keeps less than one packet (280 bytes) between calls.
-
-    `bad` counts the places where bytes did not make a packet: garbage, wrong checksum, unknown flags. The checksum of a
-    packet with an unknown message can't be verified; in a stream it counts only if another packet, or nothing, follows.
-    """
-
-    def __init__(self) -> None:
-        self.bad = 0
-        self._rest = b""
-        self._lost = False
-        self._parse = PacketParser()
-
-    def feed(self, data: bytes) -> Iterator[Framed]:
-        """Yield the packets that more bytes of a stream complete."""
-        buffer = self._rest + data
-        position, packets = self._cut(buffer, whole=False)
-        self._rest = buffer[position:]
-        yield from packets
-
-    def datagram(self, data: bytes) -> Iterator[Framed]:
-        """Yield the packets of one datagram, which holds whole packets only."""
-        _, packets = self._cut(data, whole=True)
-        self._lost = False
-        yield from packets
-
-    def _cut(self, buffer: bytes, *, whole: bool) -> tuple[int, list[Framed]]:
-        packets: list[Framed] = []
-        position = 0
-        while position < len(buffer):
-            length = _length(buffer, position)
-            if length is None and not whole:
-                break
-            if length is not None and length > 0 and position + length > len(buffer) and not whole:
-                break
-            framed = None
-            if length is not None and 0 < length <= len(buffer) - position:
-                framed = self._packet(buffer, position, length, whole=whole)
-            if framed is None:
-                if not self._lost:
-                    self.bad += 1
-                self._lost = True
-                position = _next_magic(buffer, position + 1)
-                continue
-            self._lost = False
-            packets.append(framed)
-            position += len(framed.raw)
-        return position, packets
-
-    def _packet(self, buffer: bytes, position: int, length: int, *, whole: bool) -> Framed | None:
-        end = position + length
-        raw = buffer[position:end]
-        message = self._parse(raw)
-        if message is None:
-            return None
-        if isinstance(message, mavlink.MAVLink_unknown) and not whole:
-            follows = end == len(buffer) or buffer[end] in (_MAGIC_1, _MAGIC_2)
-            if not follows:
-                return None
-        return Framed(raw, message)
-
-
-def _length(buffer: bytes, position: int) -> int | None:
-    """The length of the packet that begins here; None when its header is incomplete, 0 when no packet begins here."""
-    magic = buffer[position]
-    have = len(buffer) - position
-    if magic == _MAGIC_1:
-        return None if have < 2 else buffer[position + 1] + 8
-    if magic == _MAGIC_2:
-        if have < 3:
-            return None
-        flags = buffer[position + 2]
-        if flags & ~_SIGNED:
-            return 0
-        return buffer[position + 1] + 12 + (13 if flags & _SIGNED else 0)
-    return 0
-
-
-def _next_magic(buffer: bytes, start: int) -> int:
-    places = [p for p in (buffer.find(_MAGIC_1, start), buffer.find(_MAGIC_2, start)) if p >= 0]
-    return min(places, default=len(buffer))
-
-
-def pack(message: MavlinkMessage, packer: Any, *, version_1: bool) -> bytes:
-    """Pack a message with the packer's ids and next sequence number; in version 1 only where its id fits."""
-    version_1 = version_1 and message.get_msgId() <= _MAX_ID_1
-    raw: bytes = message.pack(packer, force_mavlink1=version_1)
-    packer.seq = (packer.seq + 1) % 256
-    return raw
 
 
 # --- one link
@@ -433,21 +307,33 @@ class MavlinkLinks:
             try:
                 if not self._wait(channel):
                     continue
-                data = channel.read()
-                stamp_us = self._clock.utc_ns() // 1000
+                while (data := channel.read()) and not self._stop.is_set():
+                    self._take(link, channel, framer, data, receiver)
+                    if not channel.datagrams:  # a stream that never ends must not keep its own output waiting
+                        break
             except (OSError, ValueError) as error:  # ValueError: a descriptor that another thread closed
                 link.fail(error)
                 continue
             if data is None:
                 link.fail("the other side closed it")
-                continue
-            if not data:
-                continue
-            bad = framer.bad
-            packets = framer.datagram(data) if channel.datagrams else framer.feed(data)
-            for framed in packets:
-                self._received(link, stamp_us, framed, receiver)
-            link.packets_bad += framer.bad - bad
+
+    def _take(
+        self, link: Link, channel: ByteChannel, framer: Framer, data: bytes, receiver: PacketReceiver | None
+    ) -> None:
+        """Cut what was read into packets. On a signed port strangers' datagrams are dropped before they are parsed."""
+        stamp_us = self._clock.utc_ns() // 1000
+        bad = framer.bad
+        if not channel.datagrams:
+            packets = framer.feed(data)
+        elif link.guard is None:
+            packets = framer.datagram(data)
+        else:
+            sifted = link.guard.sift(data)
+            packets = framer.datagram(sifted.sound)
+            link.packets_bad += sifted.bad
+        for framed in packets:
+            self._received(link, channel, stamp_us, framed, receiver)
+        link.packets_bad += framer.bad - bad
 
     def _wait(self, channel: ByteChannel) -> bool:
         """Wait until there is something to read, and flush meanwhile. poll takes descriptors above 1023, select does
@@ -461,7 +347,9 @@ class MavlinkLinks:
                 channel.flush()
         return bool(ready & ~select.POLLOUT)
 
-    def _received(self, link: Link, stamp_us: int, framed: Framed, receiver: PacketReceiver | None) -> None:
+    def _received(
+        self, link: Link, channel: ByteChannel, stamp_us: int, framed: Framed, receiver: PacketReceiver | None
+    ) -> None:
         with self._order:
             message = framed.message
             trusted = True
@@ -469,8 +357,12 @@ class MavlinkLinks:
                 source = (message.get_srcSystem(), message.get_srcComponent())
                 trust = link.guard.judge(framed.raw, *source, message.get_msgId())
                 if trust == "refuse":
+                    if channel.datagrams and is_signed(framed.raw):
+                        channel.shown("old")  # `sift` let it pass: its signature is right
                     return
                 trusted = trust == "obey"
+            if trusted:
+                channel.shown("signed" if link.guard is not None and is_signed(framed.raw) else "sound")
             link.packets_in += 1
             link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1

@@ -18,10 +18,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
 from dappled import durable, key_files
 from dappled.clock import Clock
+from dappled.drivers.mavlink.framing import SIGNATURE_BYTES, is_signed, mavlink, message_of, packet_length
 from dappled.errors import DappledError
 
 log = logging.getLogger(__name__)
@@ -31,8 +30,6 @@ EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
 UNITS_PER_S = 100_000
 NEW_STREAM_UNITS = 60 * UNITS_PER_S
 AHEAD_UNITS = 10 * UNITS_PER_S
-_BLOCK = 13
-_SIGNED_FLAG = 0x01
 _STREAMS = 256
 _KEEP_S = 1.0
 _LATEST = 2**48 - 1
@@ -171,6 +168,14 @@ class SigningStatistics:
         return self.forged + self.replayed + self.unsigned_refused
 
 
+@dataclass(frozen=True, slots=True)
+class Sifted:
+    """The packets of a datagram that are worth parsing, and how many places in it were no packet."""
+
+    sound: bytes
+    bad: int
+
+
 class SignatureGuard:
     """Signing on one link: signs what is sent, verifies what is received. Used under the link's lock.
 
@@ -188,13 +193,13 @@ class SignatureGuard:
 
     def judge(self, raw: bytes, system: int, component: int, message_id: int) -> Trust:
         """Return whether to obey a sound packet, only hear it, or refuse it."""
-        if raw[0] != mavlink.PROTOCOL_MARKER_V2 or not raw[2] & _SIGNED_FLAG:
+        if not is_signed(raw):
             return self._judge_unsigned(message_id)
-        if not hmac.compare_digest(self._signature(raw[:-6]), raw[-6:]):
+        if not self._rightly_signed(raw):
             self._forged += 1
             return "refuse"
         timestamp = timestamp_of(raw)
-        stream = (system, component, raw[-_BLOCK])
+        stream = (system, component, raw[-SIGNATURE_BYTES])
         last = self._streams.get(stream)
         if timestamp <= (self._time.oldest() if last is None else last):
             self._replayed += 1
@@ -206,6 +211,30 @@ class SignatureGuard:
         self._time.accepted(timestamp)
         self._good += 1
         return "obey"
+
+    def sift(self, datagram: bytes) -> Sifted:
+        """Keep the packets of a datagram that are worth parsing: rightly signed, or unsigned where that may be heard.
+
+        Nothing but their signature is looked at: strangers' packets are refused for some 10 µs each, parsing takes ten
+        times as long.
+        """
+        kept, at = list[bytes](), 0
+        while at < len(datagram):
+            length = packet_length(datagram, at)
+            if length is None:
+                return Sifted(b"".join(kept), 1)
+            raw = datagram[at : at + length]
+            at += length
+            if is_signed(raw):
+                if self._rightly_signed(raw):
+                    kept.append(raw)
+                else:
+                    self._forged += 1
+            elif self._unsigned != "refuse" or message_of(raw) == mavlink.MAVLINK_MSG_ID_RADIO_STATUS:
+                kept.append(raw)
+            else:
+                self._refused += 1
+        return Sifted(b"".join(kept), 0)
 
     def prepare(self, packer: mavlink.MAVLink) -> None:
         """Let the next message that `packer` packs be signed, with a timestamp of its own."""
@@ -224,8 +253,8 @@ class SignatureGuard:
         self._taken += 1
         return "obey" if self._unsigned == "allow" else "hear"
 
-    def _signature(self, signed: bytes) -> bytes:
-        return hashlib.sha256(self._key + signed).digest()[:6]
+    def _rightly_signed(self, raw: bytes) -> bool:
+        return hmac.compare_digest(hashlib.sha256(self._key + raw[:-6]).digest()[:6], raw[-6:])
 
 
 def timestamp_of(raw: bytes) -> int:

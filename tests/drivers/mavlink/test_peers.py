@@ -1,0 +1,155 @@
+"""Who is at the other end of a port: nothing is sent to those who have not shown who they are."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dappled.clock import SystemClock
+from dappled.drivers.mavlink import MavlinkLinks, Packet, make_key, mavlink, open_signing, pack, read_key
+from dappled.drivers.mavlink.peers import MOST, Peers
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+
+S = 10**9
+
+
+class Port:
+    """A link that listens, signed or not, and counts what it heard."""
+
+    def __init__(self, folder: Path, *, signed: bool) -> None:
+        self.key = None
+        signing = None
+        if signed:
+            make_key(folder / "key")
+            self.key = read_key(folder / "key")
+            signing = open_signing([folder / "key"], folder / "time", SystemClock())
+        self.links = MavlinkLinks(
+            ["udpin:127.0.0.1:0"], system_id=1, component_id=100, clock=SystemClock(), signing=signing
+        )
+        self.heard = threading.Semaphore(0)
+        self.logged = 0
+
+    def log_packet(self, _stamp_us: int, _raw: bytes) -> int:
+        self.logged += 1
+        return self.logged - 1
+
+    def on_packet(self, packet: Packet) -> None:
+        if not packet.sent:
+            self.heard.release()
+
+    def send(self) -> bool:
+        return self.links.sender.send(mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3))
+
+    def refused(self) -> int:
+        one = self.links.statistics()[0]
+        return one.packets_bad + (one.signing.refused if one.signing else 0)
+
+    def until_refused(self, count: int) -> None:
+        deadline = time.monotonic() + 20
+        while self.refused() < count:
+            assert time.monotonic() < deadline, f"{self.refused()} of {count} were refused"
+            threading.Event().wait(0.005)
+
+
+class Station:
+    """A program with a socket of its own."""
+
+    def __init__(self, port: Port, system: int = 255) -> None:
+        self.packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=190)
+        if port.key is not None:
+            signing = self.packer.signing
+            signing.secret_key, signing.sign_outgoing = port.key, True
+            signing.timestamp = round((time.time() - EPOCH_UNIX_S) * UNITS_PER_S)
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.connect(("127.0.0.1", port.links.port(0)))
+        self.socket.settimeout(20)
+
+    def packet(self) -> bytes:
+        return pack(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), self.packer, version_1=False)
+
+    def received(self) -> int:
+        """Bytes that have come by now, after everything that was sent on loopback."""
+        self.socket.setblocking(False)
+        count = 0
+        while True:
+            try:
+                count += len(self.socket.recv(65536))
+            except BlockingIOError:
+                return count
+
+
+@pytest.fixture(params=[False, True], ids=["unsigned", "signed"])
+def port(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Port]:
+    made = Port(tmp_path, signed=request.param)
+    made.links.start(made, made)
+    yield made
+    made.links.stop()
+
+
+def test_seventeen_strangers_who_send_a_byte_each_hear_nothing_and_displace_nobody(port: Port) -> None:
+    station, strangers = Station(port), [Station(port) for _ in range(17)]
+    station.socket.send(station.packet())
+    assert port.heard.acquire(timeout=20)
+    for stranger in strangers:
+        stranger.socket.send(b"x")
+    port.until_refused(17 if port.key else 1)  # what no packet begins in is one bad place
+    assert port.send()
+    assert station.socket.recv(300)
+    assert [stranger.received() for stranger in strangers] == [0] * 17
+    for each in (station, *strangers):
+        each.socket.close()
+
+
+def test_a_packet_that_is_recorded_and_sent_again_makes_no_peer(tmp_path: Path) -> None:
+    port = Port(tmp_path, signed=True)
+    port.links.start(port, port)
+    station, stranger = Station(port), Station(port)
+    recorded = station.packet()
+    station.socket.send(recorded)
+    assert port.heard.acquire(timeout=20)
+    for _ in range(3):
+        stranger.socket.send(recorded)
+    port.until_refused(3)
+    for _ in range(50):
+        assert port.send()
+    assert stranger.received() <= 3 * len(recorded)
+    assert station.received() > 30 * len(recorded)
+    port.links.stop()
+    station.socket.close()
+    stranger.socket.close()
+
+
+def test_a_sound_packet_proves_for_five_seconds_and_a_signed_one_for_a_minute() -> None:
+    peers = Peers()
+    peers.shown(("a", 1), 20, "sound", 0)
+    peers.shown(("b", 1), 20, "signed", 0)
+    assert peers.receivers(1000, 4 * S) == [("a", 1), ("b", 1)]
+    assert peers.receivers(1000, 6 * S) == [("b", 1)]
+    assert peers.receivers(1000, 61 * S) == []
+
+
+def test_a_full_table_refuses_newcomers_until_somebody_has_gone() -> None:
+    peers = Peers()
+    for number in range(MOST):
+        peers.shown(("a", number), 20, "sound", 0)
+    peers.shown(("late", 1), 20, "signed", 4 * S)
+    assert ("late", 1) not in peers.receivers(20, 4 * S)
+    peers.shown(("a", 0), 20, "sound", 4 * S)
+    peers.shown(("late", 1), 20, "signed", 6 * S)
+    assert peers.receivers(20, 6 * S) == [("a", 0), ("late", 1)]
+
+
+def test_who_is_only_heard_is_sent_at_most_as_much_as_it_sent() -> None:
+    peers = Peers()
+    peers.shown(("a", 1), 50, "old", 0)
+    assert peers.receivers(51, S) == []
+    assert peers.receivers(50, S) == [("a", 1)]
+    assert peers.receivers(1, S) == []
+    for number in range(2000):  # of many addresses few are kept
+        peers.shown(("b", number), 50, "old", S)
+    assert len(peers.receivers(1, S)) < MOST
