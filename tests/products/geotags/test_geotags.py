@@ -6,7 +6,9 @@ import hashlib
 import io
 import json
 import math
+import shutil
 import struct
+import subprocess
 import xml.etree.ElementTree as ET
 import zlib
 from dataclasses import replace
@@ -33,6 +35,7 @@ from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.maps.earth import Geoid
 from dappled.products.mounting import Mounting
 from tests.flight.makers import deliver, pose, request, tag
+from tests.needs import without
 
 START_NS = 1_795_256_103_000_000_000
 
@@ -293,6 +296,95 @@ def test_copies_of_raws_open_as_before(shared_data: Path, file: str) -> None:
         told = Image.Exif()
         told.load_from_fp(io.BytesIO(copy))
         assert degrees(told.get_ifd(0x8825)[2]) == pytest.approx(41.6, abs=1e-9)
+
+
+def exiftool(folder: Path) -> dict[str, dict[str, Any]]:
+    """What ExifTool says of each file in a folder, by name."""
+    if shutil.which("exiftool") is None:
+        without("exiftool (Debian: libimage-exiftool-perl)")
+    asked = [
+        "exiftool",
+        "-j",
+        "-n",
+        "-FileType",
+        "-GPSLatitude",
+        "-FileName",
+        "-Model",
+        "-Warning",
+        "-Error",
+        str(folder),
+    ]
+    said = subprocess.run(asked, check=True, capture_output=True).stdout
+    return {one["FileName"]: one for one in json.loads(said) if one.pop("SourceFile")}
+
+
+def exiv2_reads(paths: list[Path]) -> None:
+    """exiv2 finds the latitude in each, without a word on stderr."""
+    if shutil.which("exiv2") is None:
+        without("exiv2 (Debian: exiv2)")
+    for path in paths:
+        done = subprocess.run(["exiv2", "-q", "-PEkt", path], check=True, capture_output=True, text=True)  # noqa: S607
+        assert done.stderr == ""
+        words = dict(line.split(None, 1) for line in done.stdout.splitlines() if line.strip())
+        assert words["Exif.GPSInfo.GPSLatitude"].strip() == "41deg 36' 0\""
+
+
+OTHERS_READ = {
+    "RAF": raf(),
+    "TIFF": tiff(),
+    "JPEG": jpeg(exif=True),
+    "PNG": png("RGB", exif=True),
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS_READ)
+def test_exiftool_and_exiv2_read_the_place_whatever_the_size_of_the_file(tmp_path: Path, kind: str) -> None:
+    """ExifTool takes no file for a RAF whose preview's offset has bit 15 set. Sizes beside each multiple of 0x4000, and
+    between."""
+    sizes = [at + step for at in range(0x4000, 0x24000, 0x4000) for step in (-160, -3, -1, 0, 1, 2, 1021)]
+    for size in sizes:
+        original = grown(OTHERS_READ[kind], kind, size)
+        copy = exif_gps.tagged(exif_gps.tagged(original, exif_gps.Place(1.0, 2.0, 3.0)), exif_gps.Place(41.6, -91.5, 9))
+        (tmp_path / f"{size:x}.{kind}").write_bytes(copy)
+    found = exiftool(tmp_path)
+    assert len(found) == len(sizes)
+    for name, told in found.items():
+        assert (told["FileType"], told["GPSLatitude"], told["Model"]) == (kind, pytest.approx(41.6), "Model"), name
+        assert not {"Warning", "Error"} & told.keys(), told
+    if kind != "RAF":  # exiv2 wants a real sensor's part: the body's own RAF is below
+        exiv2_reads([tmp_path / f"{size:x}.{kind}" for size in sizes[::9]])
+
+
+def grown(data: bytes, kind: str, size: int) -> bytes:
+    """A file of this size with the same content: bytes behind all else, or before a PNG's and a JPEG's pixels."""
+    missing = size - len(data)
+    if kind == "PNG":  # pixels begin behind signature and IHDR
+        chunk = b"teSt" + bytes(missing - 12)
+        return data[:33] + struct.pack(">I", missing - 12) + chunk + struct.pack(">I", zlib.crc32(chunk)) + data[33:]
+    if kind == "JPEG":
+        comments = b""
+        while missing > 0:
+            length = min(missing, 0x8000)
+            length = missing if missing - length < 4 else length
+            comments += struct.pack(">BBH", 0xFF, 0xFE, length - 2) + b" " * (length - 4)
+            missing -= length
+        return data[:2] + comments + data[2:]
+    return data + bytes(missing)
+
+
+@pytest.mark.parametrize("file", ["synthetic_450D.CR2", "synthetic_S5200.RAF"])
+def test_others_read_copies_of_the_bodies_raws_at_any_size(tmp_path: Path, shared_data: Path, file: str) -> None:
+    original = (shared_data / "raw" / file).read_bytes()
+    kind = file[-3:]
+    for more in (0, 1, 0x4001, 0x8000, 0xFFFE):
+        copy = exif_gps.tagged(original + bytes(more), exif_gps.Place(41.6, -91.5, 215.0, START_NS))
+        (tmp_path / f"{more}.{kind}").write_bytes(copy)
+    for name, told in exiftool(tmp_path).items():
+        assert (told["FileType"], told["GPSLatitude"]) == (kind, pytest.approx(41.6)), name
+        assert not {"Warning", "Error"} & told.keys(), told
+    exiv2_reads(sorted(tmp_path.iterdir()))
+    with rawpy.imread(str(tmp_path / f"0.{kind}")) as first, rawpy.imread(str(tmp_path / f"32768.{kind}")) as grown_one:
+        assert np.array_equal(first.raw_image, grown_one.raw_image)
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if name.endswith("PNG")])

@@ -23,6 +23,7 @@ Entry = tuple[int, int, int, bytes]
 """Tag, type, count and value (in the file's byte order) of a directory."""
 _RAF = b"FUJIFILMCCD-RAW"
 _RAF_JPEG = 84
+_RAF_ALIGNED, _RAF_NOT_SET = 4, 0x8000
 _EXIF = b"Exif\0\0"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SOI, _APP0, _APP1, _SOS = 0xD8, 0xE0, 0xE1, 0xDA
@@ -75,12 +76,20 @@ def tagged(data: bytes, where: Place) -> bytes:
             return _png(data, where)
         if data.startswith(_RAF):
             offset, length = struct.unpack_from(">II", data, _RAF_JPEG)
-            preview = _jpeg(data[offset : offset + length], where)
-            header = data[:_RAF_JPEG] + struct.pack(">II", len(data), len(preview))
-            return header + data[_RAF_JPEG + 8 :] + preview
+            return _with_preview(data, _jpeg(data[offset : offset + length], where))
     except (struct.error, IndexError) as error:
         raise ExifError(f"its EXIF is damaged ({error}): no position can be written into a copy") from None
     raise ExifError("it is not a TIFF-like raw, TIFF, JPEG, PNG or RAF: only the sidecar has its position")
+
+
+def _with_preview(data: bytes, preview: bytes) -> bytes:
+    """A RAF with another preview, behind all else. ExifTool takes no file for a RAF whose preview's offset has bit 15
+    set (ProcessRAF)."""
+    at = -(-len(data) // _RAF_ALIGNED) * _RAF_ALIGNED
+    if at & _RAF_NOT_SET:
+        at = (at | _RAF_NOT_SET - 1) + 1
+    header = data[:_RAF_JPEG] + struct.pack(">II", at, len(preview))
+    return header + data[_RAF_JPEG + 8 :].ljust(at - len(header), b"\0") + preview
 
 
 def _tiff(data: bytes, where: Place) -> bytes:
