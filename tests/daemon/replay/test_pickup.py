@@ -14,6 +14,7 @@ from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, PickupError
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
+from dappled.findings import Code, Subject, finding, told
 from dappled.flight import Cause, LedgerReader, Shot, recording
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import request, shot
@@ -95,7 +96,7 @@ def test_a_second_card_that_numbers_from_1_again_is_brought_too(
     assert "note:        card: the camera's memory card was changed" in out
     expected = [(card / name).read_bytes() for card in (first, second) for name in names]
     assert flight.frames() == dict(enumerate(expected))
-    assert [text for _, text in flight.events("card changed")] == ["card: the camera's memory card was changed"]
+    assert [text for _, text in flight.events("card.changed")] == [told(finding(Code.CARD_CHANGED, Subject("card")))]
     for card in (first, second):
         assert flight.pickup(card) == 0
         assert "0 frames brought, 3 already there, 0 missing" in capfd.readouterr().out

@@ -361,10 +361,10 @@ def test_what_is_in_doubt_is_read_and_weighed_once(flight: Flight, monkeypatch: 
     weighed = 0
     match = matching.match
 
-    def counted(*arguments: Any) -> matching.Matching:
+    def counted(*arguments: Any, **known: Any) -> matching.Matching:
         nonlocal weighed
         weighed += 1
-        return match(*arguments)
+        return match(*arguments, **known)
 
     monkeypatch.setattr(matching, "match", counted)
     flight.old(5)

@@ -170,7 +170,7 @@ def bring(
         stack.callback(recorder.close)
         for one in proposal.findings:
             if one.code is Code.CARD_CHANGED:
-                ledger.add_event("card changed", told(one))
+                ledger.add_event(one.code.value, told(one))
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
             ledger.add_event("picked up", f"{group.main.name}: {proposal.reasons[number]}", number)

@@ -19,6 +19,7 @@ from dappled.drivers.camera import (
     Deferred,
     Fired,
     Identity,
+    Noticed,
     PlainCamera,
     ShotFailed,
     StateChanged,
@@ -274,9 +275,11 @@ class ComposedCamera(PlainCamera):
             self._shot_fired.wait(self._settings.poll_s)
             self._shot_fired.clear()
             self._stopping.wait(self._settings.poll_s / 4)
+        for left in self._watch.left():
+            self.report(left)
         self._watch.close()
 
-    def _deliver(self, arrival: Arrival | Companion) -> None:
+    def _deliver(self, arrival: Arrival | Companion | Noticed) -> None:
         if isinstance(arrival, Arrival) and arrival.shot is not None:
             self._end(arrival.shot, arrival)
         else:

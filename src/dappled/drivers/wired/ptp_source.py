@@ -37,6 +37,8 @@ _REST_S = 0.5
 class PtpSource:
     """A FileSource (see `sources`). One thread calls it."""
 
+    removable = True
+
     def __init__(self, port: str) -> None:
         self._port = port
         self._child: tuple[subprocess.Popen[bytes], ProcessChannel] | None = None
@@ -49,7 +51,7 @@ class PtpSource:
             file.seek(0)
             rows = json.load(file)
         self._taken_s = {name: taken_s for name, _, taken_s in rows}
-        return [FoundFile(name, size) for name, size, _ in rows]
+        return [FoundFile(name, size, round((taken_s or 0) * 1e9)) for name, size, taken_s in rows]
 
     def taken_s(self, found: FoundFile) -> float | None:
         """See FileSource: the body's own note of when the file was made."""

@@ -20,16 +20,23 @@ from dappled.drivers.wired.matching import seconds
 RAW_SUFFIXES = (".raf", ".cr2", ".dng", ".nef", ".arw", ".crw", ".tif", ".tiff", ".npy", ".png")
 SUFFIXES = (*RAW_SUFFIXES, ".jpg", ".jpeg")
 MOUNTS = Path("/proc/self/mounts")
+VOLUMES = Path("/dev/disk/by-uuid")
 PLACES = ("/media/", "/run/media/", "/mnt")
 _MANY = 100_000
 
 
 @dataclass(frozen=True, slots=True)
 class FoundFile:
-    """A file at a source: its name there (with folders), and its size in bytes."""
+    """A file at a source: its name there (with folders), and its size in bytes.
+
+    `modified_ns` is the body's own time of it, `card` the id of the volume that it lies on ("" where that is unknown).
+    Before its bytes are there, these four together are its identity.
+    """
 
     name: str
     size: int
+    modified_ns: int = 0
+    card: str = ""
 
     @property
     def base(self) -> str:
@@ -48,7 +55,12 @@ class FoundFile:
 
 
 class FileSource(Protocol):
-    """Files that can be picked up. A call may block for as long as a disk or a bus does, but not for ever."""
+    """Files that can be picked up. A call may block for as long as a disk or a bus does, but not for ever.
+
+    `removable`: they lie on a card or a disk, which can be changed for another.
+    """
+
+    removable: bool
 
     def list(self) -> list[FoundFile]:
         """List all pictures in the order of their names. Raises CameraError where the source is not there."""
@@ -71,6 +83,17 @@ class FileGroup:
     companions: tuple[FoundFile, ...] = ()
 
 
+def volume_id(device: int) -> str:
+    """The id of the file system on a device, such as a card's serial number; "" where the machine names none."""
+    try:
+        for link in VOLUMES.iterdir():
+            if link.stat().st_rdev == device:
+                return link.name
+    except OSError:
+        return ""
+    return ""
+
+
 def groups(found: list[FoundFile]) -> list[FileGroup]:
     """Group files by stem: those of one exposure. The raw file is the frame."""
     by_stem: dict[str, list[FoundFile]] = {}
@@ -86,6 +109,8 @@ def groups(found: list[FoundFile]) -> list[FileGroup]:
 class FolderSource:
     """All pictures under a folder, hidden ones left out."""
 
+    removable = False
+
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
@@ -99,7 +124,7 @@ class FolderSource:
             raise CameraError(f"{self.folder} can't be read: {error.strerror}") from None
 
     def _walk(self) -> Iterator[FoundFile]:
-        count = 0
+        count, card = 0, volume_id(self.folder.stat().st_dev)
         for place, folders, names in os.walk(self.folder, onerror=self._unreadable):
             folders[:] = [name for name in folders if not name.startswith(".")]
             for name in names:
@@ -110,9 +135,10 @@ class FolderSource:
                 if count > _MANY:
                     raise CameraError(f"{self.folder} holds more than {_MANY} pictures: give the folder of the flight")
                 try:
-                    yield FoundFile(path.relative_to(self.folder).as_posix(), path.stat().st_size)
+                    stat = path.stat()
                 except OSError:
                     continue  # gone again
+                yield FoundFile(path.relative_to(self.folder).as_posix(), stat.st_size, stat.st_mtime_ns, card)
 
     def _unreadable(self, error: OSError) -> None:
         """Raise, so that a card that is pulled doesn't look like one with fewer files; skip folders of other users."""
@@ -148,6 +174,8 @@ class FolderSource:
 
 class StorageSource(FolderSource):
     """The DCIM folder of a removable disk, wherever it is mounted, as soon as it is."""
+
+    removable = True
 
     def __init__(self, mounts: Path | None = None, places: tuple[str, ...] | None = None) -> None:
         super().__init__(Path("/nonexistent"))
