@@ -5,10 +5,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from dappled.daemon.navigation import BodyLatency, BootClock, CameraClock, ExposureTime, Telemetry, clocks
-from dappled.daemon.navigation.clocks import TriggerMessage, camera_time, exposure_from_camera, mid_exposure
+from dappled.daemon.navigation.clocks import (
+    TimesyncAnswer,
+    TriggerMessage,
+    camera_time,
+    exposure_from_camera,
+    mid_exposure,
+)
 from dappled.daemon.navigation.samples import Feedback
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.mocks.autopilot.autopilot import BootTime, flight
@@ -24,6 +31,24 @@ EXPECTED = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 10.0, "latency"), 0.
 def event(after_call_ms: float, number: int = 0, image: int = 0) -> Feedback:
     boot_ns = 10**9 + round(after_call_ms * MS)
     return Feedback(number, START_NS + boot_ns, boot_ns, "CAMERA_FEEDBACK", image)
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_sigma_is_the_error_of_a_clock_that_answers_tell(count: int) -> None:
+    """Of one answer its round trip is lost on either way, evenly; of many, each way now and then takes long."""
+    chance = np.random.default_rng(count)
+    ratios = []
+    for _ in range(300):
+        answers = []
+        for second in range(count):
+            there = chance.uniform(0, 4) if count == 1 else 1 + chance.exponential(2)
+            back = 4 - there if count == 1 else 1 + chance.exponential(2)
+            sent, received = (START_NS + second * 10**9 + round(MS * way) for way in (-there, back))
+            answers.append(TimesyncAnswer(second, sent, received, second * 10**9))
+        clock = clocks.from_few(answers) if count == 1 else clocks.from_timesync(answers)
+        assert clock is not None
+        ratios.append((clock.utc_ns(answers[-1].boot_ns) - START_NS - answers[-1].boot_ns) / clock.sigma_ns)
+    assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.2
 
 
 def test_the_contact_is_taken_and_half_the_exposure_added() -> None:

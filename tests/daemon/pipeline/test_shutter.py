@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import random
+import threading
 import time
+from collections.abc import Callable
 
 import pytest
 from hypothesis import given
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.flight import Shot
 from dappled.refusals import PEERS
 from tests.daemon.fakes import FakeSink, eventually
@@ -50,6 +52,38 @@ def test_a_wish_is_written_down_before_the_camera_is_touched() -> None:
     decision = rig.shutter.request(CaptureRequest("console", "button"))
     assert (decision.outcome, decision.index) == ("shot", 42)
     assert rig.done == [("note", 42), ("fire", 42)]
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda shutter, request: shutter.request(request),
+        lambda shutter, request: shutter.start_interval(request, 5.0, 2),
+    ],
+    ids=["single", "interval"],
+)
+def test_a_wish_that_comes_while_another_is_written_down_waits_for_it(
+    ask: Callable[[Shutter, CaptureRequest], ShotDecision], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Both would have the same index otherwise."""
+    rig = Rig()
+    decided: list[ShotDecision] = []
+    others: list[threading.Thread] = []
+    written = rig.sink.note
+
+    def note(shot: Shot) -> None:
+        if not others:
+            call = threading.Thread(target=lambda: decided.append(ask(rig.shutter, CaptureRequest("b", "button", 2))))
+            others.append(call)
+            call.start()
+            call.join(0.2)  # as long as it may want to overtake
+        written(shot)
+
+    monkeypatch.setattr(rig.sink, "note", note)
+    first = ask(rig.shutter, CaptureRequest("a", "button", 1))
+    others[0].join(10)
+    assert [first.index, *(one.index for one in decided)] == [42, 43]
+    assert rig.done == [("note", 42), ("fire", 42), ("note", 43), ("fire", 43)]
 
 
 def test_retries_every_half_second_are_one_shot() -> None:

@@ -1,0 +1,194 @@
+#!/usr/bin/env python3
+"""Break the code in one place at a time, in a copy, and see that the default tests catch it.
+
+    python tools/mutations.py [WORD…]     those whose names hold a word; without words, all
+
+Each mutation replaces an exact piece of text, which has to be there just once. Some test of the files that it names
+must fail then; as the copy is, all pass. Ends with 1 where a mutation is not caught, or its text is not found.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+LIMIT_S = 1800
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """`old` becomes `new` in `file`, below src/dappled; `tests`, below tests/, should notice."""
+
+    name: str
+    file: str
+    old: str
+    new: str
+    tests: tuple[str, ...]
+
+
+MUTATIONS = (
+    Mutation(
+        "an fsync is left out",
+        "durable.py",
+        "            fill(fd)\n            os.fsync(fd)\n",
+        "            fill(fd)\n",
+        ("test_durable.py", "flight/test_power_cut.py"),
+    ),
+    Mutation(
+        "the sign in Eq 28",
+        "decode/lightfield/refocus.py",
+        "aperture_px * (1 - 1 / alpha)",
+        "aperture_px * (1 / alpha - 1)",
+        ("decode/lightfield/test_refocus.py",),
+    ),
+    Mutation(
+        "a retry is a new request",
+        "daemon/pipeline/repeats.py",
+        "            return known if recent else None\n",
+        "            return None\n",
+        ("daemon/pipeline/test_shutter.py",),
+    ),
+    Mutation(
+        "a doubt is dropped on its way to the exit code",
+        "cli/decode.py",
+        "doubted += bool(made.doubts)",
+        "doubted += 0",
+        ("cli/test_decode.py",),
+    ),
+    Mutation(
+        "sigma of the clock is halved",
+        "daemon/navigation/clocks.py",
+        "sigma_ns = math.hypot(best.delay_ns / 2 / math.sqrt(3), _TIMESYNC_FLOOR_NS)",
+        "sigma_ns = math.hypot(best.delay_ns / 2 / math.sqrt(3), _TIMESYNC_FLOOR_NS) / 2",
+        ("daemon/navigation/test_clocks.py",),
+    ),
+    Mutation(
+        "sigma of a fitted clock is halved",
+        "daemon/navigation/clocks.py",
+        "math.hypot(math.sqrt(variance), _TIMESYNC_ASYMMETRY * float(delay.min())),",
+        "math.hypot(math.sqrt(variance), _TIMESYNC_ASYMMETRY * float(delay.min())) / 2,",
+        ("daemon/navigation/test_clocks.py",),
+    ),
+    Mutation(
+        "sigma of the latency is halved",
+        "daemon/navigation/clocks.py",
+        "        round(latency.sigma_ms * 1e6),\n",
+        "        round(latency.sigma_ms * 5e5),\n",
+        ("daemon/navigation/test_clocks.py",),
+    ),
+    Mutation(
+        "sigma of a distance is halved",
+        "decode/depth/ranging.py",
+        "np.hypot(distance**2 * error / np.float32(self.gain_px_m)",
+        "np.hypot(distance**2 * error / np.float32(2 * self.gain_px_m)",
+        ("decode/depth/test_ranging.py",),
+    ),
+    Mutation(
+        "the shutter's lock is not taken",
+        "daemon/pipeline/shutter.py",
+        "        with self._lock:\n            return self._judge(request)\n",
+        "        return self._judge(request)\n",
+        ("daemon/pipeline/test_shutter.py",),
+    ),
+    Mutation(
+        "a stale epoch of the clock is used",
+        "daemon/navigation/vehicle_history.py",
+        "min([limit, *(one.number for one in self._epochs[at + 1 : at + 2])])",
+        "limit",
+        ("daemon/navigation/test_clock_steps.py", "daemon/navigation/test_jumps.py"),
+    ),
+    Mutation(
+        "a path is not confined",
+        "confined.py",
+        'or not {".", ".."}.isdisjoint(found)',
+        "",
+        ("test_confined.py",),
+    ),
+    Mutation(
+        "another camera's cam_idx is heeded",
+        "daemon/camera_protocol/component.py",
+        "        if feedback.cam_idx != self._cam_idx:\n            return False\n",
+        "",
+        ("daemon/camera_protocol/test_component.py", "daemon/camera_protocol/test_autopilots.py"),
+    ),
+    Mutation(
+        "a frame is announced before it is safe",
+        "daemon/pipeline/capture.py",
+        "        try:\n            self._enter(arrival.shot)\n            frame = self._writer.record(",
+        "        if pending is not None:\n            self._ends.tell(self._observer.settled, arrival.shot, True)\n"
+        "        try:\n            self._enter(arrival.shot)\n            frame = self._writer.record(",
+        ("daemon/pipeline/test_pipeline.py",),
+    ),
+)  # fmt: skip
+
+
+def copy(target: Path) -> None:
+    """All files of the project, without what set-up and tests made; the environment is this one."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        check=True,
+    )
+    for name in listed.stdout.decode().split("\0"):
+        if name and (ROOT / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, target / name)
+
+
+def fails(folder: Path, tests: tuple[str, ...]) -> str:
+    """The first test that fails; "" where none does. Raises SystemExit where they could not be run."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "--no-header", "-p", "no:cacheprovider", "-m", "not slow"]
+    command += [f"tests/{name}" for name in tests]
+    environment = {**os.environ, "PYTHONPATH": str(folder / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+    done = subprocess.run(
+        command, cwd=folder, env=environment, capture_output=True, text=True, check=False, timeout=LIMIT_S
+    )
+    if done.returncode not in (0, 1):
+        raise SystemExit(f"{' '.join(tests)} could not be run:\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    failed = [line.split()[1] for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
+    return " ".join(failed)
+
+
+def tried(one: Mutation, folder: Path, passing: set[str]) -> str:
+    """What became of a mutation: "caught by …" is well."""
+    path = folder / "src" / "dappled" / one.file
+    text = path.read_text(encoding="utf-8")
+    if text.count(one.old) != 1:
+        return f"its text is there {text.count(one.old)} times in {one.file}: mend its pattern"
+    unknown = tuple(name for name in one.tests if name not in passing)
+    if unknown and (failed := fails(folder, unknown)):
+        return f"{failed} fails without it"
+    passing.update(unknown)
+    path.write_text(text.replace(one.old, one.new), encoding="utf-8")
+    try:
+        failed = fails(folder, one.tests)
+        return f"caught by {failed}" if failed else f"not caught by {' '.join(one.tests)}"
+    finally:
+        path.write_text(text, encoding="utf-8")
+
+
+def main(words: list[str]) -> int:
+    missed = 0
+    passing: set[str] = set()
+    with tempfile.TemporaryDirectory(prefix="dappled-mutations-") as name:
+        copy(Path(name))
+        for one in MUTATIONS:
+            if words and not any(word in one.name for word in words):
+                continue
+            began = time.monotonic()
+            found = tried(one, Path(name), passing)
+            missed += not found.startswith("caught")
+            print(f"{one.name}: {found} ({time.monotonic() - began:.0f} s)", flush=True)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(sys.argv[1:]))
