@@ -9,7 +9,7 @@ import pytest
 from tests.architecture import walk
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_command_and_a_frame_pass_few_modules_and_the_page_lists_them(tmp_path: Path) -> None:
     walked = walk.fly(tmp_path)
     assert len(walked.command) <= walk.COMMAND_BUDGET, walked.command

@@ -54,7 +54,10 @@ def _scene(seed: int) -> list[tuple[Texture, float]]:
     ]
 
 
-@pytest.mark.parametrize("stops", [pytest.param(2, marks=pytest.mark.long), 4, pytest.param(8, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    "stops",
+    [pytest.param(4, marks=pytest.mark.slow), *(pytest.param(stops, marks=pytest.mark.long) for stops in (2, 8))],
+)
 def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: int) -> None:
     camera, scene = Camera.hidden(3), _scene(0)
     f_number = stops * FULL_F
@@ -65,7 +68,7 @@ def test_a_smaller_aperture_never_gives_worse_views_than_its_one_image(stops: in
     assert psnr(field.views, truth) > psnr(np.broadcast_to(field.slices[0].real, truth.shape), truth) - 0.5
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.long) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2, 3))])
 def test_views_of_a_hidden_camera_meet_the_truth(seed: int) -> None:
     camera, scene = Camera.hidden(seed), _scene(seed)
     field, report = _decoder(_calibration(camera)).decode_reported(
@@ -138,7 +141,7 @@ def test_a_print_one_percent_off_costs_the_views_less_than_a_decibel(scale: floa
     assert printed > 36
 
 
-@pytest.mark.parametrize("told", [0.67, 1.33])
+@pytest.mark.parametrize("told", [pytest.param(0.67, marks=pytest.mark.long), 1.33])
 def test_without_a_calibration_visible_carriers_tell_the_aperture(
     far_out: tuple[Camera, Calibration, Plane], told: float
 ) -> None:
@@ -153,7 +156,7 @@ def test_without_a_calibration_visible_carriers_tell_the_aperture(
     assert psnr(wrong[0].views, truth) > max(30, psnr(right[0].views, truth) - 0.5)
 
 
-@pytest.mark.parametrize("told", [0.5, 2.0])
+@pytest.mark.parametrize("told", [pytest.param(0.5, marks=pytest.mark.long), 2.0])
 def test_an_f_number_that_no_search_reaches_is_doubted(far_out: tuple[Camera, Calibration, Plane], told: float) -> None:
     _, known, plane = far_out
     _, report = _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=told * FULL_F)
@@ -161,6 +164,7 @@ def test_an_f_number_that_no_search_reaches_is_doubted(far_out: tuple[Camera, Ca
     assert "agree with no aperture near f/" in report.doubt
 
 
+@pytest.mark.slow
 def test_views_at_a_raw_signal_to_noise_of_100() -> None:
     camera, scene = Camera.hidden(7), _scene(1)
     frame = camera.expose(scene)

@@ -52,7 +52,7 @@ def _without_noise(camera: MaskedCamera) -> MaskedCamera:
 @pytest.mark.parametrize(
     ("seed", "mono", "noisy"),
     [
-        (3, False, True),
+        pytest.param(3, False, True, marks=pytest.mark.slow),
         *(
             pytest.param(s, m, noisy, marks=pytest.mark.long)
             for m in (False, True)

@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_targets_lead_to_metres(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with_mask = ["--mask", "reference-5x5", "--calibration", str(folder / "c.toml")]
     frames = [str(folder / f"{metres}.dng") for metres in (2, 6)]

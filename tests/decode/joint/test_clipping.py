@@ -141,6 +141,7 @@ def test_a_wrong_f_number_is_told_of_frames_with_clipped_pixels_too(half_open: H
     assert "told is f/19" in report.aperture_doubt
 
 
+@pytest.mark.slow
 def test_a_mosaic_gives_the_same_as_its_plane(half_open: HalfOpen) -> None:
     _, knows = half_open.decoders()
     counts = np.rint(half_open.plane * 20_000).astype(np.uint16)
@@ -172,6 +173,7 @@ def test_a_wide_highlight_keeps_its_white_inside(half_open: HalfOpen) -> None:
     np.testing.assert_array_equal(made[100:140, 120:160], plane[100:140, 120:160])
 
 
+@pytest.mark.slow
 def test_a_highlight_that_clipped_as_a_whole_is_not_made_up() -> None:
     """At the ideal aperture the mask lets the same light through to all pixels of an even scene."""
     scene = RaySum(boards=(0.0,), exponent=2.0, finest=0.02, kappa=1.0, points=3, shape=(240, 280))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ class Reached:
     truth: np.ndarray
 
 
+@cache
 def _reached(scene: RaySum, model: str = "joint") -> Reached:
     plane, true = scene.expose()
     fields = [
@@ -82,7 +84,7 @@ def test_two_thirds_of_errors_are_within_the_standard_error(scene: RaySum, least
     ("scene", "model"),
     [
         (RaySum(finest=BAND, snr=500, shape=(220, 260), covers="apart"), "independent"),
-        (RaySum(finest=BAND, snr=100, shape=(220, 260), covers="apart"), "joint"),
+        pytest.param(RaySum(finest=BAND, snr=100, shape=(220, 260), covers="apart"), "joint", marks=pytest.mark.slow),
         pytest.param(
             RaySum(finest=BAND, snr=300, shape=(440, 520), covers="apart"), "independent", marks=pytest.mark.long
         ),
@@ -216,6 +218,7 @@ def test_only_a_frame_in_which_nothing_tells_of_parallax_has_none(moved: float, 
     assert is_motionless(patches) is motionless
 
 
+@pytest.mark.slow
 def test_a_thing_that_moves_before_a_scene_that_does_not_keeps_its_parallax() -> None:
     """Two thirds of the frame have none; 46.6 dB where patches lean to what most of a frame has."""
     scene = RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(0.0, 0.0, 4.5), covers="apart", seed=1)
@@ -224,6 +227,7 @@ def test_a_thing_that_moves_before_a_scene_that_does_not_keeps_its_parallax() ->
     assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 48.2
 
 
+@pytest.mark.slow
 def test_a_thing_before_a_background_near_the_focus_keeps_its_parallax() -> None:
     """Most of the frame moves by a tenth of a sample from view to view, and was taken as at rest with all of it."""
     found = _reached(RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(3.2, 3.2, 12.0), covers="apart", seed=1))

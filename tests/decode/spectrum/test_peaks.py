@@ -89,7 +89,10 @@ TURNED = 0.03
 def _told(off: float, mask: Mask = MASK) -> MaskDecoder:
     """A decoder whose prediction lies `off` of a carrier's frequency farther in than the carriers."""
     pitch = 0.01 / (1 + off)
-    return MaskDecoder(replace(SENSOR, row_mm=(pitch, 0), column_mm=(0, pitch)), mask, "geometric", STATED_DISTANCE_MM)
+    sensor = replace(SENSOR, row_mm=(pitch, 0), column_mm=(0, pitch))
+    return MaskDecoder(
+        sensor, mask, "geometric", STATED_DISTANCE_MM, joint_views=False
+    )  # nothing is told of views here
 
 
 @cache

@@ -76,7 +76,7 @@ def answer(one: Job) -> Done:
     return Done(one.key, "flight", name, (), None, 0.0, 0.0, 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_batch_goes_on_where_it_was_stopped(
     flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -107,6 +107,7 @@ def test_a_light_field_of_a_batch_holds_its_pose(flight: Flown, tmp_path: Path) 
     assert done.peak_mb > 50
 
 
+@pytest.mark.slow
 def test_a_bad_frame_is_noted_and_the_others_are_made(
     flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

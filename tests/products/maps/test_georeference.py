@@ -341,7 +341,7 @@ def tagged(sha256: str, index: int) -> Tag:
         (["--terrain", "none.tif"], "none.tif can't be read"),
         (["--frames", "zero"], "write numbers as 0,3-5"),
         (["--frames", "77"], "can be put on a map"),
-        (["--ground", "5000"], "can be put on a map"),
+        (["--ground", "5000", "--frames", "0"], "can be put on a map"),
         (["--as", "difference"], "--against FLIGHT go together"),
         (["--terrain", "x.tif", "--terrain-heights", "ellipsoid", "--geoid", "no.gtx"], "no geoid grid no.gtx"),
         (["--refine", "a.tif", "b.tif", "--frames", "0"], "one base map"),
