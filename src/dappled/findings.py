@@ -37,6 +37,7 @@ class Code(StrEnum):
     CAMERA_CLOCK_FAR = "camera.clock_far"
     CARD_CHANGED = "card.changed"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
+    FRAME_RIVAL_PICTURE = "frame.rival_picture"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"
     FRAME_UNCONFIRMED = "frame.unconfirmed"
     LINK_SAME_IDS = "link.same_ids"

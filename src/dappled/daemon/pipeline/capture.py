@@ -30,6 +30,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.errors import report, sentence
+from dappled.findings import Finding
 from dappled.flight import Frame, Shot, Tag
 from dappled.workers import Loop
 
@@ -340,8 +341,7 @@ class Capture:
             elif isinstance(event, SettingsChanged):
                 self._ends.tell(self._observer.settings_changed, event)
             elif isinstance(event, Noticed):
-                log.warning("%s", findings.told(event.finding))
-                self._writer.event(event.finding.code.value, findings.told(event.finding))
+                self._noticed(event.finding)
         except Exception as error:  # noqa: BLE001  # one event that goes wrong must not end the capture
             report(log, "capture", error)
 
@@ -349,6 +349,14 @@ class Capture:
         self._shots.state, self._shots.reason = change.state, change.reason
         if not self._loop.stopping.is_set():
             self._ends.tell(self._observer.camera_changed, change)
+
+    def _noticed(self, found: Finding) -> None:
+        log.warning("%s", findings.told(found))
+        about = found.subject
+        if about.kind == "frame" and isinstance(about.which, int):
+            self._writer.event("doubt", findings.text(found), about.which)
+        else:
+            self._writer.event(found.code.value, findings.told(found))
 
     def _enter(self, index: int | None) -> None:
         """Write a shot's row before its first event. Raises FlightError; the next event tries again."""

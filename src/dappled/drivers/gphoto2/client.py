@@ -43,7 +43,7 @@ from dappled.drivers.child_process import (
     end_child,
     start_child,
 )
-from dappled.drivers.gphoto2.messages import LATE_LIMIT, SEEN_LIMIT, Carryover, lost_file, message_event
+from dappled.drivers.gphoto2.messages import Carryover, lost_file, message_event
 from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings, parse_settings
 from dappled.workers import Loop
 
@@ -212,7 +212,7 @@ class GPhoto2Camera(QueuedCamera):
                 self._process = self._channel = None
                 pending, self._pending = self._pending, {}
             fired = [Claim(shot, fired_ns) for shot, fired_ns in pending.items() if fired_ns is not None]
-            self._carryover = replace(self._carryover, late=(*self._carryover.late, *fired)[-LATE_LIMIT:])
+            self._carryover = self._carryover.died(fired)
             channel.close()
             end_child(process)
             stopped = self._loop.stopping.is_set()
@@ -293,24 +293,10 @@ class GPhoto2Camera(QueuedCamera):
                 self._pending.pop(event.shot, None)  # type: ignore[arg-type]  # an Arrival's None is excluded above
         elif isinstance(event, StateChanged):
             self._identity = event.identity or self._identity
-            if event.identity is not None and event.identity.serial != self._carryover.serial:
-                late = self._carryover.late if self._carryover.serial is None else ()
-                self._carryover = Carryover(event.identity.serial, late, since_ns=event.monotonic_ns)
         elif isinstance(event, SettingsChanged):
             self._known_settings = event.settings
-        if isinstance(event, Arrival | Companion):
-            self._learn(event)
+        self._carryover = self._carryover.heard(event)
         self.report(event)
-
-    def _learn(self, event: Arrival | Companion) -> None:
-        """Remember what the next process needs, in case this one dies."""
-        carryover, facts = self._carryover, event.facts
-        late = tuple(claim for claim in carryover.late if claim.shot != event.shot)
-        file = (str(facts.get("folder")), str(facts.get("name")), event.blob.size, facts.get("taken_s"))
-        since_ns = event.monotonic_ns if len(carryover.seen) == SEEN_LIMIT else carryover.since_ns
-        offsets_s = tuple(facts.get("body_offsets_s", carryover.offsets_s))
-        seen = (*carryover.seen, file)[-SEEN_LIMIT:]
-        self._carryover = replace(carryover, late=late, offsets_s=offsets_s, seen=seen, since_ns=since_ns)
 
     def _await_budget(self) -> None:
         now_ns = self._clock.monotonic_ns()

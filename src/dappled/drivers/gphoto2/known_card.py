@@ -30,9 +30,11 @@ class KnownCard:
         self._label = ""
         self._files: dict[CameraFile, FileFacts | None] = {}  # None: it couldn't be brought, whatever it is
         self._brought: dict[CameraFile, list[FileFacts]] = {}
-        for folder, name, size, taken_s in brought:
-            self._brought.setdefault(CameraFile(folder, name), []).append((size, taken_s))
         self._newest: Counter | None = None
+        for folder, name, size, taken_s in brought:
+            file = CameraFile(folder, name)
+            self.settle(file, (size, taken_s))
+            self._newest = _counter(file)
         self._frames: deque[tuple[Counter, int]] = deque(maxlen=_NEIGHBOURS)  # where the shot is certain
 
     # --- files
@@ -46,6 +48,10 @@ class KnownCard:
         if file in self._files and ((known := self._files[file]) is None or _same(known, facts)):
             return True
         return any(_same(one, facts) for one in self._brought.get(file, ()))
+
+    def is_done(self, file: CameraFile) -> bool:
+        """Whether a known file was brought or given up: it isn't one that was there before."""
+        return file in self._files and (self._files[file] is None or file in self._brought)
 
     def is_other(self, found: CardContents, *, has_old: bool) -> bool:
         """Whether this is another card than the one that is known: it says so, has another file of a known name, or
@@ -97,6 +103,11 @@ class KnownCard:
         if before is None or steps is None or steps > 0:
             self._newest = counter
         return steps is not None and steps > 1
+
+    def is_newer(self, file: CameraFile) -> bool:
+        """Whether a file was made after the newest that is known, by its name."""
+        counter = _counter(file)
+        return counter is not None and self._newest is not None and (_steps(self._newest, counter) or 0) > 0
 
     def made(self, file: CameraFile, shot: int) -> None:
         """A shot made this file for certain."""

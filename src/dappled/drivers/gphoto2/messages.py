@@ -6,8 +6,8 @@ Both processes import this; it does not load libgphoto2.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from dappled.drivers.attribution import Claim
@@ -50,6 +50,28 @@ class Carryover:
     offsets_s: tuple[float, ...] = ()
     seen: tuple[SeenFile, ...] = ()
     since_ns: int | None = None
+
+    def heard(self, event: CameraEvent) -> Carryover:
+        """After an event of the process. Another body has another clock and other files."""
+        if isinstance(event, StateChanged) and event.identity is not None and event.identity.serial != self.serial:
+            return Carryover(
+                event.identity.serial, self.late if self.serial is None else (), since_ns=event.monotonic_ns
+            )
+        if not isinstance(event, Arrival | Companion):
+            return self
+        facts = event.facts
+        file = (str(facts.get("folder")), str(facts.get("name")), event.blob.size, facts.get("taken_s"))
+        return replace(
+            self,
+            late=tuple(claim for claim in self.late if claim.shot != event.shot),
+            offsets_s=tuple(facts.get("body_offsets_s", self.offsets_s)),
+            seen=(*self.seen, file)[-SEEN_LIMIT:],
+            since_ns=event.monotonic_ns if len(self.seen) == SEEN_LIMIT else self.since_ns,
+        )
+
+    def died(self, fired: Iterable[Claim]) -> Carryover:
+        """After the end of the process, which had fired these shots and brought no file of them."""
+        return replace(self, late=(*self.late, *fired)[-LATE_LIMIT:])
 
     def to_json(self) -> dict[str, Any]:
         """Convert to plain values."""

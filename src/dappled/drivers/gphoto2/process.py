@@ -99,7 +99,7 @@ class CameraLoop:
 
     def _look_last(self) -> None:
         """Name the pictures that stay on the card."""
-        if self._session is None or not self._session.keeps_files or not self._state.unlisted:
+        if self._session is None or not self._session.keeps_files:
             return
         self._session.close()
         self._session = None

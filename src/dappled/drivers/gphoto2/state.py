@@ -34,6 +34,9 @@ _SETTINGS_S = 1.0
 """How long after a file the settings are read: by then the body has updated what the shot changed (battery, free
 shots)."""
 
+_SAME_TIME_S = 1.5
+"""Times of two pictures in whole seconds that are no farther apart may be one time."""
+
 Stem = tuple[str, str]
 
 
@@ -92,6 +95,7 @@ class CameraState:
         self._cut_off: tuple[CameraFile, ...] = ()  # announced and not fetched when the link broke
         self._missed = False  # a picture may have been missed
         self._quiet_ns = 0  # when something was last heard of a shot or a file
+        self._framed: deque[Claim] = deque(maxlen=LATE_LIMIT)  # the last shots whose frames have come
         self._held: dict[Stem, Held] = {}  # JPEGs that wait for the raw file beside them
         self._last_frame: tuple[Stem, bool, int] | None = None  # (stem, whether it is a JPEG, shot)
         self._settings_due_ns: int | None = None
@@ -117,6 +121,9 @@ class CameraState:
     def lost(self, reason: str, now_ns: int, *, keeps_files: bool) -> list[CameraEvent]:
         """The session is gone. A fired shot whose file is on the card stays current; any other has failed."""
         self._cut_off = (*self._cut_off, *(file for file in (*self._to_fetch, *self._suspects) if not file.in_memory))
+        open_since = [one.since_ns for one in (*self._to_fetch.values(), *self._suspects.values()) if one.since_ns]
+        if self._since_ns is not None:
+            self._since_ns = min([self._since_ns, *open_since])  # these are not known yet
         self._to_fetch.clear()
         self._to_compare.clear()
         self._suspects.clear()
@@ -237,6 +244,8 @@ class CameraState:
         library knows it no more. Then the card is listed before anything is fetched."""
         if facts is None or not self._card.has(file, facts):
             self._suspects[file] = _Announced(now_ns, self._since_ns)
+        elif not self._card.is_done(file):  # it was listed before it was announced
+            self._queue([file], now_ns)
 
     def listed(self, found: CardContents, now_ns: int) -> list[CameraEvent]:
         """The card was listed: fetch what is new. On a card that is seen for the first time that is what was made since
@@ -245,14 +254,16 @@ class CameraState:
         only_recent = not self._card.is_listed
         strange = [file for file, facts in found.files.items() if not self._card.has(file, facts)]
         made = {file: self._made_since(found.files[file][1]) for file in strange}
+        if only_recent:  # where time says nothing, the camera's count may
+            made |= {file: self._card.is_newer(file) for file in strange if made[file] is None}
         old = any(self._made_since(taken_s) is False for _, taken_s in found.files.values())
-        if not only_recent and self._card.is_other(found, has_old=old):
+        if self._card.is_other(found, has_old=old and self._card.is_listed):
             only_recent = True
             self._card.change()
             self._last_frame = None
             told.append(Noticed(finding(Code.CARD_CHANGED, Subject("card")), now_ns))
             self._to_fetch |= {file: one for file, one in self._suspects.items() if file in found.files}
-            unsure = [file for file in strange if made[file] is None and file not in self._to_fetch]
+            unsure = [file for file in strange if not made[file] and file not in self._to_fetch]
             told += [_on_card(file, now_ns) for file in (unsure if len(unsure) <= LATE_LIMIT else ())]
         told += [_on_card(file, now_ns) for file in self._cut_off if file not in found.files]
         fresh = [file for file in strange if made[file] or not only_recent]
@@ -277,11 +288,6 @@ class CameraState:
     def is_stale(self) -> bool:
         """Whether the library knows another card than the one that is in the camera."""
         return bool(self._suspects)
-
-    @property
-    def unlisted(self) -> bool:
-        """Whether a shot or a file came after the card had been listed."""
-        return self._since_ns is not None and self._quiet_ns > self._since_ns
 
     def _made_since(self, taken_s: int | None) -> bool | None:
         """Whether a picture was made after the card had been listed last; None where that is not known."""
@@ -364,15 +370,30 @@ class CameraState:
         frame = self._attributed(file, arrival, taken_s, announced)
         self._last_frame = None if frame.shot is None else (_stem(file), _is_jpeg(file.name), frame.shot)
         held = self._held.pop(_stem(file), None)
-        return [frame, *([] if held is None else self._deliver(*held))]
+        told = self._rivals(arrival, taken_s) if frame.shot is None else []
+        return [frame, *told, *([] if held is None else self._deliver(*held))]
+
+    def _rivals(self, stray: Arrival, taken_s: int | None) -> list[CameraEvent]:
+        """A stray that was made as a shot was may be that shot's picture, which then has another one."""
+        if taken_s is None or not self._clock.offsets_s:
+            return []
+        return [
+            Noticed(
+                finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", claim.shot), picture=stray.name), stray.monotonic_ns
+            )
+            for claim in self._framed
+            if abs(self._clock.off_s(claim, taken_s)) <= _SAME_TIME_S
+        ]
 
     def _attributed(self, file: CameraFile, arrival: Arrival, taken_s: int | None, announced: _Announced) -> Arrival:
         """Say which shot made a frame. The current shot ends with its frame."""
         fired_ns = None if self.current is None else self.current.fired_ns
         current = None if self.current is None or fired_ns is None else Claim(self.current.shot, fired_ns)
         clue = FileClue(taken_s, announced.seen_ns, announced.since_ns, *self._card.neighbours(file))
-        found = attribute(clue, self._late, [] if current is None else [current], self._clock)
+        waiting = [] if current is None else [current]
+        found = attribute(clue, self._late, waiting, self._clock)
         self._clock = found.clock
+        self._framed.extend(claim for claim in (*self._late, *waiting) if claim.shot == found.shot)
         if current is not None and found.shot == current.shot:
             self.current = None
         left = [claim for claim in self._late if claim.shot != found.shot]
