@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.findings import Finding
 from dappled.flight import FlightError, log_reading
 from dappled.flight.log_reading import split
 from dappled.flight.logs import BLOCK_BYTES, TelemetryLog, packet_length
@@ -40,7 +41,7 @@ def test_a_torn_end_costs_the_last_record_only(
     records: list[tuple[int, bytes]], last: tuple[int, bytes], data: st.DataObject
 ) -> None:
     torn = logged(*last)[: data.draw(st.integers(1, len(logged(*last)) - 1))]
-    problems: list[str] = []
+    problems: list[Finding] = []
     found = list(split(b"".join(logged(*record) for record in records) + torn, problems.append))
     assert found[: len(records)] == records
     assert len(problems) == 1
@@ -54,7 +55,7 @@ def test_reading_goes_on_behind_garbage(
     garbage = garbage.replace(b"\xfe", b"").replace(b"\xfd", b"")
     start = 1_795_256_103_000_000  # a stamp of the real size holds no first byte either
     after = [(start + n, mavlink_2(b"payload")) for n, _ in enumerate(after)]
-    problems: list[str] = []
+    problems: list[Finding] = []
     found = list(
         split(b"".join(logged(*r) for r in before) + garbage + b"".join(logged(*r) for r in after), problems.append)
     )
@@ -64,7 +65,7 @@ def test_reading_goes_on_behind_garbage(
 
 @given(st.binary(max_size=400))
 def test_any_bytes_are_read_without_a_crash(data: bytes) -> None:
-    problems: list[str] = []
+    problems: list[Finding] = []
     total = sum(len(logged(stamp, raw)) for stamp, raw in split(data, problems.append))
     assert total <= len(data)
     assert (total == len(data)) == (not problems)

@@ -26,7 +26,7 @@ from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
-from dappled.findings import told
+from dappled.findings import Finding, Level, told, worst
 from dappled.flight import LIVE, layout
 from dappled.flight.checks import flight_check
 
@@ -80,6 +80,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--config", type=Path, metavar="FILE", help="settings file, for endpoints, workers and record.seal_key"
     )
+    parser.add_argument("--anyway", action="store_true", help="exit with 0 though a log is in doubt")
     parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
 
@@ -100,6 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
     recording = _recording(arguments, is_flight)
     for one in recording.findings:
         print(f"{one.level.word}: {told(one)}", file=sys.stderr)
+    found: list[Finding] = []
     flown = _as_recorded(arguments, facts, recipe)
     progress = PrintedProgress(as_json=arguments.json)
     with ExitStack() as stack:
@@ -121,10 +123,13 @@ def run(arguments: argparse.Namespace) -> int:
             recipe=recipe,
             publish=settings.publish if arguments.publish else None,
             pace=_pace(arguments),
-            report=lambda text: print(f"doubt: {text}", file=sys.stderr),
+            report=found.append,
         )
+    for one in found:
+        print(f"{one.level.word}: {told(one)}", file=sys.stderr)
+    doubted = worst([*recording.findings, *found]) > Level.NOTE and not arguments.anyway
     if not arguments.verify:
-        return 1 if progress.bad else 0
+        return 1 if progress.bad or doubted else 0
     problems += writer.verdict(decoded=recipe is not None)
     for text in problems:
         print(f"different: {text}", file=sys.stderr)

@@ -15,6 +15,7 @@ from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json, read_log
 from dappled.errors import counted
+from dappled.findings import Code, Finding, Subject, finding, text
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
 from dappled.flight.records import Cause, Shot
@@ -85,6 +86,11 @@ def read_telemetry(path: Path, report: Callable[[str], object] = lambda _: None)
     Bytes that are not a packet are skipped up to the next place where two records follow each other, or one ends the
     file. `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
     """
+    return read_records(path, lambda gap: report(f"{path}: {text(gap)}"))
+
+
+def read_records(path: Path, report: Callable[[Finding], object]) -> Iterator[tuple[int, int, bytes]]:
+    """See `read_telemetry`; `report` gets a finding for each gap."""
     try:
         with open(path, "rb", opener=durable.without_waiting) as file:
             size = os.fstat(file.fileno()).st_size
@@ -93,12 +99,14 @@ def read_telemetry(path: Path, report: Callable[[str], object] = lambda _: None)
         raise disk_error("read the telemetry", path, error) from error
     if data is not None:
         with data:
-            for number, (stamp_us, raw) in enumerate(split(data, lambda text: report(f"{path}: {text}"))):
+            for number, (stamp_us, raw) in enumerate(split(data, report, path)):
                 yield number, stamp_us, raw
 
 
-def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, bytes]]:
-    """(stamp in µs UTC, packet) of each record in a log's bytes; see `read`."""
+def split(
+    data: bytes | mmap.mmap, report: Callable[[Finding], object] = lambda _: None, path: Path = Path()
+) -> Iterator[tuple[int, bytes]]:
+    """(stamp in µs UTC, packet) of each record in a log's bytes; see `read_telemetry`."""
     at, size = 0, len(data)
     while at < size:
         end = _record_end(data, at)
@@ -106,7 +114,7 @@ def split(data: bytes | mmap.mmap, report: Callable[[str], object] = lambda _: N
             found = _resynchronise(data, at + 1)
             skipped = (size if found is None else found) - at
             where = "at the end" if found is None else f"before byte {found}"
-            report(f"{skipped} bytes {where} are not telemetry and were skipped")
+            report(finding(Code.LOG_BYTES_SKIPPED, Subject("log", str(path)), bytes=skipped, where=where))
             if found is None:
                 return
             at = found

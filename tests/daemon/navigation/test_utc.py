@@ -9,8 +9,8 @@ import pytest
 
 from dappled.daemon.navigation import Telemetry, UtcCorrection, machine_clock
 from dappled.daemon.navigation.clocks import UtcLearner
-from dappled.drivers.gnss.utc_choice import RELEASED_NS, ROLLOVER_NS
 from dappled.drivers.mavlink import mavlink
+from dappled.drivers.utc_choice import RELEASED_NS, ROLLOVER_NS
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath

@@ -13,6 +13,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, log_packets
 from dappled.drivers.mavlink.dataflash import DataFlashError
+from dappled.findings import Finding, Level, text
 from dappled.mocks.autopilot.path import FlightPath
 from tests.drivers.mavlink.true_logs import (
     BOOT_US,
@@ -67,11 +68,12 @@ def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path
         log = written(tmp_path)[form == "tlog"]
     data = log.read_bytes()
     log.write_bytes(data[: len(data) - cut])
-    told: list[str] = []
+    told: list[Finding] = []
     after = ExposureTime((UTC_US + round(SPAN_S * 1e6)) * 1000, 1_000_000, "test")  # so all of the log is read
     RecordedTelemetry(log, {}, wait_s=9.0, report=told.append).pose(0, after)
     assert len(told) == (cut > 0)
-    assert all(str(log) in text and ("cut short" in text or "at the end" in text) for text in told)
+    assert all(one.subject.which == str(log) and one.level is Level.CAUTION for one in told)
+    assert all("cut short" in text(one) or "at the end" in text(one) for one in told)
 
 
 @pytest.mark.parametrize(

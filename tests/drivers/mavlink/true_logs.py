@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,10 +25,12 @@ TYPES = {
     "GPS": (12, "QBBIHBcLLe", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt"),
     "GPA": (13, "QBCCCC", "TimeUS,I,VDop,HAcc,VAcc,SAcc"),
     "XKF1": (14, "QBfff", "TimeUS,C,VN,VE,VD"),
+    "XKF4": (17, "QBb", "TimeUS,C,PI"),
     "CAM": (15, "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
     "TRIG": (16, "QBHIHLLeeeccC", "TimeUS,I,Img,GPSTime,GPSWeek,Lat,Lng,Alt,RelAlt,GPSAlt,R,P,Y"),
 }
-CODES = {"Q": "Q", "L": "i", "f": "f", "B": "B", "I": "I", "H": "H", "c": "h", "C": "H", "e": "i"}
+Row = tuple[float, ...]
+CODES = {"b": "b", "Q": "Q", "L": "i", "f": "f", "B": "B", "I": "I", "H": "H", "c": "h", "C": "H", "e": "i"}
 
 
 def record(name: str, *values: float) -> bytes:
@@ -36,7 +38,23 @@ def record(name: str, *values: float) -> bytes:
     return struct.pack("<BBB" + "".join(CODES[one] for one in form), 0xA3, 0x95, number, *values)
 
 
-def formats() -> bytes:
+def rewritten(log: Path, change: Callable[[str, Row], Iterable[tuple[str, Row]]], columns: str = "") -> Path:
+    """A .bin whose records are as `change` gives them; those of GPS have a further `columns` of one byte."""
+    types = TYPES | {"GPS": (12, TYPES["GPS"][1] + "B", f"{TYPES['GPS'][2]},{columns}")} if columns else TYPES
+    numbers, data, at = {number: name for name, (number, _, _) in TYPES.items()}, log.read_bytes(), len(formats())
+    parts = [formats(types)]
+    while at < len(data):
+        name = numbers[data[at + 2]]
+        form = "<" + "".join(CODES[one] for one in TYPES[name][1])
+        for kind, row in change(name, struct.unpack_from(form, data, at + 3)):
+            number, codes, _ = types[kind]
+            parts.append(struct.pack("<BBB" + "".join(CODES[one] for one in codes), 0xA3, 0x95, number, *row))
+        at += 3 + struct.calcsize(form)
+    log.write_bytes(b"".join(parts))
+    return log
+
+
+def formats(types: Mapping[str, tuple[int, str, str]] = TYPES) -> bytes:
     def one(number: int, name: str, form: str, columns: str) -> bytes:
         length = 3 + struct.calcsize("<" + "".join(CODES.get(code, "x") for code in form))
         length = 89 if name == "FMT" else length
@@ -44,7 +62,7 @@ def formats() -> bytes:
                            columns.encode())  # fmt: skip
 
     listed = [one(0x80, "FMT", "BBnNZ", "Type,Length,Name,Format,Columns")]
-    return b"".join([*listed, *(one(number, name, form, columns) for name, (number, form, columns) in TYPES.items())])
+    return b"".join([*listed, *(one(number, name, form, columns) for name, (number, form, columns) in types.items())])
 
 
 def told(true: TruePose) -> tuple[int, int, float]:
@@ -136,11 +154,20 @@ def ulog_message(kind: str, data: bytes) -> bytes:
 
 
 def ulog_written(
-    folder: Path, *, fix: int = 6, older: bool = False, late_us: int = 4_000, invalid: bool = False, ahead_us: int = 0
+    folder: Path,
+    *,
+    fix: int = 6,
+    older: bool = False,
+    late_us: int = 4_000,
+    invalid: bool = False,
+    ahead_us: int = 0,
+    blended: bool = False,
+    unix: bool = False,
 ) -> Path:
     """The same flight as `written`, as PX4's .ulg: https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Estimates
     are published `late_us` after they hold; `older`: the receiver's places as integers, as before PX4 1.14; `invalid`:
-    beside each estimate stands one that is wrong and says so; `ahead_us`: the receiver's UTC is that of a later time,
+    beside each estimate stands one that is wrong and says so; `blended`: the receiver that counts tells no UTC, only
+    `sensor_gps` does; `unix`: all stamps are Unix time; `ahead_us`: the receiver's UTC is that of a later time,
     and its messages say which."""
     path, home_m = FlightPath(5), 0.0
     types = ULOG_TYPES | ({"vehicle_gps_position": OLDER_RECEIVER} if older else {})
@@ -149,9 +176,12 @@ def ulog_written(
             "uint8_t[4] _padding0;", "bool lat_lon_valid;bool alt_valid;"
         )
         types["vehicle_local_position"] += "bool v_xy_valid;bool v_z_valid;bool z_valid;"
+    if blended:
+        types["sensor_gps"] = types["vehicle_gps_position"]
+    begins_us = BOOT_US + (1_790_000_000 * 10**6 if unix else 0)
     if ahead_us:
         types["vehicle_gps_position"] += "int32_t timestamp_time_relative;"
-    log = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", BOOT_US), ulog_message("B", bytes(40))]
+    log = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", begins_us), ulog_message("B", bytes(40))]
     log += [ulog_message("F", f"{name}:{fields}".encode()) for name, fields in types.items()]
     numbers = {name: n for n, name in enumerate(types)}
     log += [ulog_message("A", struct.pack("<BH", 0, n) + name.encode()) for name, n in numbers.items()]
@@ -163,7 +193,7 @@ def ulog_written(
 
     for step in range(round(SPAN_S / STEP_S)):
         t_s = step * STEP_S
-        at = BOOT_US + round(t_s * 1e6)
+        at = begins_us + round(t_s * 1e6)
         true = path.pose(t_s)
         up, velocity = -true.position_ned_m[2], true.velocity_ned_m_s
         if step == 0:
@@ -188,7 +218,10 @@ def ulog_written(
         else:
             relative = ("i", (ahead_us,)) if ahead_us else ("", ())
             exact = *place, true.altitude_msl_m
-            data("vehicle_gps_position", "QQdddfffffBB" + relative[0], at, fixed_us, *exact, *quality, *relative[1])
+            told_us = 0 if blended else fixed_us
+            data("vehicle_gps_position", "QQdddfffffBB" + relative[0], at, told_us, *exact, *quality, *relative[1])
+            if blended:
+                data("sensor_gps", "QQdddfffffBB", at, fixed_us, *exact, *quality)
     (folder / "10_15_03.ulg").write_bytes(b"".join(log))
     return folder / "10_15_03.ulg"
 

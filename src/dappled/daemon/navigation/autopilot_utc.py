@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dappled.drivers.gnss.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
+from dappled.drivers.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
 from dappled.findings import Finding, Subject
 
 _SAME_NS = 50_000_000  # offsets further apart are a step: crystals drift by less between two messages

@@ -6,7 +6,7 @@ import ctypes
 from collections.abc import Callable
 from pathlib import Path
 
-from dappled.drivers.gnss.utc_choice import RELEASED_NS
+from dappled.drivers.utc_choice import RELEASED_NS
 
 _TIMEX_BYTES = 512  # more than any kernel's struct timex
 

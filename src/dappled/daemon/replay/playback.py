@@ -23,6 +23,7 @@ from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Identity
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.replay import ReplayCamera
+from dappled.findings import Finding
 
 _DECODE_QUEUE = 1000
 _STOP_S = 5.0
@@ -46,11 +47,11 @@ def run(
     recipe: Recipe | None = None,
     publish: PublishSettings | None = None,
     pace: Pace | None = None,
-    report: Callable[[str], object] = lambda _: None,
+    report: Callable[[Finding], object] = lambda _: None,
 ) -> None:
     """Play the recording to its end (see `replay.play`), and close what was opened for it.
 
-    `writer` takes the results, `report` a sentence for each gap in the telemetry. Without a recipe nothing is decoded,
+    `writer` takes the results, `report` what is to be said of the telemetry. Without a recipe nothing is decoded,
     without `publish` nothing is published. Raises ReplayError, DecodeError, WireError, KeyFileError.
     """
     time = replay.clock(recording)
@@ -69,6 +70,7 @@ def run(
             recording.vehicles,
             rules=recording.rules,
             report=report,
+            bounds=recording.bounds,
         )
         publisher = None
         if publish is not None:

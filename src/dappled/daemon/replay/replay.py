@@ -12,7 +12,7 @@ from time import sleep
 from typing import Any, Self
 
 from dappled import __version__, confined, durable, picture_order
-from dappled.clock import RecordedClock
+from dappled.clock import RecordedClock, TimeOfDayClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
 from dappled.daemon.navigation.clocks import TAGGING_RULES
@@ -23,6 +23,7 @@ from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot
+from dappled.drivers.utc_choice import UtcBounds
 from dappled.drivers.wired.matching import seconds
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding
@@ -38,6 +39,7 @@ from dappled.flight import (
     log_reading,
 )
 
+_DATED = 8  # frames whose own time is asked
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 
 
@@ -50,7 +52,8 @@ class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
     each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
     `Telemetry`); `elsewhere` another platform or other versions that it was recorded with; `rules` those it was
-    tagged by; `findings` what was found in a folder of frames."""
+    tagged by; `findings` what was found in a folder of frames;
+    `bounds` which dates of its log can be true."""
 
     root: Path
     shots: Sequence[Shot]
@@ -62,6 +65,7 @@ class RecordedFlight:
     elsewhere: str | None = None
     rules: int = TAGGING_RULES
     findings: tuple[Finding, ...] = ()
+    bounds: UtcBounds | None = None
 
 
 def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
@@ -122,12 +126,18 @@ def _elsewhere(recorded: Mapping[str, str]) -> str | None:
 
 
 def of_folder(
-    folder: Path, match: str, telemetry: Path | None, start_utc_ns: int | None, interval_s: float
+    folder: Path,
+    match: str,
+    telemetry: Path | None,
+    start_utc_ns: int | None,
+    interval_s: float,
+    *,
+    now_ns: int | None = None,
 ) -> RecordedFlight:
     """Frames in a folder, in the order of their EXIF's times or else of their names; the first at `start_utc_ns` (None:
     the telemetry's first position, or 1970 without telemetry), the others at `interval_s` after each other. A single
     .tlog (or, without one, a single .bin of ArduPilot or .ulg of PX4) in the folder is the telemetry, where none is
-    named."""
+    named. `now_ns`: no log is of a later time."""
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
@@ -136,10 +146,11 @@ def of_folder(
     paths = ordered.items
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
+    bounds = _bounds(paths, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
     if start_utc_ns is None:
-        start_utc_ns = _first_position_utc_ns(telemetry) if telemetry else 0
+        start_utc_ns = _first_position_utc_ns(telemetry, bounds) if telemetry else 0
     elif telemetry is not None and own_log(telemetry):
-        next(_packets(telemetry), None)  # a log that can't be used is refused before anything is replayed
+        next(_packets(telemetry, bounds=bounds), None)  # one that can't be used is refused before all else
     shots, files, expected = [], [], []
     for index, path in enumerate(paths):
         utc_ns = start_utc_ns + round(index * interval_s * 1e9)
@@ -158,7 +169,13 @@ def of_folder(
         before, name, earlier_s = ordered.against
         code, subject = Code.PICTURE_NAMES_DISAGREE, Subject("picture", Path(name).name)
         found = (finding(code, subject, Level.NOTE, before=Path(before).name, earlier_s=earlier_s),)
-    return RecordedFlight(folder, shots, files, expected, telemetry, {}, findings=found)
+    return RecordedFlight(folder, shots, files, expected, telemetry, {}, findings=found, bounds=bounds)
+
+
+def _bounds(paths: Sequence[Path], start_utc_ns: int | None, now_ns: int) -> UtcBounds:
+    """Which dates of a log beside these frames can be true: their own tell, and that of the first by the user."""
+    taken = [round(taken_s * 1e9) for path in paths[:_DATED] if (taken_s := _taken_s(path)) is not None]
+    return UtcBounds.of_log(now_ns, [*taken, *([] if start_utc_ns is None else [start_utc_ns])])
 
 
 def _taken_s(path: Path) -> float | None:
@@ -201,10 +218,11 @@ class RecordedTelemetry:
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
         rules: int = TAGGING_RULES,
-        report: Callable[[str], object] = lambda _: None,
+        report: Callable[[Finding], object] = lambda _: None,
+        bounds: UtcBounds | None = None,
     ) -> None:
         """`vehicles`, `component_id`, `cam_idx`, `attitude_sigma_rad` and `rules` are those that the recording daemon
-        had. `report` gets a sentence for each gap that is read over, and for a log that was cut short."""
+        had. `report` gets what is to be said of the log."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
         self._telemetry = Telemetry(
             vehicles=vehicles,
@@ -213,7 +231,7 @@ class RecordedTelemetry:
             attitude_sigma_rad=attitude_sigma_rad,
             rules=rules,
         )
-        self._packets = _packets(path, report) if path else iter(())
+        self._packets = _packets(path, report, bounds) if path else iter(())
         self._fed = 0
 
     @classmethod
@@ -225,7 +243,8 @@ class RecordedTelemetry:
         vehicles: Sequence[tuple[int, int]],
         *,
         rules: int,
-        report: Callable[[str], object] = lambda _: None,
+        report: Callable[[Finding], object] = lambda _: None,
+        bounds: UtcBounds | None = None,
     ) -> Self:
         """As the daemon of these settings had it."""
         return cls(
@@ -238,6 +257,7 @@ class RecordedTelemetry:
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
             rules=rules,
             report=report,
+            bounds=bounds,
         )
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
@@ -339,30 +359,34 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
     return None if found is None else found[0]
 
 
-def _packets(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, MavlinkMessage]]:
+def _packets(
+    path: Path, report: Callable[[Finding], object] = lambda _: None, bounds: UtcBounds | None = None
+) -> Iterator[tuple[int, int, MavlinkMessage]]:
     """The messages of a .tlog or of an autopilot's own log. Raises FlightError and AutopilotLogError."""
     decoder = PacketParser()
-    for number, stamp_us, raw in _logged(path, report):
+    for number, stamp_us, raw in _logged(path, report, bounds):
         message = decoder(raw)
         if message is not None:  # a packet with a wrong checksum was never acted on either
             yield number, stamp_us, message
 
 
-def _logged(path: Path, report: Callable[[str], object]) -> Iterator[tuple[int, int, bytes]]:
+def _logged(
+    path: Path, report: Callable[[Finding], object], bounds: UtcBounds | None
+) -> Iterator[tuple[int, int, bytes]]:
     kind = own_log(path)
     if kind is None:
-        return log_reading.read_telemetry(path, report)
+        return log_reading.read_records(path, report)
     if kind == "ulog":
         from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
 
-        return ulog.packets(path, report)
+        return ulog.packets(path, report, bounds)
     from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
 
-    return dataflash.packets(path, report)
+    return dataflash.packets(path, report, bounds)
 
 
-def _first_position_utc_ns(path: Path) -> int:
-    utc_ns = first_position_utc_ns(_packets(path))
+def _first_position_utc_ns(path: Path, bounds: UtcBounds) -> int:
+    utc_ns = first_position_utc_ns(_packets(path, bounds=bounds))
     if utc_ns is None:
         raise ReplayError(f"{path} holds no position: give --start, the time of the first frame")
     return utc_ns

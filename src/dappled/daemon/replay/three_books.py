@@ -18,15 +18,16 @@ from typing import Literal
 
 import numpy as np
 
+from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings
 from dappled.daemon.navigation import recorded_vehicles
 from dappled.daemon.replay.in_order import paired_in_order
 from dappled.daemon.replay.replay import own_log
 from dappled.decode.array_types import Floats
-from dappled.drivers.gnss.utc_choice import LOGS_FROM_NS
 from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.drivers.mavlink.log_packets import LoggedTrigger, TriggerLog
+from dappled.drivers.utc_choice import LOGS_FROM_NS, UtcBounds
 from dappled.errors import DappledError
 from dappled.flight import LedgerReader, ShotRow, Stray, Tag, layout, log_reading
 from dappled.flight.logs import MAVLINK_2
@@ -181,7 +182,9 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     tables = layout.read_facts(folder).get("settings", {})
     settings = configuration.of_tables(tables, str(folder.settings))
     heard = _heard(folder.telemetry, systems, settings.mavlink, outside=settings.camera.fired_outside)
-    read = [(path, _read(path, settings.mavlink.cam_idx)) for path in logs]
+    known_ns = [utc_ns for index in found.rows if (utc_ns := found.utc_ns(found.at_us(index) * 1000)) is not None]
+    bounds = UtcBounds.of_log(TimeOfDayClock().utc_ns(), known_ns[:1])
+    read = [(path, _read(path, settings.mavlink.cam_idx, bounds)) for path in logs]
     triggers: list[_Trigger] = []
     spans, elsewhere, steady = [], 0, True
     for path, log in read:
@@ -213,7 +216,7 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     )
 
 
-def _read(path: Path, cam_idx: int) -> TriggerLog:
+def _read(path: Path, cam_idx: int, bounds: UtcBounds) -> TriggerLog:
     try:
         kind = own_log(path)
     except OSError as error:
@@ -221,11 +224,11 @@ def _read(path: Path, cam_idx: int) -> TriggerLog:
     if kind == "ulog":
         from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
 
-        return ulog.triggers(path)
+        return ulog.triggers(path, bounds)
     if kind == "dataflash":
         from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
 
-        return dataflash.triggers(path, cam_idx)
+        return dataflash.triggers(path, cam_idx, bounds)
     raise BooksError(f"{path} is no log of an autopilot: give ArduPilot's .bin or PX4's .ulg")
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from datetime import timedelta
 from typing import Literal
 
-from dappled.drivers.gnss.gps_time import GPS_EPOCH, gps_to_utc
+from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
 
 Edge = Literal["falling", "rising"]
 TIM_TM2, RXM_RAWX = (0x0D, 0x03), (0x02, 0x15)

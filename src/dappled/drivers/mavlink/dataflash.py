@@ -1,7 +1,7 @@
 """Read ArduPilot's own log (DataFlash, .bin) as the MAVLink packets that a telemetry link would have carried.
 
 Positions are POS with the velocities of XKF1 or NKF1, attitudes ATT, the receiver GPS and GPA. UTC comes from the
-receiver's time (`log_packets.log_clock`). Triggers of a camera are TRIG, with CAM as contacts of its feedback pin, or,
+receiver's time (`log_evidence.utc_clock`). Triggers of a camera are TRIG, with CAM as contacts of its feedback pin, or,
 without a pin, CAM.
 """
 
@@ -9,56 +9,60 @@ from __future__ import annotations
 
 import contextlib
 import io
+import math
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pymavlink import DFReader
 
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import from_euler
-from dappled.drivers.mavlink import log_packets
-from dappled.drivers.mavlink.log_packets import (
-    FIX_3D,
-    AutopilotLogError,
-    LogClock,
-    LoggedTrigger,
-    ReceiverFix,
-    Timed,
-    TriggerLog,
-)
+from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
+from dappled.drivers.mavlink import log_evidence, log_packets
+from dappled.drivers.mavlink.log_evidence import Chosen, LoggedPlaces, Missing, Receiver
+from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
+from dappled.drivers.utc_choice import UtcBounds
 from dappled.errors import first_line
+from dappled.findings import Code, Finding, Subject, finding
 
-_USED = ["POS", "ATT", "GPS", "GPA", "XKF1", "NKF1"]
+_USED = ["POS", "ATT", "GPS", "GPA", "XKF1", "NKF1", "XKF4", "NKF4"]
 _OF_CAMERAS = ["CAM", "TRIG"]
 _GPS_EPOCH_US = 315_964_800 * 10**6
-_LEAP_US = 18 * 10**6  # since 2017; no older log is of use here
 _WEEK_US = 7 * 86400 * 10**6
-_GAP_US = 1_000_000  # a velocity further away is not that of a position
+_MOST_WEEKS = 2**16
+_CORES_AGREE_M_S = 0.5
 
 
 class DataFlashError(AutopilotLogError):
     """A log of ArduPilot can't be used; one sentence."""
 
 
-def packets(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
-    """(running number, stamp in µs UTC, packet), in the order of time. `report` gets a sentence where the log was cut
-    short. Raises DataFlashError."""
+def packets(
+    path: Path, report: Callable[[Finding], object] = lambda _: None, bounds: UtcBounds | None = None
+) -> Iterator[tuple[int, int, bytes]]:
+    """(running number, stamp in µs UTC, packet), in the order of time. `report` gets what is to be said of the log;
+    `bounds` say which dates can be true (None: up to now). Raises DataFlashError."""
+    missing = Missing()
     with _sound(path):
         rows, cut = _rows(path, _USED)
-        clock = _clock(path, rows["GPS"])
-        messages = [*_positions(path, rows), *_attitudes(rows), *_receiver(rows, clock)]
-    if cut:
-        report(f"{path}: {log_packets.CUT_SHORT}")
+        clock, counting, told = _clock(path, rows, bounds)
+        messages = [*_positions(path, rows, missing, told), *_attitudes(rows, missing)]
+        for receiver, which in counting:
+            for fix in receiver.fixes(which):
+                messages += log_packets.receiver(fix, clock)
+    log_packets.tell(path, [*told, *missing.findings(path)], report, cut=cut)
     yield from log_packets.packets(messages, clock)
 
 
-def triggers(path: Path, cam_idx: int) -> TriggerLog:
+def triggers(path: Path, cam_idx: int, bounds: UtcBounds | None = None) -> TriggerLog:
     """The triggers of one camera (0 is CAM1). Raises DataFlashError."""
     with _sound(path):
         rows, _ = _rows(path, ["GPS", *_OF_CAMERAS])
-        clock = _clock(path, rows["GPS"])
+        clock, _, _ = _clock(path, rows, bounds)
         # before ArduPilot 4.3 the messages don't say which camera: there is one
         mine = {name: [row for row in rows[name] if getattr(row, "I", 0) == cam_idx] for name in _OF_CAMERAS}
         given = mine["TRIG"] or mine["CAM"]
@@ -123,70 +127,145 @@ def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
     log = _Reader(path)
     try:
         while (message := log.recv_match(type=used)) is not None:
-            name = message.get_type()
-            first = getattr(message, "I", 0) == 0 and getattr(message, "C", 0) == 0
-            if first or name in _OF_CAMERAS:  # the first receiver, the first core
-                rows[name].append(message)
+            rows[message.get_type()].append(message)
         return rows, log.cut_short()
     finally:
         log.filehandle.close()
 
 
-def _clock(path: Path, receiver: list[Any]) -> LogClock:
-    """The autopilot's clock by the receiver's fixes. Raises DataFlashError without one."""
-    fixes = [row for row in receiver if row.Status >= FIX_3D and row.GWk > 0]
-    if not fixes:
-        raise DataFlashError(f"{path} holds no fix of a satellite receiver: its time in UTC is not known")
-    boots_us = np.array([row.TimeUS for row in fixes], dtype=np.int64)
-    gps_us = np.array([row.GWk * _WEEK_US + row.GMS * 1000 for row in fixes], dtype=np.int64)
+def _clock(
+    path: Path, rows: dict[str, list[Any]], bounds: UtcBounds | None
+) -> tuple[LogClock, list[tuple[Receiver, Chosen]], list[Finding]]:
+    """The autopilot's clock, the receiver's messages that count, and what is to be said of both. Raises DataFlashError
+    without a fix."""
+    receivers = list(_receivers(rows))
+    counting, told = log_evidence.chosen(path, receivers)
     try:
-        return log_packets.log_clock(boots_us, _GPS_EPOCH_US + gps_us - _LEAP_US - boots_us)
+        clock, doubts = log_evidence.utc_clock(path, counting, receivers, bounds)
     except AutopilotLogError as error:
-        raise DataFlashError(f"{path}: {error}") from None
+        raise DataFlashError(str(error)) from None
+    return clock, counting, [*told, *doubts]
 
 
-def _positions(path: Path, rows: dict[str, list[Any]]) -> Iterator[Timed]:
-    moving = rows["XKF1"] or rows["NKF1"]
-    if not rows["POS"] or not moving:
+def _receivers(rows: dict[str, list[Any]]) -> Iterator[Receiver]:
+    """Each receiver's messages (GPS), with the accuracies (GPA) that are nearest in time."""
+    for number in sorted({getattr(row, "I", 0) for row in rows["GPS"]}):
+        mine = [row for row in rows["GPS"] if getattr(row, "I", 0) == number]
+        told = [row for row in rows.get("GPA", []) if getattr(row, "I", 0) == number]
+        at, quality = _times(mine), _times(told)
+        nearest = np.abs(quality[None, :] - at[:, None]).argmin(axis=1) if told and len(told) < 2 else None
+        if len(told) > 1:
+            after = np.clip(np.searchsorted(quality, at), 1, len(quality) - 1)
+            nearest = after - (np.abs(quality[after - 1] - at) <= np.abs(quality[after] - at))
+        known = {
+            name: np.full(len(mine), np.nan) if nearest is None else _column(told, name)[nearest]
+            for name in ("VDop", "HAcc", "VAcc", "SAcc")
+        }
+        weeks, ms = _column(mine, "GWk"), _column(mine, "GMS")
+        sound = (weeks > 0) & (weeks < _MOST_WEEKS) & (ms >= 0) & (ms < _WEEK_US / 1000)
+        gps_us = np.where(sound, weeks, 0).astype(np.int64) * _WEEK_US + np.where(sound, ms, 0).astype(np.int64) * 1000
+        usual_us = int(np.median(gps_us[sound])) if sound.any() else 0
+        leap_us, later_leap_us = _leap_us(usual_us), _leap_us(usual_us + 1024 * _WEEK_US)
+        yield Receiver(
+            number + 1,
+            at,
+            np.where(sound, _GPS_EPOCH_US + gps_us - leap_us, 0),
+            np.nan_to_num(_column(mine, "Status")).astype(np.int64),
+            _column(mine, "Lat"),
+            _column(mine, "Lng"),
+            _column(mine, "Alt"),
+            _column(mine, "NSats"),
+            _column(mine, "HDop"),
+            known["VDop"],
+            np.stack([known[name] for name in ("HAcc", "VAcc", "SAcc")]),
+            _column(mine, "U") > 0 if all(hasattr(row, "U") for row in mine) else None,
+            1024 * _WEEK_US - (later_leap_us - leap_us),
+        )
+
+
+def _leap_us(gps_us: int) -> int:
+    """By how much GPS time is ahead of UTC."""
+    gps = GPS_EPOCH + timedelta(microseconds=gps_us)
+    return round((gps - gps_to_utc(gps)).total_seconds()) * 10**6
+
+
+def _positions(path: Path, rows: dict[str, list[Any]], missing: Missing, told: list[Finding]) -> Iterator[Timed]:
+    places = LoggedPlaces(
+        "POS", _times(rows["POS"]), *(_column(rows["POS"], name) for name in ("Lat", "Lng", "Alt", "RelHomeAlt"))
+    )
+    name = _estimator(rows)
+    if not rows["POS"] or not rows[name]:
         raise DataFlashError(
             f"{path} holds no positions with velocities (POS, and XKF1 or NKF1): set LOG_BITMASK for them"
         )
-    times = _column(moving, "TimeUS")
-    velocities = np.stack([_column(moving, name) for name in ("VN", "VE", "VD")])
-    for row in rows["POS"]:
-        if np.abs(times - row.TimeUS).min() > _GAP_US:
-            continue
-        north, east, down = (float(np.interp(row.TimeUS, times, speed)) for speed in velocities)
-        place = row.Lat, row.Lng, row.Alt
-        yield log_packets.position(int(row.TimeUS), place, row.RelHomeAlt, (north, east, down))
+    moving = _core(path, rows, name, places, told)
+    velocities = np.stack([_column(moving, axis) for axis in ("VN", "VE", "VD")])
+    yield from log_evidence.positions(places, name, _times(moving), velocities, missing)
 
 
-def _attitudes(rows: dict[str, list[Any]]) -> Iterator[Timed]:
-    for row in rows["ATT"]:
-        yield log_packets.attitude(int(row.TimeUS), from_euler(*np.radians([row.Roll, row.Pitch, row.Yaw]).tolist()))
+def _estimator(rows: dict[str, list[Any]]) -> str:
+    """Whose velocities count: those of the filter that the attitude says is active, else the newer one's."""
+    active = [int(row.AEKF) for row in rows["ATT"] if hasattr(row, "AEKF")]
+    older = bool(active) and 2 * active.count(2) > len(active)
+    return "NKF1" if rows["NKF1"] and (older or not rows["XKF1"]) else "XKF1"
 
 
-def _receiver(rows: dict[str, list[Any]], clock: LogClock) -> Iterator[Timed]:
-    accuracies = rows["GPA"]
-    times = _column(accuracies, "TimeUS")
-    for row in rows["GPS"]:
-        at = int(row.TimeUS)
-        quality = accuracies[int(np.abs(times - at).argmin())] if accuracies else None
-        yield from log_packets.receiver(
-            ReceiverFix(
-                at,
-                int(row.Status),
-                row.Lat,
-                row.Lng,
-                row.Alt,
-                int(row.NSats),
-                row.HDop,
-                None if quality is None else quality.VDop,
-                None if quality is None else (quality.HAcc, quality.VAcc, quality.SAcc),
-            ),
-            clock,
-        )
+def _core(path: Path, rows: dict[str, list[Any]], name: str, places: LoggedPlaces, told: list[Finding]) -> list[Any]:
+    """The messages of the estimator's cores that count: of the core that was in use at the time, where the log says so
+    (XKF4, NKF4); else of the first one whose velocities agree with the positions."""
+    cores = sorted({getattr(row, "C", 0) for row in rows[name]})
+    of_core = {core: [row for row in rows[name] if getattr(row, "C", 0) == core] for core in cores}
+    if len(cores) == 1:
+        return of_core[cores[0]]
+    said = [row for row in rows[name.replace("1", "4")] if hasattr(row, "PI")]
+    primaries = {int(row.PI) for row in said}
+    if primaries and primaries <= set(cores):
+        at, primary = _times(said), _column(said, "PI")
+        before = np.clip(np.searchsorted(at, _times(rows[name]), side="right") - 1, 0, None)
+        found = [row for row, core in zip(rows[name], primary[before], strict=True) if getattr(row, "C", 0) == core]
+        by, core = name.replace("1", "4"), int(np.median(primary))
+    else:
+        off_m_s = {core: _off_m_s(places, of_core[core]) for core in cores}
+        most = 2.0 * min(off_m_s.values()) + _CORES_AGREE_M_S
+        core = next(core for core in cores if off_m_s[core] <= most)
+        found, by = of_core[core], "POS"
+    if core != cores[0]:
+        told.append(finding(Code.LOG_CORE, Subject("log", str(path)), core=core, cores=len(cores), by=by))
+    return found
+
+
+def _off_m_s(places: LoggedPlaces, moving: list[Any]) -> float:
+    """By how much velocities differ from those of the positions (median, m/s, north and east); infinite where nothing
+    can be compared."""
+    times, span_s = _times(moving), np.diff(places.boots_us) / 1e6
+    north, east = _column(moving, "VN"), _column(moving, "VE")
+    good = np.isfinite(north) & np.isfinite(east)
+    if not good.any():
+        return math.inf
+    middle = places.boots_us[:-1] + np.diff(places.boots_us) // 2
+    per_deg = 111_320.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moved_n = np.diff(places.lat) * per_deg / span_s
+        moved_e = np.diff(places.lon) * per_deg * np.cos(np.radians(places.lat[:-1])) / span_s
+    off = np.hypot(
+        moved_n - np.interp(middle, times[good], north[good]), moved_e - np.interp(middle, times[good], east[good])
+    )
+    off = off[np.isfinite(off)]
+    return float(np.median(off)) if off.size else math.inf
+
+
+def _attitudes(rows: dict[str, list[Any]], missing: Missing) -> Iterator[Timed]:
+    angles = np.radians(np.stack([_column(rows["ATT"], name) for name in ("Roll", "Pitch", "Yaw")], axis=-1))
+    sound = [all(map(math.isfinite, row)) for row in angles.tolist()]
+    turned = [from_euler(*row.tolist()) if good else (0.0,) * 4 for row, good in zip(angles, sound, strict=True)]
+    yield from log_evidence.attitudes("ATT", _times(rows["ATT"]), np.array(turned).reshape(-1, 4), missing)
+
+
+def _times(rows: list[Any]) -> NDArray[np.int64]:
+    """Times since boot (µs); those of damaged messages as -1."""
+    return np.array([row.TimeUS if 0 <= row.TimeUS < 2**62 else -1 for row in rows], dtype=np.int64)
 
 
 def _column(rows: list[Any], name: str) -> Floats:
-    return np.array([getattr(row, name) for row in rows], dtype=np.float64)
+    """Values, NaN where the log has no such column."""
+    return np.array([getattr(row, name, np.nan) for row in rows], dtype=np.float64)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,7 @@ from dappled.decode.array_types import Floats
 from dappled.decode.geometry import Quaternion, Vector3
 from dappled.drivers.mavlink.links import MavlinkMessage, mavlink, pack
 from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 
 FIX_3D = 3
 _UNKNOWN_16 = 2**16 - 1
@@ -20,9 +22,6 @@ _AGREEING = 0.75  # share of a receiver's messages that must give one time
 _DRIFT = 1e-4  # of an autopilot's clock, at most
 
 Timed = tuple[int, MavlinkMessage]  # µs since boot
-CUT_SHORT = (
-    "it ends within a message: the copy is cut short, or the autopilot lost power, and what came after is missing"
-)
 
 
 class AutopilotLogError(DappledError):
@@ -105,6 +104,14 @@ def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> Log
     since = np.maximum.accumulate(values + rising) - rising
     until = np.maximum.accumulate((values - rising)[::-1])[::-1] + rising
     return LogClock(times, np.maximum(since, until) + begins)
+
+
+def tell(path: Path, found: Iterable[Finding], report: Callable[[Finding], object], *, cut: bool) -> None:
+    """Report what was found in a log, and whether it was cut short."""
+    for one in found:
+        report(one)
+    if cut:
+        report(finding(Code.LOG_CUT_SHORT, Subject("log", str(path))))
 
 
 def packets(messages: Iterable[Timed], clock: LogClock) -> Iterator[tuple[int, int, bytes]]:

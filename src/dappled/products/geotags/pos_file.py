@@ -16,7 +16,7 @@ import numpy as np
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_bytes
 from dappled.decode.geometry import Symmetric, camera_pose
-from dappled.drivers.gnss.gps_time import GPS_EPOCH, gps_to_utc
+from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
 from dappled.errors import DappledError
 from dappled.flight import disk_error
 

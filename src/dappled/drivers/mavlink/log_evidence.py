@@ -1,0 +1,241 @@
+"""Choose what counts in an autopilot's own log: which samples, which receiver, which UTC; one rule for all kinds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.clock import TimeOfDayClock
+from dappled.decode.array_types import Floats
+from dappled.drivers.mavlink import log_packets
+from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
+from dappled.drivers.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
+from dappled.findings import Code, Finding, Subject, finding
+
+BOOT_MAX_US = 2**32 * 1000  # MAVLink's milliseconds since boot
+HIGHEST_M = 100_000.0
+FASTEST_M_S = 300.0
+_HIGHEST_DOP = 600.0
+_EXTRAPOLATED = 8  # of PX4; MAVLink's 8 is another
+_GAP_US = 1_000_000  # a velocity further away is not that of a position
+_MOST_M_S2, _STEP_M_S = 200.0, 5.0
+_STEP_M = 50.0
+_METRES_PER_DEG = 111_320.0
+_DAY_US = 86400 * 10**6
+Chosen = NDArray[np.bool_]
+
+
+@dataclass(slots=True)
+class Missing:
+    """How many values of each message are no numbers, or can't be true: they count as missing at their time."""
+
+    of: dict[str, int] = field(default_factory=dict)
+
+    def count(self, message: str, good: Chosen) -> Chosen:
+        """Count the others, and give back the same."""
+        if bad := int((~good).sum()):
+            self.of[message] = self.of.get(message, 0) + bad
+        return good
+
+    def findings(self, path: Path) -> Iterator[Finding]:
+        """What is to be said of it."""
+        if self.of:
+            each = ", ".join(f"{count} of {name}" for name, count in self.of.items())
+            yield finding(Code.LOG_VALUES_MISSING, Subject("log", str(path)), values=each)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoggedPlaces:
+    """Estimated places (n,): µs since boot, degrees, metres above mean sea level and above home."""
+
+    message: str
+    boots_us: NDArray[np.int64]
+    lat: Floats
+    lon: Floats
+    alt: Floats
+    above: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Receiver:
+    """What one satellite receiver said (n,). `number` counts from 1; `utc_us` is 0 where it told none; `accuracy`
+    (3, n): horizontal, vertical (m), speed (m/s), NaN where unknown; `used`: where the autopilot used it, None where
+    the log doesn't say. `later_us`: what 1024 weeks add, less the leap seconds since."""
+
+    number: int
+    boots_us: NDArray[np.int64]
+    utc_us: NDArray[np.int64]
+    fix_type: NDArray[np.int64]
+    lat: Floats
+    lon: Floats
+    alt: Floats
+    satellites: Floats
+    hdop: Floats
+    vdop: Floats
+    accuracy: Floats
+    used: Chosen | None = None
+    later_us: int = ROLLOVER_NS // 1000
+
+    @property
+    def fixed(self) -> Chosen:
+        """Where it had a fix."""
+        known = (self.fix_type >= FIX_3D) & (self.fix_type < _EXTRAPOLATED)
+        return known & in_time(self.boots_us) & placed(self.lat, self.lon, self.alt)
+
+    def fixes(self, which: Chosen) -> Iterator[ReceiverFix]:
+        """Its messages, as far as they can be told."""
+        here = placed(self.lat, self.lon, self.alt)
+        for n in np.flatnonzero(which & in_time(self.boots_us)):
+            accuracy = tuple(self.accuracy[:, n].tolist())
+            hdop, vdop = float(self.hdop[n]), float(self.vdop[n])
+            fix = int(self.fix_type[n])
+            yield ReceiverFix(
+                int(self.boots_us[n]),
+                fix if here[n] and 0 <= fix < _EXTRAPOLATED else 0,
+                float(self.lat[n]) if here[n] else 0.0,
+                float(self.lon[n]) if here[n] else 0.0,
+                float(self.alt[n]) if here[n] else 0.0,
+                min(254, max(0, int(self.satellites[n]))) if math.isfinite(self.satellites[n]) else 255,
+                hdop if 0 <= hdop < _HIGHEST_DOP else 0.0,
+                vdop if 0 < vdop < _HIGHEST_DOP else None,
+                accuracy if all(0 <= one < HIGHEST_M for one in accuracy) else None,
+            )
+
+    def _rank(self) -> tuple[float, float, float, int]:
+        fixed = self.fixed
+        if not fixed.any():
+            return 0.0, 0.0, 0.0, -self.number
+        kind, satellites = float(np.median(self.fix_type[fixed])), float(np.nanmedian(self.satellites[fixed]))
+        return round(float(fixed.mean()), 1), kind, satellites, -self.number
+
+
+def in_time(boots_us: Any) -> Chosen:
+    """Which times since boot MAVLink can say (n,)."""
+    return np.asarray((boots_us >= 0) & (boots_us < BOOT_MAX_US))
+
+
+def placed(lat: Floats, lon: Floats, alt: Floats) -> Chosen:
+    """Which places are on the globe, and within 100 km of the sea's level (n,)."""
+    return np.asarray((np.abs(lat) <= 90) & (np.abs(lon) <= 180) & (np.abs(alt) < HIGHEST_M))
+
+
+def _spikes(times_us: NDArray[np.int64], values: Floats, per_s: float, floor: float) -> Chosen:
+    """Which of the values (k, n) leave both neighbours by more than `per_s` explains, while these agree (n,)."""
+    found = np.zeros(len(times_us), dtype=bool)
+    if len(times_us) > 2:
+        before, after = np.diff(times_us)[:-1] / 1e6, np.diff(times_us)[1:] / 1e6
+        steps = np.linalg.norm(np.diff(values, axis=1), axis=0)
+        across = np.linalg.norm(values[:, 2:] - values[:, :-2], axis=0)
+        found[1:-1] = (
+            (steps[:-1] > floor + per_s * before)
+            & (steps[1:] > floor + per_s * after)
+            & (across <= floor + per_s * (before + after))
+        )
+    return found
+
+
+def positions(
+    places: LoggedPlaces, message: str, times_us: NDArray[np.int64], velocities: Floats, missing: Missing
+) -> Iterator[Timed]:
+    """The positions with the velocities (3, m; north, east, down, m/s) of `message` that were measured nearby."""
+    good = missing.count(message, in_time(times_us) & (np.abs(velocities) < FASTEST_M_S).all(axis=0))
+    order = np.argsort(times_us[good], kind="stable")
+    times_us, velocities = times_us[good][order], velocities[:, good][:, order]
+    sound = missing.count(message, ~_spikes(times_us, velocities, _MOST_M_S2, _STEP_M_S))
+    times_us, velocities = times_us[sound], velocities[:, sound]
+    at = places.boots_us
+    here = placed(places.lat, places.lon, places.alt) & (np.abs(places.above) < HIGHEST_M)
+    rows = np.flatnonzero(missing.count(places.message, in_time(at) & here))
+    rows = rows[np.argsort(at[rows], kind="stable")]
+    metres = np.stack([places.lat * _METRES_PER_DEG, places.lon * _METRES_PER_DEG, places.alt])[:, rows]
+    metres[1] *= np.cos(np.radians(places.lat[rows]))
+    rows = rows[missing.count(places.message, ~_spikes(at[rows], metres, FASTEST_M_S, _STEP_M))]
+    if not times_us.size:
+        return
+    after = np.clip(np.searchsorted(times_us, at[rows]), 0, len(times_us) - 1)
+    away = np.minimum(np.abs(times_us[after] - at[rows]), np.abs(times_us[np.maximum(after - 1, 0)] - at[rows]))
+    for n in rows[away <= _GAP_US]:
+        north, east, down = (float(np.interp(at[n], times_us, speed)) for speed in velocities)
+        place = float(places.lat[n]), float(places.lon[n]), float(places.alt[n])
+        yield log_packets.position(int(at[n]), place, float(places.above[n]), (north, east, down))
+
+
+def attitudes(message: str, boots_us: NDArray[np.int64], turned: Floats, missing: Missing) -> Iterator[Timed]:
+    """The attitudes of quaternions (n, 4)."""
+    length = np.linalg.norm(turned, axis=1)
+    for n in np.flatnonzero(missing.count(message, in_time(boots_us) & (length > 0.5) & (length < 2.0))):
+        w, x, y, z = turned[n].tolist()
+        yield log_packets.attitude(int(boots_us[n]), (w, x, y, z))
+
+
+def chosen(path: Path, receivers: Sequence[Receiver]) -> tuple[list[tuple[Receiver, Chosen]], list[Finding]]:
+    """The messages that count: of whichever receiver the autopilot used at the time, where the log says so and these
+    had a fix for half of the time or more; else of the receiver that had the best fix."""
+    best = max(receivers, key=Receiver._rank, default=None)
+    if best is None:
+        return [], []
+    subject = Subject("log", str(path))
+    using = [(one, one.used) for one in receivers if one.used is not None and one.used.any()]
+    if using:
+        fixed = sum(int((one.fixed & which).sum()) for one, which in using)
+        if 2 * fixed >= sum(int(which.sum()) for _, which in using):
+            most, _ = max(using, key=lambda pair: int(pair[1].sum()))
+            told = [finding(Code.LOG_RECEIVER_USED, subject, receiver=most.number, receivers=len(receivers))]
+            return using, told if most.number > 1 else []
+    share = 100.0 * float(best.fixed.mean()) if len(best.boots_us) else 0.0
+    told = [finding(Code.LOG_RECEIVER_BETTER, subject, receiver=best.number, fix_percent=share)]
+    return [(best, np.ones(len(best.boots_us), dtype=bool))], told if best.number > 1 else []
+
+
+def utc_clock(
+    path: Path, ranked: Sequence[tuple[Receiver, Chosen]], others: Sequence[Receiver], bounds: UtcBounds | None
+) -> tuple[LogClock, list[Finding]]:
+    """The autopilot's clock by the receiver that counts; by another one where that one told no UTC that can be true.
+    Raises AutopilotLogError without any."""
+    bounds = bounds or UtcBounds.of_log(TimeOfDayClock().utc_ns())
+    doubted: tuple[LogClock, list[Finding]] | None = None
+    any_fix = False
+    of_others = [[(one, np.ones(len(one.boots_us), dtype=bool))] for one in others]
+    for group in (ranked, *of_others):
+        rows = [(one, which & one.fixed) for one, which in group]
+        any_fix = any_fix or any(bool(which.any()) for _, which in rows)
+        if not rows:
+            continue
+        boots_us = np.concatenate([one.boots_us[which] for one, which in rows])
+        utc_us = np.concatenate([one.utc_us[which] for one, which in rows])
+        later_us = np.concatenate([np.full(int(which.sum()), one.later_us) for one, which in rows])
+        dates = _dates(utc_us, bounds)
+        for wanted in (Date.TRUE, Date.MENDED, Date.ROLLED_OVER):
+            these = dates == wanted.value
+            if not these.any() or (wanted is Date.ROLLED_OVER and doubted is not None):
+                continue
+            true_us = utc_us + (later_us if wanted is Date.MENDED else 0)
+            try:
+                clock = log_packets.log_clock(boots_us[these], (true_us - boots_us)[these])
+            except AutopilotLogError as error:
+                raise AutopilotLogError(f"{path}: {error}") from None
+            first_ns = int(np.median(utc_us[these])) * 1000
+            told = rolled_over(Subject("log", str(path)), first_ns, mended=wanted is Date.MENDED)
+            if wanted is not Date.ROLLED_OVER:
+                return clock, [] if wanted is Date.TRUE else [told]
+            doubted = clock, [told]
+    if doubted is not None:
+        return doubted
+    if any_fix:
+        raise AutopilotLogError(
+            f"{path} holds fixes of a satellite receiver, but no date that can be true: its time in UTC is not known"
+        )
+    raise AutopilotLogError(f"{path} holds no fix of a satellite receiver: its time in UTC is not known")
+
+
+def _dates(utc_us: NDArray[np.int64], bounds: UtcBounds) -> NDArray[np.int64]:
+    """What is to be thought of each date (n,), as values of Date, by its day."""
+    days, place = np.unique(utc_us // _DAY_US, return_inverse=True)
+    judged = [bounds.judge((int(day) * _DAY_US + _DAY_US // 2) * 1000) if day > 0 else Date.IMPOSSIBLE for day in days]
+    return np.array([one.value for one in judged], dtype=np.int64)[place.reshape(-1)]

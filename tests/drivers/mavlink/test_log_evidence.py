@@ -1,0 +1,244 @@
+"""What counts in an autopilot's own log: samples, receivers, cores and dates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from dappled.cli import main
+from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
+from dappled.drivers.mavlink import dataflash, ulog
+from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds
+from dappled.findings import Code, Finding, Level, text
+from tests.drivers.mavlink.true_logs import UTC_US, Row, poses, rewritten, same_fix, ulog_written, written
+
+NAN, POSITION = math.nan, 33
+Change = Callable[[str, Row], Iterable[tuple[str, Row]]]
+NOW_NS = UTC_US * 1000 + 3600 * 10**9
+
+
+def found_in(log: Path, bounds: UtcBounds | None = None) -> list[Finding]:
+    """What is said of a log."""
+    told: list[Finding] = []
+    reader = ulog if log.suffix == ".ulg" else dataflash
+    assert list(reader.packets(log, told.append, bounds or UtcBounds.of_log(NOW_NS)))
+    return told
+
+
+def away_m(here: Pose, there: Pose) -> float:
+    assert here.latitude_rad is not None
+    assert there.latitude_rad is not None
+    assert here.longitude_rad is not None
+    assert there.longitude_rad is not None
+    assert here.altitude_msl_m is not None
+    assert there.altitude_msl_m is not None
+    north, east = metres_per_radian(here.latitude_rad, 220.0)
+    return math.hypot(
+        (here.latitude_rad - there.latitude_rad) * north,
+        (here.longitude_rad - there.longitude_rad) * east,
+        here.altitude_msl_m - there.altitude_msl_m,
+    )
+
+
+def changed(log: Path, name: str, at: int, place: int, value: float) -> Path:
+    """The log with one other value: of the message `name` number `at`."""
+    seen = 0
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        nonlocal seen
+        if kind == name and not (kind == "XKF1" and row[1]):
+            if seen == at:
+                row = (*row[:place], value, *row[place + 1 :])
+            seen += 1
+        return [(kind, row)]
+
+    return rewritten(log, change)
+
+
+@pytest.mark.parametrize("at", [13, 25, 37])  # at the exposures of `poses`, or just before
+@pytest.mark.parametrize(
+    ("name", "place", "value"),
+    [
+        ("XKF1", 2, NAN), ("XKF1", 3, math.inf), ("XKF1", 2, 400.0), ("XKF1", 4, -1e30), ("XKF1", 3, -150.0),
+        ("POS", 3, NAN), ("POS", 4, NAN), ("POS", 1, 950_000_000), ("POS", 2, 0), ("POS", 1, 416_500_000),
+        ("POS", 3, 1e7), ("ATT", 2, NAN), ("ATT", 6, math.inf), ("POS", 0, 2**63 + 5), ("XKF1", 0, 2**64 - 1),
+    ],
+)  # fmt: skip
+def test_one_bad_value_is_missing_at_its_time_and_counted(
+    tmp_path: Path, name: str, place: int, value: float, at: int
+) -> None:
+    log, _ = written(tmp_path)
+    good = poses(log)
+    told = found_in(changed(log, name, at, place, value))
+    assert [(one.code, one.level) for one in told] == [(Code.LOG_VALUES_MISSING, Level.NOTE)]
+    assert text(told[0]).endswith(f"1 of {name}")
+    for here, there in zip(poses(log), good, strict=True):
+        assert here.source == "interpolated"
+        assert away_m(here, there) < 0.1
+        assert here.attitude is not None
+        assert there.attitude is not None
+        assert turn_rad(here.attitude, there.attitude) < 0.02
+
+
+@pytest.mark.parametrize("name", ["POS", "XKF1", "ATT", "GPS", "GPA"])
+def test_no_value_of_a_log_breaks_its_reader(tmp_path: Path, name: str) -> None:
+    """Values of any bits in 3 of 10 messages."""
+    random = np.random.default_rng(5)
+    widths = {"Q": 2**64, "L": 2**31, "e": 2**31, "B": 256, "H": 2**16, "C": 2**16, "c": 2**15, "I": 2**32}
+    form = {"POS": "QLLfff", "XKF1": "QBfff", "ATT": "Qffffff", "GPS": "QBBIHBcLLe", "GPA": "QBCCCC"}[name]
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        if kind != name or random.random() < 0.7:
+            return [(kind, row)]
+        place = int(random.integers(len(row)))
+        code = form[place]
+        value = random.choice([NAN, math.inf, 3e38, -1e10, 0.0]) if code == "f" else int(random.random() * widths[code])
+        return [(kind, (*row[:place], value, *row[place + 1 :]))]
+
+    log = rewritten(written(tmp_path)[0], change)
+    assert any(raw[7] == POSITION for _, _, raw in dataflash.packets(log))
+
+
+def with_receivers(first: tuple[int, ...], second: tuple[int, ...] | None, used: int | None = None) -> Change:
+    """A change of records: receiver 1 says (status, week), and a second one that is fixed says another."""
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        if kind == "GPA":
+            return [(kind, (row[0], 0, 900, 900, 900, 900)), (kind, (row[0], 1, *row[2:]))]
+        if kind != "GPS":
+            return [(kind, row)]
+        flags = ((), ()) if used is None else ((int(used == 0),), (int(used == 1),))
+        rows = [(kind, (row[0], 0, first[0], row[3], first[1], *row[5:], *flags[0]))] if first else []
+        return [*rows, *([(kind, (row[0], 1, *row[2:], *flags[1]))] if second else [])]
+
+    return change
+
+
+@pytest.mark.parametrize("first", [(1, 0), (2, 2445), ()])
+@pytest.mark.parametrize("used", [None, 0, 1])
+def test_the_receiver_that_has_a_fix_counts(tmp_path: Path, first: tuple[int, ...], used: int | None) -> None:
+    log, link = written(tmp_path)
+    rewritten(log, with_receivers(first, (6, 2445), used), "" if used is None else "U")
+    told = found_in(log)
+    assert [one.facts["receiver"] for one in told] == [2]
+    for here, there in zip(poses(log), poses(link), strict=True):
+        assert away_m(here, there) < 0.01
+        assert same_fix(here, there)
+
+
+def test_of_two_receivers_with_a_fix_the_one_in_use_counts(tmp_path: Path) -> None:
+    log, link = written(tmp_path)
+    rewritten(log, with_receivers((6, 2445), (6, 2445), 1), "U")
+    assert [one.code for one in found_in(log)] == [Code.LOG_RECEIVER_USED]
+    assert all(same_fix(here, there) for here, there in zip(poses(log), poses(link), strict=True))
+
+
+@pytest.mark.parametrize("said", [True, False])
+def test_the_core_that_flew_counts(tmp_path: Path, said: bool) -> None:
+    """By XKF4, else by what agrees with the positions: the first core has gone astray."""
+    log, link = written(tmp_path)
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        if kind != "XKF1":
+            return [(kind, row)]
+        return [(kind, (row[0], 1 - row[1], *row[2:])), *([("XKF4", (row[0], 0, 1))] if said else [])]
+
+    told = found_in(rewritten(log, change))
+    assert [(one.code, one.facts["core"]) for one in told] == [(Code.LOG_CORE, 1)]
+    assert all(away_m(here, there) < 0.01 for here, there in zip(poses(log), poses(link), strict=True))
+
+
+def rolled(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+    return [(kind, (*row[:4], row[4] - 1024, *row[5:]) if kind == "GPS" else row)]
+
+
+def test_a_week_that_rolled_over_is_mended_where_another_clock_agrees(tmp_path: Path) -> None:
+    log = rewritten(written(tmp_path)[0], rolled)
+    (doubt,) = found_in(log)
+    assert (doubt.code, doubt.level) == (Code.TIME_WEEK_ROLLOVER, Level.CAUTION)
+    near_ns = UTC_US * 1000 + 13 * 3600 * 10**9  # in another zone
+    bounds = UtcBounds.of_log(NOW_NS, [near_ns])
+    assert [one.code for one in found_in(log, bounds)] == [Code.TIME_WEEK_MENDED]
+    stamps = [stamp_us for _, stamp_us, _ in dataflash.packets(log, bounds=bounds)]
+    assert abs(stamps[0] - UTC_US) < 1000
+    far = UtcBounds.of_log(NOW_NS, [near_ns - 5 * 86400 * 10**9])  # a clock that was never set tells nothing
+    assert [one.code for one in found_in(log, far)] == [Code.TIME_WEEK_ROLLOVER]
+    stamps = [stamp_us for _, stamp_us, _ in dataflash.packets(log, bounds=far)]
+    assert abs(stamps[0] - UTC_US + ROLLOVER_NS // 1000) < 5 * 10**6  # by the leap seconds since
+
+
+def test_a_week_that_rolled_over_costs_replay_its_good_face(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = rewritten(written(tmp_path)[0], rolled)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    Image.new("RGB", (16, 16)).save(frames / "1.jpg")
+    assert main(["replay", str(frames), "--telemetry", str(log)]) == 1
+    assert "1024 weeks later would be 2026-11-21" in capsys.readouterr().err
+    assert main(["replay", str(frames), "--telemetry", str(log), "--anyway"]) == 0
+    exif = Image.Exif()
+    exif[306] = "2026:11:21 05:15:04"
+    Image.new("RGB", (16, 16)).save(frames / "1.jpg", exif=exif)
+    capsys.readouterr()
+    assert main(["replay", str(frames), "--telemetry", str(log), "--json"]) == 0
+    shown = capsys.readouterr()
+    assert '"arrived_utc_ns": 1795256103' in shown.out
+    assert "as another clock says" in shown.err
+
+
+def test_the_leap_seconds_are_those_of_the_flight(tmp_path: Path) -> None:
+    """16 in May 2015, 17 a year later."""
+
+    def in_week(week: int) -> int:
+        def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+            return [(kind, (*row[:4], week, *row[5:]) if kind == "GPS" else row)]
+
+        packets = dataflash.packets(rewritten(written(tmp_path)[0], change))
+        return next(stamp_us for _, stamp_us, _ in packets) // 10**6
+
+    assert (in_week(1894) - in_week(1844)) % (7 * 86400) == 7 * 86400 - 1
+
+
+@pytest.mark.parametrize("how", ["blended", "unix"])
+def test_px4_logs_whose_utc_or_stamps_stand_elsewhere_give_the_same_poses(tmp_path: Path, how: str) -> None:
+    pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+    plain = poses(ulog_written(tmp_path))
+    log = ulog_written(tmp_path, blended=how == "blended", unix=how == "unix")
+    assert next(iter(ulog.packets(log)))[1] == UTC_US
+    for here, there in zip(poses(log), plain, strict=True):
+        assert away_m(here, there) < 0.01
+        assert same_fix(here, there)
+
+
+REPORTS = {
+    "df-gps1-dead.bin": Code.LOG_RECEIVER_BETTER,
+    "df-gps1-2d.bin": Code.LOG_RECEIVER_BETTER,
+    "df-only-gps-instance1.bin": Code.LOG_RECEIVER_BETTER,
+    "df-week-rollover.bin": Code.TIME_WEEK_ROLLOVER,
+    "df-xkf1-nan-once.bin": Code.LOG_VALUES_MISSING,
+    "df-pos-alt-nan-once.bin": Code.LOG_VALUES_MISSING,
+    "df-xkf1-fast-once.bin": Code.LOG_VALUES_MISSING,
+    "px4-blended-utc0.ulg": None,
+}
+
+
+@pytest.mark.parametrize("name", REPORTS)
+def test_the_logs_of_reports_give_the_poses_of_their_plain_twin(shared_data: Path, name: str) -> None:
+    log = shared_data / "reports" / name
+    mended = UtcBounds.of_log(NOW_NS)
+    assert [one.code for one in found_in(log, mended)] == [code for code in [REPORTS[name]] if code]
+    if name != "df-week-rollover.bin":
+        plain = poses(shared_data / "reports" / "df-plain.bin")
+        assert max(away_m(here, there) for here, there in zip(poses(log), plain, strict=True)) < 0.02
+
+
+def test_a_log_whose_stamps_are_unix_time_gives_positions(shared_data: Path) -> None:
+    pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+    log = shared_data / "telemetry" / "pyulog-sample_px4_events.ulg"
+    assert not [one for one in found_in(log) if one.level > Level.NOTE]
+    stamps = [stamp_us for _, stamp_us, _ in ulog.packets(log)]
+    assert 1_710_773_350 <= stamps[0] // 10**6 <= stamps[-1] // 10**6 <= 1_710_773_382
