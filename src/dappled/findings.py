@@ -40,6 +40,8 @@ class Code(StrEnum):
     FRAME_RIVAL_PICTURE = "frame.rival_picture"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"
     FRAME_UNCONFIRMED = "frame.unconfirmed"
+    LINK_CLOCK_AHEAD = "link.clock_ahead"
+    LINK_CLOCK_BEHIND = "link.clock_behind"
     LINK_SAME_IDS = "link.same_ids"
     LOG_BYTES_SKIPPED = "log.bytes_skipped"
     LOG_CORE = "log.core"

@@ -153,7 +153,8 @@ def _link(facts: Mapping[str, Any]) -> str:
     signed = ""
     if signing is not None:
         signed = f"; signed: {_counts(signing, 'good', 'forged', 'replayed', 'unsigned_taken', 'unsigned_refused')}"
-    return f"{facts['url']}: {_counts(facts, 'in', 'out', 'bad', 'unsent')}{signed}".replace("_", " ")
+    names = ("in", "out", "bad", "unsent", *(["unrecorded"] if facts.get("unrecorded") else []))
+    return f"{facts['url']}: {_counts(facts, *names)}{signed}".replace("_", " ")
 
 
 def _counts(facts: Mapping[str, Any], *names: str) -> str:

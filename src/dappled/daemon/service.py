@@ -14,12 +14,12 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import dappled
+from dappled import findings
 from dappled.clock import Clock, SystemClock
 from dappled.config import settings as configuration
-from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
 from dappled.daemon.body_plan import BodyPlan
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera
@@ -27,6 +27,7 @@ from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
+from dappled.daemon.configured_links import configured_links
 from dappled.daemon.console import process as console_process
 from dappled.daemon.console.live_view import CameraLook
 from dappled.daemon.console.process import Console
@@ -58,7 +59,6 @@ from dappled.daemon.survey_facts import LiveSurvey, distance_trigger
 from dappled.drivers.camera import Camera
 from dappled.drivers.gnss.port import gnss_port
 from dappled.drivers.gnss.recorded import TelemetryNotebook
-from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
@@ -69,7 +69,6 @@ from dappled.flight import recording as flights
 log = logging.getLogger(__name__)
 HEALTH_NS = 10**9
 AGAIN_NS = 10**9
-SIGNING_TIME_FILE = ".mavlink-signing"
 _LOOK_S = 0.02
 _STOP_S = 5.0
 
@@ -122,7 +121,7 @@ class Service:
             private = listener.private if listener else ""
             self._publisher = Publisher.of(settings.publish, private=private, clock=self._clock)
             stack.callback(self._publisher.stop)
-            self._links = _configured_links(settings, self._clock)
+            self._links = configured_links(settings, self._clock)
             self._links.open()
             stack.callback(self._links.stop)
             recipe = self._begin_recording(names, recipe, stack)
@@ -144,6 +143,8 @@ class Service:
         """Begin the flight folder. Returns the recipe with the copies of its files that the flight keeps."""
         settings, clock = self._settings.now, self._clock
         self._utc_known = utc_known(settings.record.utc, clock.utc_ns())
+        if self._utc_known:
+            self._links.clock_known()
         facts = {
             "software": {"dappled": dappled.__version__, **recipes.versions()},
             "settings": configuration.to_tables(settings),
@@ -326,8 +327,13 @@ class Service:
             PeriodicTask("MAVLink"): self._tick,
             PeriodicTask("vehicle"): self._follow_vehicle,
             **tasks,
-            PeriodicTask("UTC", every_ns=HEALTH_NS): self._navigation.look_for_utc,
+            PeriodicTask("UTC", every_ns=HEALTH_NS): self._look_for_utc,
         }
+
+    def _look_for_utc(self) -> None:
+        self._navigation.look_for_utc()
+        if (learnt := self._navigation.utc.learnt) is not None:
+            self._links.clock_known(learnt.correction_ns)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Send heartbeats and health until `ask_to_stop` or `stop` is called, the ground station has set what the next
@@ -379,6 +385,7 @@ class Service:
             navigation.utc.doubt(),
             *navigation.telemetry.doubts(self._clock.utc_ns()),
             self._control.shortage,
+            *map(findings.told, self._links.findings()),
             None if self._gnss is None else self._gnss.problem(),
         )
         return health.record(
@@ -461,29 +468,6 @@ class PeriodicTask:
             self.problem = ""
             self._due_ns = now_ns + self._every_ns
             self._new.among([])
-
-
-def _configured_links(settings: Settings, clock: Clock) -> MavlinkLinks:
-    """All MAVLink links of the settings, not open yet. Raises ConfigError, LinkError, SigningError."""
-    wanted = settings.mavlink
-    return MavlinkLinks(
-        wanted.url,
-        system_id=wanted.system_id,
-        component_id=wanted.component_id,
-        clock=clock,
-        signing=_signing(settings, clock),
-    )
-
-
-def _signing(settings: Settings, clock: Clock) -> Signing | None:
-    keys, links = settings.mavlink.keys, len(settings.mavlink.url)
-    if len(keys) not in (0, 1, links):
-        raise ConfigError(
-            f'[mavlink] keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
-        )
-    files = [Path(key) if key else None for key in settings.mavlink.link_keys]
-    time_file = Path(settings.record.directory) / SIGNING_TIME_FILE
-    return open_signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))
 
 
 def _close(recording: Recording) -> None:

@@ -253,6 +253,7 @@ def _counters(link: LinkStatistics) -> dict[str, Any]:
         "bad": link.packets_bad,
         "unsent": link.packets_unsent,
         "unlogged": link.packets_unlogged,
+        "unrecorded": link.packets_unrecorded,
         "signing": None if link.signing is None else asdict(link.signing),
     }
 

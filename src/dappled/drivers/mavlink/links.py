@@ -14,7 +14,9 @@ from typing import Protocol
 from dappled.clock import Clock
 from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, open_channel, parse
 from dappled.drivers.mavlink.framing import Framed, Framer, MavlinkMessage, PacketParser, is_signed, mavlink, pack
+from dappled.drivers.mavlink.log_budget import LogBudget
 from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningStatistics
+from dappled.findings import Finding
 from dappled.workers import Loop
 
 __all__ = [
@@ -35,6 +37,7 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 _REOPEN_S = 1.0
+_STAMP_BYTES = 8  # before each packet in the telemetry log
 _POLL_S = 0.2
 
 
@@ -58,7 +61,7 @@ class Packet:
 
 
 class PacketLog(Protocol):
-    """What takes every packet, in the thread that received or sent it. Both calls must be quick."""
+    """What takes every packet within the budget, in the thread that received or sent it. Both calls must be quick."""
 
     def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
         """Write a packet to the telemetry log. Returns its number there, None where there is no log."""
@@ -82,6 +85,7 @@ class LinkStatistics:
     """Counters of a link. `error` says why it is down, None when it is up; `signing` is None without a key.
 
     `packets_in` counts what was accepted; packets that signing refused are in `signing` alone, and in no log.
+    `packets_unrecorded` were too many of one sender and message for the telemetry log (`LogBudget`).
     """
 
     url: str
@@ -94,6 +98,7 @@ class LinkStatistics:
     last_heard_monotonic_ns: int | None
     error: str | None
     signing: SigningStatistics | None = None
+    packets_unrecorded: int = 0
 
 
 class Link:
@@ -108,7 +113,8 @@ class Link:
         self.packer = mavlink.MAVLink(None)
         self.heard_1 = self.heard_2 = False
         self.packets_in = self.packets_out = self.packets_bad = 0
-        self.packets_unsent = self.packets_unlogged = self.failures = 0
+        self.packets_unsent = self.packets_unlogged = self.packets_unrecorded = self.failures = 0
+        self.budgets = {sent: LogBudget() for sent in (False, True)}
         self.last_heard_monotonic_ns: int | None = None
 
     def packed(self, message: MavlinkMessage, system_id: int, component_id: int) -> bytes:
@@ -142,6 +148,7 @@ class Link:
             self.last_heard_monotonic_ns,
             self.error,
             self.guard.statistics() if self.guard else None,
+            self.packets_unrecorded,
         )
 
 
@@ -177,16 +184,21 @@ class PacketSender:
         return taken
 
     def logged(self, link: Link, stamp_us: int, framed: Framed, *, sent: bool = False, trusted: bool = True) -> Packet:
-        """Log a packet, and return it with its number. Under the order lock, after `start`."""
-        packet_log, number = self._log, None
+        """Log a packet, and return it with its number; one beyond the log's budget is only counted. Under the order
+        lock, after `start`."""
+        packet_log, number, message = self._log, None, framed.message
         assert packet_log is not None, "packets come and go after `start`"
+        source, size = (message.get_srcSystem(), message.get_srcComponent()), _STAMP_BYTES + len(framed.raw)
+        if not link.budgets[sent].takes(source, message.get_msgId(), size, self._clock.monotonic_ns()):
+            link.packets_unrecorded += 1
+            return Packet(None, stamp_us, link.number, message, framed.raw, sent, trusted)
         try:
             number = packet_log.log_packet(stamp_us, framed.raw)
         except Exception:  # a full disk must not stop the commands of a flying machine
             if link.packets_unlogged == 0:
                 log.exception("A MAVLink packet could not be written to the telemetry log")
             link.packets_unlogged += 1
-        packet = Packet(number, stamp_us, link.number, framed.message, framed.raw, sent, trusted)
+        packet = Packet(number, stamp_us, link.number, message, framed.raw, sent, trusted)
         self.hand(link, packet, packet_log)
         return packet
 
@@ -286,6 +298,15 @@ class MavlinkLinks:
         channel = self._links[link].channel
         return channel.port() if channel else 0
 
+    def clock_known(self, correction_ns: int = 0) -> None:
+        """This machine's clock is right, or so much behind UTC, from now on: signed packets don't move the time."""
+        if self._signing_time is not None:
+            self._signing_time.clock_known(correction_ns)
+
+    def findings(self) -> list[Finding]:
+        """Whose signed packets show a wrong clock."""
+        return [] if self._signing_time is None else self._signing_time.findings()
+
     def statistics(self) -> tuple[LinkStatistics, ...]:
         """Counters of every link, in the order of the urls."""
         return tuple(link.statistics() for link in self._links)
@@ -352,7 +373,7 @@ class MavlinkLinks:
     ) -> None:
         with self._order:
             message = framed.message
-            trusted = True
+            trusted, trust = True, "obey"
             if link.guard is not None:
                 source = (message.get_srcSystem(), message.get_srcComponent())
                 trust = link.guard.judge(framed.raw, *source, message.get_msgId())
@@ -360,9 +381,12 @@ class MavlinkLinks:
                     if channel.datagrams and is_signed(framed.raw):
                         channel.shown("old")  # `sift` let it pass: its signature is right
                     return
-                trusted = trust == "obey"
-            if trusted:
-                channel.shown("signed" if link.guard is not None and is_signed(framed.raw) else "sound")
+                trusted = trust != "hear"
+            signed = link.guard is not None and is_signed(framed.raw)
+            if trust == "copy":
+                channel.shown("old")  # another link brought it first: this proves nobody here
+            elif trusted:
+                channel.shown("signed" if signed else "sound")
             link.packets_in += 1
             link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1

@@ -1,9 +1,7 @@
 """Sign and verify MAVLink 2 packets: key files, replay protection, and a signing time that never goes back.
 
 A signature is the first 6 bytes of SHA-256 over key, packet, link id and a timestamp in units of 10 µs since 2015. A
-packet is accepted once: its timestamp must be later than the last one of its stream (system, component, link id). In a
-stream that is heard for the first time it may be at most a minute older than the latest accepted one. Only accepted
-packets advance the time.
+packet is accepted once (`signature_book`). Only accepted packets advance the time.
 """
 
 from __future__ import annotations
@@ -13,25 +11,47 @@ import hmac
 import logging
 import secrets
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple, TypeAlias
 
 from dappled import durable, key_files
 from dappled.clock import Clock
 from dappled.drivers.mavlink.framing import SIGNATURE_BYTES, is_signed, mavlink, message_of, packet_length
+from dappled.drivers.mavlink.log_budget import Rate
+from dappled.drivers.mavlink.signature_book import NEW_STREAM_UNITS, UNITS_PER_S, SignatureBook, Stream
 from dappled.errors import DappledError
+from dappled.findings import Finding
+
+__all__ = [
+    "AHEAD_UNITS",
+    "EPOCH_UNIX_S",
+    "UNITS_PER_S",
+    "SignatureGuard",
+    "Signing",
+    "SigningError",
+    "SigningStatistics",
+    "SigningTime",
+    "Trust",
+    "Unsigned",
+    "make_key",
+    "open_signing",
+    "read_key",
+    "timestamp_of",
+]
 
 log = logging.getLogger(__name__)
 Unsigned = Literal["refuse", "listen", "allow"]
-Trust = Literal["obey", "hear", "refuse"]
+Streams: TypeAlias = dict[str, dict[Stream, int]]  # by the name of the key
+Trust = Literal["obey", "copy", "hear", "refuse"]
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01
-UNITS_PER_S = 100_000
-NEW_STREAM_UNITS = 60 * UNITS_PER_S
+NS_A_UNIT = 10_000
 AHEAD_UNITS = 10 * UNITS_PER_S
-_STREAMS = 256
+MOST_AHEAD_UNITS = 86_400 * UNITS_PER_S
 _KEEP_S = 1.0
+_RADIO_A_S = 5
+_RADIO_SIFTED_A_S = 20  # before their checksum is known
 _LATEST = 2**48 - 1
 
 
@@ -72,12 +92,15 @@ def read_key(path: Path) -> bytes:
 
 
 class SigningTime:
-    """The signing times of all links of this machine, kept over restarts.
+    """The signing times of all links of this machine, kept over restarts, and a `SignatureBook` for each key.
 
-    The file holds two times: one later than every time signed with, and one later than every time accepted. So no
-    packet from before a restart is accepted after it. After a crash they are up to 10 s ahead, and genuine packets are
-    refused for as long; after an orderly end they are exact. `keep` may wait for the disk; all other calls answer from
-    memory.
+    The file holds a time later than every time signed with, one later than every time accepted, and those of each
+    stream. So no packet from before a restart is accepted after it. After a crash they are up to 10 s ahead, and
+    genuine packets are refused for as long; after an orderly end they are exact. `keep` may wait for the disk; all
+    other calls answer from memory.
+
+    While this machine doesn't know the time, the latest time accepted stands for it. Once it does (`clock_known`), no
+    sender moves what is asked of the others, and it signs at most a day ahead of it.
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
@@ -85,19 +108,46 @@ class SigningTime:
         self._path = path
         self._clock = clock
         self._lock = threading.Lock()
-        self._used, self._accepted = self._kept = self._stored()
-        self._floor = self._accepted
+        self._correction: int | None = None
+        self._used, self._accepted, self._before = self._kept = self._stored()
+        self._books: dict[str, SignatureBook] = {}
+        self._floor, self._started = self._accepted, self._now()
         self.keep()
+
+    def book(self, key: bytes) -> SignatureBook:
+        """The book of a key."""
+        name = hashlib.sha256(b"book of " + key).hexdigest()[:16]
+        if name not in self._books:
+            self._books[name] = SignatureBook(self._before.get(name, {}))
+        return self._books[name]
+
+    def clock_known(self, correction_ns: int) -> None:
+        """This machine's clock is right, or so much behind UTC, from now on."""
+        self._correction = correction_ns // NS_A_UNIT
+
+    def monotonic_ns(self) -> int:
+        """The time of arrivals."""
+        return self._clock.monotonic_ns()
 
     def oldest(self) -> int:
         """Return the time that a stream heard for the first time must be later than."""
         with self._lock:
+            if self._correction is not None:
+                return max(min(self._floor, self._started + self._correction), self._now() - NEW_STREAM_UNITS)
             return max(self._floor, max(self._used, self._accepted, self._now()) - NEW_STREAM_UNITS)
+
+    def ahead(self, timestamp: int) -> int:
+        """See SignedTimes."""
+        ahead = timestamp - self._now()
+        return ahead if self._correction is not None and ahead > NEW_STREAM_UNITS else 0
 
     def next(self) -> int:
         """Return a timestamp to sign with, later than every one before."""
         with self._lock:
-            self._used = min(_LATEST, max(self._used + 1, self._accepted, self._now()))
+            now, heard = self._now(), self._accepted
+            if self._correction is not None:
+                heard = min(heard, now + MOST_AHEAD_UNITS)
+            self._used = min(_LATEST, max(self._used + 1, heard, now))
             return self._used
 
     def accepted(self, timestamp: int) -> None:
@@ -108,18 +158,18 @@ class SigningTime:
     def keep(self, *, ending: bool = False) -> None:
         """Write the times to the file, 10 s ahead; exactly where `ending`. Raises SigningError."""
         with self._lock:
-            times = (self._used, self._accepted)
+            now = _Times(self._used, self._accepted, self._heard_streams())
         margin = 0 if ending else AHEAD_UNITS
-        if not ending and all(now + margin // 2 <= kept for now, kept in zip(times, self._kept, strict=True)):
+        if not ending and now.within(self._kept, margin // 2):
             return
-        used, accepted = (min(_LATEST, each + margin) for each in times)
+        kept = now.later(margin).over(self._before)
         try:
-            durable.write_file(self._path, f"{used} {accepted}\n".encode(), 0o600)
+            durable.write_file(self._path, kept.text().encode(), 0o600)
         except OSError as error:
             raise SigningError(
                 f"cannot keep the signing times in {self._path}: {error.strerror or error}; check its folder"
             ) from error
-        self._kept = (used, accepted)
+        self._kept = kept
 
     def run(self, stop: threading.Event) -> None:
         """Keep the times until `stop` is set, and then exactly. A file that can't be written is logged once."""
@@ -136,20 +186,86 @@ class SigningTime:
             if ending:
                 return
 
-    def _now(self) -> int:
-        return max(0, self._clock.utc_ns() // 10_000 - EPOCH_UNIX_S * UNITS_PER_S)
+    def findings(self) -> list[Finding]:
+        """Whose clock is wrong, by the books."""
+        return [one for book in self._books.values() for one in book.findings()]
 
-    def _stored(self) -> tuple[int, int]:
+    def _heard_streams(self) -> Streams:
+        """The streams of which something was accepted since the start, by key."""
+        found: Streams = {}
+        for name, book in list(self._books.items()):
+            before = self._before.get(name, {})
+            found[name] = {one: at for one, at in book.streams().items() if at != before.get(one)}
+        return found
+
+    def _now(self) -> int:
+        utc = self._clock.utc_ns() // NS_A_UNIT + (self._correction or 0)
+        return max(0, utc - EPOCH_UNIX_S * UNITS_PER_S)
+
+    def _stored(self) -> _Times:
         try:
-            used, accepted = (int(word) for word in self._path.read_text("ascii").split())
+            return _Times.of(self._path.read_text("ascii"))
         except FileNotFoundError:
-            return 0, 0
+            return _Times(0, 0, {})
         except (OSError, ValueError) as error:
             raise SigningError(
                 f"cannot read the signing times in {self._path} ({error}): old packets could be sent again; change the "
                 "keys and remove the file"
             ) from error
-        return min(max(used, 0), _LATEST), min(max(accepted, 0), _LATEST)
+
+
+class _Times(NamedTuple):
+    """What the file holds. Its first line has the time signed with and the time accepted; each further one a key's
+    name, system, component and link id of a stream, and its time."""
+
+    used: int
+    accepted: int
+    streams: Streams
+
+    @classmethod
+    def of(cls, text: str) -> _Times:
+        """The times in a file's text. Raises ValueError."""
+        first, *rest = text.splitlines() or [""]
+        used, accepted = (int(word) for word in first.split())
+        streams: Streams = {}
+        for line in rest:
+            name, *numbers = line.split()
+            system, component, link, last = (int(word) for word in numbers)
+            streams.setdefault(name, {})[system, component, link] = _bounded(last)
+        return cls(_bounded(used), _bounded(accepted), streams)
+
+    def text(self) -> str:
+        """The file's text."""
+        rows = [f"{name} {s} {c} {link} {at}" for name, (s, c, link), at in self._rows()]
+        return "\n".join([f"{self.used} {self.accepted}", *rows, ""])
+
+    def later(self, margin: int) -> _Times:
+        """All times so much later."""
+        moved: Streams = {name: {} for name in self.streams}
+        for name, one, at in self._rows():
+            moved[name][one] = _bounded(at + margin)
+        return _Times(_bounded(self.used + margin), _bounded(self.accepted + margin), moved)
+
+    def over(self, before: Streams) -> _Times:
+        """The same, with the streams from before that were not heard since."""
+        names = before.keys() | self.streams.keys()
+        return self._replace(
+            streams={name: {**before.get(name, {}), **self.streams.get(name, {})} for name in sorted(names)}
+        )
+
+    def within(self, kept: _Times, margin: int) -> bool:
+        """Whether all of these, and so much later, are covered by what is `kept`."""
+        covered = self.used + margin <= kept.used and self.accepted + margin <= kept.accepted
+        return covered and all(at + margin <= kept.streams.get(name, {}).get(one, 0) for name, one, at in self._rows())
+
+    def _rows(self) -> Iterator[tuple[str, Stream, int]]:
+        for name, each in self.streams.items():
+            for one, at in each.items():
+                yield name, one, at
+
+
+def _bounded(time: int) -> int:
+    return min(max(time, 0), _LATEST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +277,7 @@ class SigningStatistics:
     replayed: int
     unsigned_taken: int
     unsigned_refused: int
+    copies: int = 0
 
     @property
     def refused(self) -> int:
@@ -180,35 +297,33 @@ class SignatureGuard:
     """Signing on one link: signs what is sent, verifies what is received. Used under the link's lock.
 
     `unsigned` says whether packets without a signature are refused, heard but not obeyed ("listen"), or accepted
-    ("allow"). RADIO_STATUS, which radios insert themselves, is always heard.
+    ("allow"). RADIO_STATUS, which radios insert themselves, is heard in any case, five a second.
     """
 
     def __init__(self, key: bytes, link_id: int, time: SigningTime, unsigned: Unsigned = "refuse") -> None:
         self._key = key
         self._link_id = link_id
-        self._time = time
+        self._time, self._book = time, time.book(key)
         self._unsigned = unsigned
-        self._streams: dict[tuple[int, int, int], int] = {}
-        self._good = self._forged = self._replayed = self._taken = self._refused = 0
+        self._radio, self._radio_sifted = Rate(_RADIO_A_S), Rate(_RADIO_SIFTED_A_S)
+        self._good = self._forged = self._replayed = self._copies = self._taken = self._refused = 0
 
     def judge(self, raw: bytes, system: int, component: int, message_id: int) -> Trust:
-        """Return whether to obey a sound packet, only hear it, or refuse it."""
+        """Return whether to obey a sound packet (a copy: as one that came over another link), only hear it, or refuse
+        it."""
         if not is_signed(raw):
             return self._judge_unsigned(message_id)
         if not self._rightly_signed(raw):
             self._forged += 1
             return "refuse"
-        timestamp = timestamp_of(raw)
         stream = (system, component, raw[-SIGNATURE_BYTES])
-        last = self._streams.get(stream)
-        if timestamp <= (self._time.oldest() if last is None else last):
+        verdict = self._book.judge(self._time, stream, timestamp_of(raw), raw[-6:], self._link_id)
+        if verdict == "old":
             self._replayed += 1
             return "refuse"
-        self._streams.pop(stream, None)
-        self._streams[stream] = timestamp
-        if len(self._streams) > _STREAMS:
-            self._streams.pop(next(iter(self._streams)))
-        self._time.accepted(timestamp)
+        if verdict == "copy":
+            self._copies += 1
+            return "copy"
         self._good += 1
         return "obey"
 
@@ -230,7 +345,7 @@ class SignatureGuard:
                     kept.append(raw)
                 else:
                     self._forged += 1
-            elif self._unsigned != "refuse" or message_of(raw) == mavlink.MAVLINK_MSG_ID_RADIO_STATUS:
+            elif self._unsigned != "refuse" or self._is_radio(message_of(raw), self._radio_sifted):
                 kept.append(raw)
             else:
                 self._refused += 1
@@ -244,14 +359,20 @@ class SignatureGuard:
 
     def statistics(self) -> SigningStatistics:
         """Counters."""
-        return SigningStatistics(self._good, self._forged, self._replayed, self._taken, self._refused)
+        return SigningStatistics(
+            self._good, self._forged, self._replayed, self._taken, self._refused, copies=self._copies
+        )
 
     def _judge_unsigned(self, message_id: int) -> Trust:
-        if self._unsigned == "refuse" and message_id != mavlink.MAVLINK_MSG_ID_RADIO_STATUS:
+        if self._unsigned == "refuse" and not self._is_radio(message_id, self._radio):
             self._refused += 1
             return "refuse"
         self._taken += 1
         return "obey" if self._unsigned == "allow" else "hear"
+
+    def _is_radio(self, message_id: int, rate: Rate) -> bool:
+        """Whether it is a radio's own report, of which few are heard: anybody may say that he is the radio."""
+        return message_id == mavlink.MAVLINK_MSG_ID_RADIO_STATUS and rate.takes(1, self._time.monotonic_ns())
 
     def _rightly_signed(self, raw: bytes) -> bool:
         return hmac.compare_digest(hashlib.sha256(self._key + raw[:-6]).digest()[:6], raw[-6:])

@@ -1,0 +1,36 @@
+"""Make the MAVLink links that the settings name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+
+from dappled.clock import Clock
+from dappled.config.schema import ConfigError
+from dappled.config.settings import Settings
+from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
+
+SIGNING_TIME_FILE = ".mavlink-signing"
+
+
+def configured_links(settings: Settings, clock: Clock) -> MavlinkLinks:
+    """All MAVLink links of the settings, not open yet. Raises ConfigError, LinkError, SigningError."""
+    wanted = settings.mavlink
+    return MavlinkLinks(
+        wanted.url,
+        system_id=wanted.system_id,
+        component_id=wanted.component_id,
+        clock=clock,
+        signing=_signing(settings, clock),
+    )
+
+
+def _signing(settings: Settings, clock: Clock) -> Signing | None:
+    keys, links = settings.mavlink.keys, len(settings.mavlink.url)
+    if len(keys) not in (0, 1, links):
+        raise ConfigError(
+            f'[mavlink] keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
+        )
+    files = [Path(key) if key else None for key in settings.mavlink.link_keys]
+    time_file = Path(settings.record.directory) / SIGNING_TIME_FILE
+    return open_signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))
