@@ -49,6 +49,7 @@ class Code(StrEnum):
     LOG_RECEIVER_BETTER = "log.receiver_better"
     LOG_RECEIVER_USED = "log.receiver_used"
     LOG_VALUES_MISSING = "log.values_missing"
+    LOG_VEHICLE = "log.vehicle"
     PICTURE_NAMES_DISAGREE = "picture.names_disagree"
     PICTURE_ON_CARD = "picture.on_card"
     PICTURE_RIVAL_SHOTS = "picture.rival_shots"

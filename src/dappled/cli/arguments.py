@@ -22,6 +22,13 @@ def whole(text: str) -> int:
     return int(text)
 
 
+def system_id(text: str) -> int:
+    """Parse a MAVLink system id."""
+    if not (text.isdecimal() and 1 <= int(text) <= 255):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a system id from 1 to 255")
+    return int(text)
+
+
 def seconds(text: str) -> float:
     """Parse a time of 0 s or more."""
     number = _number(text)

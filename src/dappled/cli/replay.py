@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli import sealing
-from dappled.cli.arguments import positive, seconds
+from dappled.cli.arguments import positive, seconds, system_id
 from dappled.cli.terminal import frame_json, frame_line
 from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
@@ -30,7 +30,7 @@ from dappled.findings import Finding, Level, told, worst
 from dappled.flight import LIVE, layout
 from dappled.flight.checks import flight_check
 
-_OF_FOLDERS = ("telemetry", "match", "start", "interval")
+_OF_FOLDERS = ("telemetry", "vehicle", "match", "start", "interval")
 _GIVEN = ("camera", "mask", "white", "dark", "calibration")
 
 
@@ -66,6 +66,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="telemetry for a folder of frames: a .tlog, or the autopilot's own log (ArduPilot's .bin, PX4's .ulg)\n"
         "(default: the only one in it)",
+    )
+    parser.add_argument(
+        "--vehicle",
+        type=system_id,
+        metavar="SYSID",
+        help="system id of the vehicle that carried the camera, where a .tlog holds several",
     )
     parser.add_argument("--white", metavar="FILE", help="white frame")
     parser.add_argument("--dark", metavar="FILE", help="dark frame")
@@ -199,6 +205,7 @@ def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recorde
         telemetry=arguments.telemetry,
         start_utc_ns=arguments.start,
         interval_s=1.0 if arguments.interval is None else arguments.interval,
+        vehicle=arguments.vehicle,
     )
 
 

@@ -18,6 +18,7 @@ from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_ut
 from dappled.daemon.navigation.clocks import TAGGING_RULES
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
+from dappled.daemon.replay.vehicle_choice import vehicle_of
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
@@ -132,12 +133,14 @@ def of_folder(
     start_utc_ns: int | None,
     interval_s: float,
     *,
+    vehicle: int | None = None,
     now_ns: int | None = None,
 ) -> RecordedFlight:
     """Frames in a folder, in the order of their EXIF's times or else of their names; the first at `start_utc_ns` (None:
     the telemetry's first position, or 1970 without telemetry), the others at `interval_s` after each other. A single
     .tlog (or, without one, a single .bin of ArduPilot or .ulg of PX4) in the folder is the telemetry, where none is
-    named. `now_ns`: no log is of a later time."""
+    named. `vehicle`: the system id of the one whose telemetry counts (see `vehicle_of`). `now_ns`: no log is of a
+    later time."""
     if telemetry is not None and not telemetry.is_file():
         raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
@@ -146,9 +149,10 @@ def of_folder(
     paths = ordered.items
     if not paths:
         raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
+    system, told = _vehicle(telemetry, vehicle)
     bounds = _bounds(paths, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
     if start_utc_ns is None:
-        start_utc_ns = _first_position_utc_ns(telemetry, bounds) if telemetry else 0
+        start_utc_ns = _first_position_utc_ns(telemetry, bounds, system) if telemetry else 0
     elif telemetry is not None and own_log(telemetry):
         next(_packets(telemetry, bounds=bounds), None)  # one that can't be used is refused before all else
     shots, files, expected = [], [], []
@@ -164,12 +168,22 @@ def of_folder(
         shots.append(shot)
         files.append(RecordedShot(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
-    found: tuple[Finding, ...] = ()
+    found = tuple(told)
     if ordered.against is not None:  # the better evidence decides
         before, name, earlier_s = ordered.against
         code, subject = Code.PICTURE_NAMES_DISAGREE, Subject("picture", Path(name).name)
-        found = (finding(code, subject, Level.NOTE, before=Path(before).name, earlier_s=earlier_s),)
-    return RecordedFlight(folder, shots, files, expected, telemetry, {}, findings=found, bounds=bounds)
+        found = (*found, finding(code, subject, Level.NOTE, before=Path(before).name, earlier_s=earlier_s))
+    vehicles = [] if system is None else [(0, system)]
+    return RecordedFlight(folder, shots, files, expected, telemetry, {}, vehicles, findings=found, bounds=bounds)
+
+
+def _vehicle(telemetry: Path | None, vehicle: int | None) -> tuple[int | None, list[Finding]]:
+    """Whose telemetry counts, and what is to be said of it. Raises VehicleError and ReplayError."""
+    if telemetry is not None and own_log(telemetry) is None:
+        return vehicle_of(telemetry, vehicle)
+    if vehicle is not None:
+        raise ReplayError("--vehicle is for a .tlog: there is no other vehicle in an autopilot's own log; leave it out")
+    return None, []
 
 
 def _bounds(paths: Sequence[Path], start_utc_ns: int | None, now_ns: int) -> UtcBounds:
@@ -385,8 +399,10 @@ def _logged(
     return dataflash.packets(path, report, bounds)
 
 
-def _first_position_utc_ns(path: Path, bounds: UtcBounds) -> int:
-    utc_ns = first_position_utc_ns(_packets(path, bounds=bounds))
+def _first_position_utc_ns(path: Path, bounds: UtcBounds, system: int | None) -> int:
+    packets = _packets(path, bounds=bounds)
+    mine = (one for one in packets if system is None or one[2].get_srcSystem() == system)
+    utc_ns = first_position_utc_ns(mine)
     if utc_ns is None:
         raise ReplayError(f"{path} holds no position: give --start, the time of the first frame")
     return utc_ns
