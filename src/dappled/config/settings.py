@@ -101,6 +101,11 @@ class MavlinkSettings:
         "Packets without a signature on a link with a key: refuse; listen (read, but not obeyed); or allow",
         choices=("refuse", "listen", "allow"),
     )
+    unsigned_parameters: bool = setting(
+        False,
+        "Take the settings that end a flight or change its decoding (LF_MASK, LF_LAW, LF_DECODE, CAM_FORMAT, "
+        "CAM_FOCALLEN) over unsigned UDP and TCP links off loopback, too",
+    )
     feedback_is_shot: bool = setting(
         False,
         "The autopilot fires the camera by wire, and each of its CAMERA_FEEDBACK messages is a shot; always so, and "

@@ -257,7 +257,7 @@ class Service:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
         decoding = DecodingParameter(self._shots, self._writer, decodes=decodes)
         recipe = RecipeParameters(names, self._after, self._settings, self._shutter, self._writer)
-        return Parameters(body, (decoding, recipe))
+        return Parameters(body, (decoding, recipe), unsigned=self._settings.now.mavlink.unsigned_parameters)
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:
         """Start the last stage first, so that each item finds its receiver. A part that fails is stopped too."""

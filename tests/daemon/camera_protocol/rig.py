@@ -57,6 +57,7 @@ class Camera:
         signing: Signing | None = None,
         settled: bool = True,
         clock: Clock | None = None,
+        settable: Callable[[Camera], Parameters] = Parameters,
     ) -> None:
         self.clock = clock or SystemClock()
         self.telemetry = Telemetry()
@@ -82,7 +83,7 @@ class Camera:
             autopilot,
             self.shutter,
             self.clock,
-            Parameters(self),
+            settable(self),
             model=self,
             earlier=NothingEarlier(),
             series=DistanceTrigger(self.shutter, Nowhere(), self.clock, mount=self.mount),

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import struct
+import time
 from collections.abc import Callable
+from pathlib import Path
 from xml.etree import ElementTree as Xml
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.clock import SystemClock
 from dappled.daemon.camera_protocol.parameters import (
     TYPE,
     WAIT_NS,
@@ -19,7 +23,9 @@ from dappled.daemon.camera_protocol.parameters import (
     code,
 )
 from dappled.drivers.camera import Setting, SettingName
-from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, Signing, make_key, mavlink, open_signing, read_key
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from tests.daemon.camera_protocol.rig import Camera, Peer
 
 
 class Body:
@@ -100,3 +106,60 @@ def test_any_words_make_sound_xml_and_a_number_that_fits(words: str) -> None:
     printable = "".join(c for c in words if c.isprintable())
     Xml.fromstring(camera_definition(printable, printable, [Parameter("X", printable, printable, (printable,))]).xml)  # noqa: S314  # our own bytes
     assert 0 <= code(words) < 2**31
+
+
+EVERYWHERE = "0.0.0.0"  # noqa: S104  # a link that other machines reach
+
+
+class Own:
+    """A setting of dappled itself, and what it was set to."""
+
+    def __init__(self) -> None:
+        self.mask = "octave"
+
+    def parameters(self) -> tuple[Parameter, ...]:
+        return (Parameter("LF_MASK", "Mask", self.mask, ("octave", "none")),)
+
+    def set(self, name: str, value: str) -> None:
+        assert name == "LF_MASK"
+        self.mask = value
+
+
+class Decodable(Camera):
+    """A camera with a mask that a ground station may change."""
+
+    def __init__(self, url: str, *, unsigned: bool, signing: Signing | None = None) -> None:
+        self.own = Own()
+        super().__init__(
+            urls=[url], signing=signing, settable=lambda camera: Parameters(camera, (self.own,), unsigned=unsigned)
+        )
+
+
+def set_mask(camera: Decodable, peer: Peer) -> int:
+    data = struct.pack("<I", code("none")).ljust(128, b"\0")
+    peer.send(mavlink.MAVLink_param_ext_set_message(1, 100, b"LF_MASK", data, TYPE))
+    result = int(peer.one("PARAM_EXT_ACK").param_result)
+    assert (camera.own.mask == "none") == (result == mavlink.PARAM_ACK_ACCEPTED)
+    return result
+
+
+@pytest.mark.parametrize(
+    ("host", "unsigned", "taken"), [("", False, False), ("", True, True), ("127.0.0.1", False, True)]
+)
+def test_a_stranger_cannot_change_the_mask_over_an_unsigned_link(host: str, unsigned: bool, taken: bool) -> None:
+    camera = Decodable(f"udpin:{host or EVERYWHERE}:0", unsigned=unsigned)
+    with camera, Peer(camera.links.port(0)) as stranger:
+        result = set_mask(camera, stranger)
+        assert result == (mavlink.PARAM_ACK_ACCEPTED if taken else mavlink.PARAM_ACK_FAILED)
+        if not taken:
+            assert "LF_MASK" in stranger.one("STATUSTEXT").text
+
+
+def test_a_station_with_the_key_sets_the_mask(tmp_path: Path) -> None:
+    make_key(tmp_path / "key")
+    signing = open_signing([tmp_path / "key"], tmp_path / "time", SystemClock())
+    camera = Decodable(f"udpin:{EVERYWHERE}:0", unsigned=False, signing=signing)
+    with camera, Peer(camera.links.port(0)) as station:
+        station.packer.signing.secret_key, station.packer.signing.sign_outgoing = read_key(tmp_path / "key"), True
+        station.packer.signing.timestamp = round((time.time() - EPOCH_UNIX_S) * UNITS_PER_S)
+        assert set_mask(camera, station) == mavlink.PARAM_ACK_ACCEPTED

@@ -323,7 +323,7 @@ class Component:
             reply = self._parameters.read(message)
         else:
             self._send_changed_parameters()  # earlier changes first, so that the reply follows them
-            reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns())
+            reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns(), exposed=packet.exposed)
         self._send_reply(reply, packet.link)
         self._send_changed_parameters()
 

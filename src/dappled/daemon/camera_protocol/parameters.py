@@ -33,6 +33,7 @@ _BODY: dict[SettingName, tuple[str, str]] = {
     "focal_length": ("CAM_FOCALLEN", "Focal length"),
     "battery": ("CAM_BATTERY", "Battery"),
 }
+_DECODED_BY: tuple[SettingName, ...] = ("image_format", "focal_length")
 _SETTINGS = {name: setting for setting, (name, _) in _BODY.items()}
 
 
@@ -67,8 +68,15 @@ class BodyParameters(Protocol):
 class Parameters:
     """All settings of a camera, as known in memory: the body's and those of dappled itself."""
 
-    def __init__(self, body: BodyParameters, own: Sequence[OwnParameters] = ()) -> None:
-        self._body, self._own = body, own
+    def __init__(self, body: BodyParameters, own: Sequence[OwnParameters] = (), *, unsigned: bool = False) -> None:
+        """`unsigned`: strangers may set everything (`mavlink.unsigned_parameters`)."""
+        self._body, self._own, self._unsigned = body, own, unsigned
+
+    def closed_to_strangers(self, name: str) -> bool:
+        """Whether it ends a flight, or changes how its frames can be decoded: not over an unsigned link that others
+        reach."""
+        own = any(one.name == name for several in self._own for one in several.parameters())
+        return not self._unsigned and (own or _SETTINGS.get(name) in _DECODED_BY)
 
     def all(self) -> tuple[Parameter, ...]:
         """The body's first."""
@@ -160,8 +168,8 @@ class ParameterServer:
             if one.value != before.get(one.name, one.value)
         )
 
-    def set(self, message: MavlinkMessage, link: int, now_ns: int) -> ParameterReply:
-        """PARAM_EXT_SET (323). Time is monotonic."""
+    def set(self, message: MavlinkMessage, link: int, now_ns: int, *, exposed: bool = False) -> ParameterReply:
+        """PARAM_EXT_SET (323). Time is monotonic. `exposed`: a stranger may have sent it."""
         name = str(message.param_id)
         parameter = self._parameters.find(name)
         wanted = _number(message)
@@ -177,6 +185,9 @@ class ParameterServer:
             return ParameterReply((_ack(name, wanted, _IN_PROGRESS),))  # a retry: the change is under way
         if asked is None and value == parameter.value:
             return ParameterReply((_ack(name, wanted, _ACCEPTED),))
+        if exposed and self._parameters.closed_to_strangers(name):
+            words = f"{name} can't be set over an unsigned link: sign it, or set mavlink.unsigned_parameters"
+            return ParameterReply((_ack(name, code(parameter.value), _FAILED),), words)
         return self._change(parameter, value, _Asked(value, link, now_ns + WAIT_NS))
 
     def _change(self, parameter: Parameter, value: str, asked: _Asked) -> ParameterReply:

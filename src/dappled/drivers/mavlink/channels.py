@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import ipaddress
 import os
 import socket
 import termios
@@ -60,6 +61,16 @@ class Address:
     kind: LinkKind
     host: str
     port: int
+
+    @property
+    def exposed(self) -> bool:
+        """Whether others than this machine's users can reach it: it is no serial line, and not on loopback."""
+        if self.kind == "serial" or self.host == "localhost":
+            return False
+        try:
+            return not ipaddress.ip_address(self.host).is_loopback
+        except ValueError:  # a name, which anybody may own
+            return True
 
 
 def parse(url: str) -> Address:

@@ -48,7 +48,8 @@ _POLL_S = 0.2
 class Packet:
     """One packet, received or (`sent`) sent. `number` is its place in the telemetry log, None if it was not logged.
 
-    `trusted`: False for an unsigned packet on a signed link, which may be heard but not obeyed.
+    `trusted`: False for an unsigned packet on a signed link, which may be heard but not obeyed. `exposed`: it came
+    unsigned over a network, so anyone there may have sent it.
     """
 
     number: int | None
@@ -58,6 +59,7 @@ class Packet:
     raw: bytes
     sent: bool = False
     trusted: bool = True
+    exposed: bool = False
 
 
 class PacketLog(Protocol):
@@ -183,7 +185,16 @@ class PacketSender:
                 taken = self._send_on(each, message) or taken
         return taken
 
-    def logged(self, link: Link, stamp_us: int, framed: Framed, *, sent: bool = False, trusted: bool = True) -> Packet:
+    def logged(
+        self,
+        link: Link,
+        stamp_us: int,
+        framed: Framed,
+        *,
+        sent: bool = False,
+        trusted: bool = True,
+        exposed: bool = False,
+    ) -> Packet:
         """Log a packet, and return it with its number; one beyond the log's budget is only counted. Under the order
         lock, after `start`."""
         packet_log, number, message = self._log, None, framed.message
@@ -191,14 +202,14 @@ class PacketSender:
         source, size = (message.get_srcSystem(), message.get_srcComponent()), _STAMP_BYTES + len(framed.raw)
         if not link.budgets[sent].takes(source, message.get_msgId(), size, self._clock.monotonic_ns()):
             link.packets_unrecorded += 1
-            return Packet(None, stamp_us, link.number, message, framed.raw, sent, trusted)
+            return Packet(None, stamp_us, link.number, message, framed.raw, sent, trusted, exposed)
         try:
             number = packet_log.log_packet(stamp_us, framed.raw)
         except Exception:  # a full disk must not stop the commands of a flying machine
             if link.packets_unlogged == 0:
                 log.exception("A MAVLink packet could not be written to the telemetry log")
             link.packets_unlogged += 1
-        packet = Packet(number, stamp_us, link.number, message, framed.raw, sent, trusted)
+        packet = Packet(number, stamp_us, link.number, message, framed.raw, sent, trusted, exposed)
         self.hand(link, packet, packet_log)
         return packet
 
@@ -388,10 +399,12 @@ class MavlinkLinks:
             elif trusted:
                 channel.shown("signed" if signed else "sound")
             link.packets_in += 1
-            link.last_heard_monotonic_ns = self._clock.monotonic_ns()
+            if trusted or message.get_msgId() != mavlink.MAVLINK_MSG_ID_RADIO_STATUS:  # a radio alone is no peer
+                link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
-            packet = self.sender.logged(link, stamp_us, framed, trusted=trusted)
+            exposed = link.address.exposed and not signed
+            packet = self.sender.logged(link, stamp_us, framed, trusted=trusted, exposed=exposed)
             if receiver is not None:
                 self.sender.hand(link, packet, receiver)
 
