@@ -29,6 +29,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "trigger": ("trigger", "ask for frames over MAVLink, as a ground station does"),
     "mavlink": ("keys", "make keys for signed MAVLink links"),
     "decode": ("decode", "decode frames to light fields"),
+    "picture": ("picture", "make photographs without the mask's shadow, at the sensor's own resolution"),
     "carriers": ("carriers", "show the predicted and the measured carriers of a frame"),
     "calibrate": ("calibrate", "fit lattice, law and phases to calibration frames"),
     "views": ("views", "draw a light field's views, slices or shifts as one picture"),

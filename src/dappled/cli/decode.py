@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.frames = decode_arguments.frames(arguments.frames)
     single = len(arguments.frames) == 1 and arguments.output.suffix
     if not single:
-        _refuse_same_names(arguments.frames, arguments.output)
+        decode_arguments.refuse_same_names(arguments.frames, arguments.output, ".zarr")
         arguments.output.mkdir(parents=True, exist_ok=True)
     bad = doubted = 0
     for frame in tqdm(arguments.frames, unit="frame", disable=len(arguments.frames) < 2 or not sys.stderr.isatty()):
@@ -69,17 +68,6 @@ def run(arguments: argparse.Namespace) -> int:
         which = "" if single else f", {doubted} of {counted(len(arguments.frames), 'frame')}"
         print(f"dappled decode: written, but in doubt{which}: see above; --anyway accepts that", file=sys.stderr)
     return 1 if bad or (doubted and not arguments.anyway) else 0
-
-
-def _refuse_same_names(frames: Sequence[Path], folder: Path) -> None:
-    """Two frames of one name would overwrite each other's light field."""
-    first: dict[str, Path] = {}
-    for frame in frames:
-        other = first.setdefault(frame.stem, frame)
-        if other is not frame:
-            raise DappledError(
-                f"{other} and {frame} would both be written as {folder / frame.stem}.zarr: decode them into two folders"
-            )
 
 
 def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:

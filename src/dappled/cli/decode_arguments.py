@@ -75,7 +75,7 @@ def recorded(given: Sequence[Path], asked: Recipe) -> Recipe:
     """
     if asked.mask:
         return asked
-    flights = {_flight(path.resolve()) for path in given}
+    flights = {flight_of(path.resolve()) for path in given}
     if len(flights) > 1:
         raise DappledError("these are not the frames of one flight: give --mask, or decode each flight by itself")
     (flight,) = flights
@@ -90,9 +90,21 @@ def recorded(given: Sequence[Path], asked: Recipe) -> Recipe:
     return made
 
 
-def _flight(path: Path) -> Path | None:
+def flight_of(path: Path) -> Path | None:
     """The flight that a folder is, or that a file or a folder of frames lies in."""
     return next((one for one in (path, *path.parents[:2]) if (one / "flight.toml").is_file()), None)
+
+
+def refuse_same_names(frames: Sequence[Path], folder: Path, suffix: str) -> None:
+    """Two frames of one name would overwrite each other's results. Raises DappledError."""
+    first: dict[str, Path] = {}
+    for frame in frames:
+        other = first.setdefault(frame.stem, frame)
+        if other is not frame:
+            raise DappledError(
+                f"{other} and {frame} would both be written as {folder / frame.stem}{suffix}: "
+                "decode them into two folders"
+            )
 
 
 def _is_frame(path: Path) -> bool:

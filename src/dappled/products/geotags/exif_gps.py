@@ -171,6 +171,17 @@ def _directory(order: str, start: int, entries: Sequence[Entry]) -> bytes:
     return struct.pack(order + "H", len(entries)) + b"".join(rows) + bytes(4) + values
 
 
+def text_entry(tag: int, words: str) -> Entry:
+    """An entry of ASCII, other letters as question marks."""
+    coded = words.encode("ascii", "replace") + b"\0"
+    return tag, _ASCII, len(coded), coded
+
+
+def ratio_entry(tag: int, above: int, below: int) -> Entry:
+    """A fraction in a little-endian file."""
+    return tag, _RATIONAL, 1, struct.pack("<II", above, below)
+
+
 def _rows(order: str, behind: int, entries: Sequence[Entry]) -> tuple[list[bytes], bytes]:
     """The entries' rows, and their longer values, which begin at the offset `behind`."""
     rows, values = [], b""

@@ -17,7 +17,7 @@ from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
 from dappled.flight import Frame, Tag
 from dappled.products.geotags import exif_gps, geotags, sidecars
-from dappled.products.geotags.exif_gps import Entry
+from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
 from dappled.products.geotags.geotags import Placed
 from dappled.products.maps import cog
 from dappled.products.maps.photographs import Photograph, Station
@@ -25,7 +25,7 @@ from dappled.products.maps.photographs import Photograph, Station
 SUFFIXES = {"tiff": ".tif", "jpeg": ".jpg"}
 _QUALITY = 95
 _EXIF_IFD = 0x8769
-_ASCII, _SHORT, _LONG, _RATIONAL, _UNDEFINED = 2, 3, 4, 5, 7
+_SHORT, _LONG, _RATIONAL, _UNDEFINED = 3, 4, 5, 7
 _XMP_TAG = 700
 _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\0"
 _FILM_MM = 36.0
@@ -95,7 +95,11 @@ def _srgb(image: Singles) -> Floats:
 
 def _settings(one: Photograph, tag: Tag, utc_ns: int | None) -> tuple[list[Entry], list[Entry]]:
     """Entries of the first directory and of EXIF 2.31's, little endian; unknown ones are left out."""
-    first = [_text(0x010F, "dappled"), _text(0x0110, tag.camera), _text(0x0131, f"dappled {__version__}")]
+    first = [
+        text_entry(0x010F, "dappled"),
+        text_entry(0x0110, tag.camera),
+        text_entry(0x0131, f"dappled {__version__}"),
+    ]
     rows, columns = one.eye.shape
     inner: list[Entry] = [
         (0x9000, _UNDEFINED, 4, b"0231"),
@@ -108,30 +112,28 @@ def _settings(one: Photograph, tag: Tag, utc_ns: int | None) -> tuple[list[Entry
     if utc_ns is not None:
         taken = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y:%m:%d %H:%M:%S")
         fraction = f"{utc_ns % 10**9 // 1000:06d}"
-        first.append(_text(0x0132, taken))
-        inner += [_text(0x9003, taken), _text(0x9004, taken), _text(0x9011, "+00:00"), _text(0x9291, fraction)]
+        first.append(text_entry(0x0132, taken))
+        inner += [
+            text_entry(0x9003, taken),
+            text_entry(0x9004, taken),
+            text_entry(0x9011, "+00:00"),
+            text_entry(0x9291, fraction),
+        ]
     if tag.exposure_s:
-        inner.append(_ratio(0x829A, round(tag.exposure_s * 1e6), 10**6))
+        inner.append(ratio_entry(0x829A, round(tag.exposure_s * 1e6), 10**6))
     if tag.f_number:
-        inner.append(_ratio(0x829D, round(tag.f_number * 100), 100))
+        inner.append(ratio_entry(0x829D, round(tag.f_number * 100), 100))
     if tag.iso:
         inner.append((0x8827, _SHORT, 1, struct.pack("<H", min(65535, round(tag.iso)))))
     if tag.focal_length_mm:
         per_mm = [float(np.linalg.norm(one.eye.matrix[:2, axis])) / tag.focal_length_mm for axis in (0, 1)]
         inner += [
-            _ratio(0x920A, round(tag.focal_length_mm * 1000), 1000),
-            _ratio(0xA20E, round(per_mm[0] * 10 * 10**4), 10**4),  # pixels of this picture in a centimetre of the chip
-            _ratio(0xA20F, round(per_mm[1] * 10 * 10**4), 10**4),
+            ratio_entry(0x920A, round(tag.focal_length_mm * 1000), 1000),
+            ratio_entry(
+                0xA20E, round(per_mm[0] * 10 * 10**4), 10**4
+            ),  # pixels of this picture in a centimetre of the chip
+            ratio_entry(0xA20F, round(per_mm[1] * 10 * 10**4), 10**4),
             (0xA210, _SHORT, 1, struct.pack("<H", 3)),
             (0xA405, _SHORT, 1, struct.pack("<H", round(_FILM_MM * tag.focal_length_mm * per_mm[0] / columns))),
         ]
     return first, inner
-
-
-def _text(tag: int, words: str) -> Entry:
-    coded = words.encode("ascii", "replace") + b"\0"
-    return tag, _ASCII, len(coded), coded
-
-
-def _ratio(tag: int, above: int, below: int) -> Entry:
-    return tag, _RATIONAL, 1, struct.pack("<II", above, below)

@@ -1,0 +1,110 @@
+"""A colour mosaic in blocks: its samples by place of the colour pattern, their local means, and sums over plane waves.
+
+Rows and columns are counted from the frame's centre, so that no phase depends on the frequency that it is taken at.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.decode.array_types import Floats, Singles
+
+EMPTY = -1  # in a pattern: no sample there, as on the spread plane of a staggered chip
+_PASSES = 3  # of a running mean as long as the carriers' period: what is left of them is its cube
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MosaicPlane:
+    """A linear plane float32 (H, W), 1.0 = sensor white. `pattern` (a, b) repeats over it: a colour's index from 0, or
+    `EMPTY`. `valid` (H, W) is False for clipped and defective pixels; None: all are good."""
+
+    plane: Singles
+    pattern: NDArray[np.intp]
+    valid: NDArray[np.bool_] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.plane.shape[0], self.plane.shape[1]
+
+    @property
+    def colours(self) -> int:
+        """How many colours there are."""
+        return int(self.pattern.max()) + 1
+
+    def places(self) -> Iterator[PatternPlace]:
+        """The samples of each place of the pattern that has any."""
+        for (row, column), colour in np.ndenumerate(self.pattern):
+            if colour != EMPTY:
+                yield PatternPlace(int(row), int(column), int(colour), (self.pattern.shape[0], self.pattern.shape[1]))
+
+
+@dataclass(frozen=True, slots=True)
+class PatternPlace:
+    """One place of a colour pattern of the size `step`."""
+
+    row: int
+    column: int
+    colour: int
+    step: tuple[int, int]
+
+    @property
+    def cut(self) -> tuple[slice, slice]:
+        """What cuts its samples from a frame."""
+        return slice(self.row, None, self.step[0]), slice(self.column, None, self.step[1])
+
+    def at(self, shape: tuple[int, int]) -> tuple[Floats, Floats]:
+        """Rows and columns of its samples, from the frame's centre."""
+        rows, columns = (
+            np.arange(first, side, step, dtype=np.float64) - (side - 1) / 2
+            for first, side, step in zip((self.row, self.column), shape, self.step, strict=True)
+        )
+        return rows, columns
+
+
+def local_mean(values: Singles, reach_px: float, step: tuple[int, int], weights: Singles | None = None) -> Singles:
+    """Values (h, w) of one place averaged over about `reach_px` pixels of the frame; `weights` 0 leaves samples out.
+
+    With weights the values have been multiplied by them already, and are divided by the weights' own mean.
+    """
+    sizes = [max(1, round(reach_px / one)) for one in step]
+    if weights is None:
+        return _smooth(values, sizes)
+    mean = _smooth(weights, sizes)
+    return np.asarray(_smooth(values, sizes) / np.maximum(mean, 1e-3), dtype=np.float32)
+
+
+def _smooth(values: Singles, sizes: list[int]) -> Singles:
+    made = values
+    for axis, size in enumerate(sizes):
+        for _ in range(_PASSES if size > 1 else 0):
+            made = ndimage.uniform_filter1d(made, size, axis=axis, mode="nearest")
+    return made
+
+
+def wave_sums(
+    values: Singles,
+    rows: Floats,
+    columns: Floats,
+    frequencies: Floats,
+    edges: tuple[NDArray[np.intp], NDArray[np.intp]],
+) -> NDArray[np.complex64]:
+    """(blocks down, blocks across, K): sums of values · e^{−2πi f·x} over blocks that begin at `edges`."""
+    down = np.exp(-2j * np.pi * np.outer(rows, frequencies[:, 0])).astype(np.complex64)
+    across = np.exp(-2j * np.pi * np.outer(columns, frequencies[:, 1]))
+    parts = np.concatenate([across.real, across.imag], axis=1).astype(np.float32)
+    starts, ends = edges[1], [*edges[1][1:], len(columns)]
+    count = len(frequencies)
+    made = np.empty((len(edges[0]), len(starts), count), dtype=np.complex64)
+    for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        lines = values[:, start:end] @ parts[start:end]
+        whole = np.empty((len(rows), count), dtype=np.complex64)
+        whole.real, whole.imag = lines[:, :count], lines[:, count:]
+        whole *= down
+        made[:, index] = np.add.reduceat(whole, edges[0], axis=0)
+    return made

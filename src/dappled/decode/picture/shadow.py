@@ -1,0 +1,402 @@
+"""The mask's shadow W in a frame: what the film lets through at each pixel of a scene in focus, 1 in the mean.
+
+In focus all light of a point meets in one pixel, so pixel = scene · W, and W is a trigonometric polynomial on the
+carriers' lattice, 1 + Σ c_k e^{2πi k·F x}. The frame's own coefficients are those that explain it best by least
+squares: with L the frame's local mean over a period, frame − L is regressed on L · e^{2πi k·F x}. Blocks weigh by what
+they leave unexplained, clipped and defective pixels by nothing, each colour has coefficients of its own, and these vary
+over the frame as polynomials where that explains blocks that were held out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from dappled.decode.array_types import Floats, Singles
+from dappled.decode.optics import Lattice, Order
+from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, local_mean, wave_sums
+
+Coefficients = NDArray[np.complex128]
+_BLOCK_PX, _BLOCK_PERIODS = 64, 4  # a block's side is at least both
+_RIDGE = 1e-6  # of the mean of the diagonal: orders that fall together on a coarse pattern share what they explain
+_DEGREES = (0, 2)  # of the polynomials that are tried
+_SURE = 4.0  # log likelihood by which held-out blocks must prefer the more complicated one
+_SEARCH_SIDE = 2048  # pixels of the frame's middle that the lattice is searched in
+_STEP_BINS = 0.3  # of the search, at the outermost order
+_CLEAR = 5.5  # standard deviations of what the search finds where no carriers are
+_FOUND_BINS = 0.5  # standard error of the lattice after the search
+_DEEP = 0.2  # standard deviation of W from which on local means are taken again with the shadow known
+_STEPS = 3  # of Gauss and Newton, at most
+_ENOUGH = 0.1  # of the frame
+_STILL_BINS = 3e-3  # of a frame: a lattice so near is kept
+_LEAST = 1e-3  # of the frame's mean: darker local means tell nothing of the shadow
+
+
+class ShadowFrom(StrEnum):
+    """What a shadow's coefficients are from."""
+
+    FRAME = "frame"
+    WHITE = "white"
+    CALIBRATION = "calibration"
+    NONE = "none"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shadow:
+    """`coefficients` complex (colours, K, terms) of the half plane's `orders`, at the frame's centre, their terms those
+    of a polynomial of `degree` over the frame; `sigma` (colours,) the standard error of W, rms over the frame."""
+
+    shape: tuple[int, int]
+    lattice: Lattice
+    orders: tuple[Order, ...]
+    coefficients: Coefficients
+    degree: int
+    source: ShadowFrom
+    sigma: Floats
+
+    @property
+    def depth(self) -> float:
+        """The standard deviation of W over the frame: 0 where the mask casts no shadow."""
+        return float(np.sqrt(2 * (np.abs(self.coefficients[:, :, 0]) ** 2).sum(axis=1).mean()))
+
+    def at(self, place: PatternPlace) -> Singles:
+        """W at the samples of one place of the colour pattern, not below a hundredth."""
+        rows, columns = place.at(self.shape)
+        frequencies = np.asarray(self.orders, dtype=np.float64).reshape(-1, 2) @ self.lattice.matrix()
+        down = 2 * np.exp(2j * np.pi * np.outer(rows, frequencies[:, 0]))
+        across = np.exp(2j * np.pi * np.outer(columns, frequencies[:, 1]))
+        y, x = rows / (self.shape[0] / 2), columns / (self.shape[1] / 2)
+        made = np.ones((len(rows), len(columns)), dtype=np.float32)
+        powers = _powers(self.degree)
+        for b in range(self.degree + 1):
+            wave = np.zeros_like(down)
+            for term, (a, other) in enumerate(powers):
+                if other == b:
+                    wave += down * self.coefficients[place.colour, :, term] * (y**a)[:, None]
+            side = across * (x**b)[:, None]
+            left = np.concatenate([wave.real, -wave.imag], axis=1).astype(np.float32)
+            right = np.concatenate([side.real, side.imag], axis=1).astype(np.float32)
+            made += left @ right.T
+        return np.maximum(made, np.float32(0.01))
+
+
+def no_shadow(shape: tuple[int, int], lattice: Lattice, orders: Sequence[Order], colours: int) -> Shadow:
+    """W = 1."""
+    none = np.zeros((colours, len(orders), 1), dtype=np.complex128)
+    return Shadow(shape, lattice, tuple(orders), none, 0, ShadowFrom.NONE, np.zeros(colours))
+
+
+def shadow_of(
+    mosaic: MosaicPlane,
+    lattice: Lattice,
+    orders: Sequence[Order],
+    *,
+    turned: float = 0.0,
+    scaled: float = 0.0,
+    others: Sequence[Shadow] = (),
+) -> Shadow:
+    """The shadow that explains a frame best: its own, one of `others` (a white frame's, a calibration's), or none.
+
+    `lattice` is where the carriers are expected, `orders` those of the half plane without the mean. The search for the
+    lattice allows for a turn (radians) and for a print's scale to either side. What a shadow explains is counted on
+    blocks that it was not fitted to.
+    """
+    half = tuple(order for order in orders if order != (0, 0))
+    mosaic = _unclipped(mosaic, period_of(lattice))
+    means = _Means.of(mosaic, period_of(lattice))
+    found = _searched(means, lattice, half, turned=turned, scaled=scaled)
+    equations = _Equations.of(means, found, half)
+    for _ in range(_STEPS):
+        if (finer := equations.lattice()) is None:
+            break
+        equations = _Equations.of(means, finer, half)
+    first = equations.fitted(0)
+    if first.depth > _DEEP or mosaic.valid is not None:  # where the light was is known better behind a known shadow
+        means = _Means.of(mosaic, means.period, first)
+        equations = _Equations.of(means, equations.at, half)
+    best, gain = no_shadow(mosaic.shape, equations.at, half, mosaic.colours), 0.0
+    for degree in _DEGREES:
+        held = equations.held_out(degree)
+        if held > gain + _SURE:
+            best, gain = equations.fitted(degree), held
+    none = equations.explained(None)
+    for one in others:
+        there = _Equations.of(means, one.lattice, one.orders)
+        if (told := there.explained(one) - none) > gain:
+            best, gain = one, told
+    return best
+
+
+def period_of(lattice: Lattice) -> float:
+    """The longest period of the carriers, in pixels."""
+    return 1 / min(math.hypot(*step) for step in lattice.neighbours())
+
+
+def _unclipped(mosaic: MosaicPlane, period: float) -> MosaicPlane:
+    """Without what lies within a period of a clipped pixel, where enough is left: of pixels as bright as a bright part
+    of the mask makes them, only those of dark places of the scene are not clipped."""
+    if mosaic.valid is None:
+        return mosaic
+    sound = ndimage.minimum_filter(mosaic.valid, 2 * math.ceil(period / 2) + 1)
+    return replace(mosaic, valid=sound) if float(sound.mean()) > _ENOUGH else mosaic
+
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Exponents of rows and columns of a polynomial's terms, the constant first."""
+    return [(whole - b, b) for whole in range(degree + 1) for b in range(whole + 1)]
+
+
+def _terms(places: Floats, shape: tuple[int, int], degree: int) -> Floats:
+    """(n, terms) of the polynomial at places (n, 2) from the frame's centre."""
+    y, x = (places / (np.array(shape) / 2)).T
+    return np.stack([y**a * x**b for a, b in _powers(degree)], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Means:
+    """A mosaic with the local means of each place's samples."""
+
+    mosaic: MosaicPlane
+    period: float
+    means: tuple[tuple[PatternPlace, Singles, Singles | None], ...]
+
+    @classmethod
+    def of(cls, mosaic: MosaicPlane, period: float, shadow: Shadow | None = None) -> _Means:
+        made = []
+        for place in mosaic.places():
+            values = np.ascontiguousarray(mosaic.plane[place.cut])
+            good = None if mosaic.valid is None else mosaic.valid[place.cut].astype(np.float32)
+            weights = good
+            if shadow is not None:  # least squares: Σ frame·W / Σ W²
+                values, weights = values * (known := shadow.at(place)), known * known
+                if good is not None:
+                    weights *= good
+            mean = local_mean(values if good is None else values * good, period, place.step, weights)
+            made.append((place, mean, good))
+        return cls(mosaic, period, tuple(made))
+
+    def floor(self) -> float:
+        return _LEAST * max(float(np.mean([mean[::7, ::7].mean() for _, mean, _ in self.means])), 1e-9)
+
+    def quotient(self) -> tuple[Singles, tuple[int, int]]:
+        """(frame − local mean) / local mean in the frame's middle, and where that begins."""
+        shape, floor = self.mosaic.shape, self.floor()
+        made = np.zeros(shape, dtype=np.float32)
+        for place, mean, good in self.means:
+            part = self.mosaic.plane[place.cut] / np.maximum(mean, floor) - 1
+            made[place.cut] = np.clip(part if good is None else part * good, -2, 4)
+        start = [max(0, (side - _SEARCH_SIDE) // 2) for side in shape]
+        return made[start[0] : start[0] + _SEARCH_SIDE, start[1] : start[1] + _SEARCH_SIDE], (start[0], start[1])
+
+
+def _searched(means: _Means, lattice: Lattice, orders: Sequence[Order], *, turned: float, scaled: float) -> Lattice:
+    """The lattice, turned and scaled, at which the spectrum of frame over local mean has its peaks; the given one where
+    it has none."""
+    if not (turned or scaled):
+        return lattice
+    part, _ = means.quotient()
+    part = part * np.outer(np.hanning(part.shape[0]), np.hanning(part.shape[1])).astype(np.float32)
+    size = [fft.next_fast_len(side, real=True) for side in part.shape]
+    power = np.abs(fft.rfft2(part, s=size)) ** 2
+    there = np.asarray(orders, dtype=np.float64) @ lattice.matrix()
+    largest = float(np.hypot(*(there * part.shape).T).max())
+    counts = [math.ceil(reach * largest / _STEP_BINS) for reach in (scaled, turned)]
+    scales, turns = (np.linspace(-reach, reach, 2 * n + 1) for reach, n in zip((scaled, turned), counts, strict=True))
+    scores = np.zeros((len(scales), len(turns)))
+    for fy, fx in there:
+        y = (1 + scales[:, None]) * (np.cos(turns) * fy - np.sin(turns) * fx)
+        x = (1 + scales[:, None]) * (np.sin(turns) * fy + np.cos(turns) * fx)
+        flip = np.where(x - np.round(x) < 0, -1, 1)  # a real frame: the other half is conjugate
+        rows = np.round(flip * y * size[0]).astype(np.intp) % size[0]
+        columns = np.minimum(np.round(np.abs(x - np.round(x)) * size[1]).astype(np.intp), power.shape[1] - 1)
+        near = power[rows, columns]
+        scores += np.log1p(near / max(float(np.median(near)) / math.log(2), 1e-12))
+    middle, scatter = 0.596 * len(there), 0.62 * math.sqrt(len(there))  # of log(1 + an exponential variable)
+    at = np.unravel_index(int(np.argmax(scores)), scores.shape)
+    if scores[at] < middle + _CLEAR * scatter:
+        return lattice
+    turn, scale = turns[at[1]], 1 + scales[at[0]]
+    (a, b), (c, d) = scale * np.asarray(lattice.rotated(float(turn)).matrix())
+    return Lattice((float(a), float(b)), (float(c), float(d)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of the coefficients, block by block: `gram` (colours, blocks, n, n) and `right` (colours,
+    blocks, n) of the mean, `orders` and their opposites. `energy` and `count` are of each block's frame − L."""
+
+    shape: tuple[int, int]
+    at: Lattice
+    orders: tuple[Order, ...]
+    centres: Floats
+    gram: NDArray[np.complex64]
+    right: NDArray[np.complex64]
+    energy: Floats
+    count: Floats
+    odd: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, means: _Means, lattice: Lattice, orders: tuple[Order, ...]) -> _Equations:
+        mosaic, floor = means.mosaic, means.floor()
+        every = np.array([(0, 0), *orders, *((-ky, -kx) for ky, kx in orders)], dtype=np.intp)
+        apart = every[:, None] - every[None, :]
+        sign = np.where((apart[..., 0] > 0) | ((apart[..., 0] == 0) & (apart[..., 1] >= 0)), 1, -1)
+        unique, index = np.unique((apart * sign[..., None]).reshape(-1, 2), axis=0, return_inverse=True)
+        index = index.reshape(len(every), len(every))
+        side = max(_BLOCK_PX, math.ceil(_BLOCK_PERIODS * means.period))
+        steps = mosaic.pattern.shape
+        across = [math.ceil(side / step) * step for step in steps]
+        blocks = [max(1, whole // one) for whole, one in zip(mosaic.shape, across, strict=True)]
+        shape = (mosaic.colours, blocks[0] * blocks[1])
+        n, half = len(every), len(orders) + 1
+        gram = np.zeros((*shape, len(unique)), dtype=np.complex64)
+        right = np.zeros((*shape, n), dtype=np.complex64)
+        energy, count = np.zeros(shape), np.zeros(shape)
+        matrix = lattice.matrix()
+        for place, mean, good in means.means:
+            rows, columns = place.at(mosaic.shape)
+            high = mosaic.plane[place.cut] - mean
+            known = mean > floor
+            keep = known.astype(np.float32) if good is None else good * known
+            high *= keep
+            weight = mean * keep
+            edges = tuple(
+                np.arange(number) * (one // step) for number, one, step in zip(blocks, across, steps, strict=True)
+            )
+            waves = wave_sums(weight * high, rows, columns, every[:half] @ matrix, (edges[0], edges[1]))
+            right[place.colour, :, :half] += waves.reshape(shape[1], -1)
+            sums = wave_sums(weight * mean, rows, columns, unique @ matrix, (edges[0], edges[1]))
+            gram[place.colour] += sums.reshape(shape[1], -1)
+            for values, into in ((high * high, energy), (keep, count)):
+                lines = np.add.reduceat(values, edges[0], axis=0, dtype=np.float64)
+                into[place.colour] += np.add.reduceat(lines, edges[1], axis=1).ravel()
+        right[..., half:] = right[..., 1:half].conj()
+        whole = gram[..., index]
+        whole = np.where(sign > 0, whole, whole.conj())
+        middles = [
+            (np.arange(number) + 0.5) * one - (full - 1) / 2
+            for number, one, full in zip(blocks, across, mosaic.shape, strict=True)
+        ]
+        y, x = np.meshgrid(*middles, indexing="ij")
+        odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
+        return cls(
+            mosaic.shape, lattice, orders, np.column_stack([y.ravel(), x.ravel()]), whole, right, energy, count, odd
+        )
+
+    @cached_property
+    def weights(self) -> Floats:
+        """(colours, blocks): one over what a block leaves unexplained, per pixel."""
+        made = []
+        for colour in range(len(self.right)):
+            plain = np.where(self.count[colour] > 0, 1.0, 0.0)
+            c = self._solved(colour, plain, 0)[0]
+            left = self.energy[colour] - self._gains(colour, self._local(c, 0))
+            spread = np.maximum(left, 0) / np.maximum(self.count[colour], 1)
+            usual = float(np.median(spread[self.count[colour] > 0])) if plain.any() else 1.0
+            made.append(plain / np.maximum(spread + 0.05 * usual, 1e-12))
+        return np.array(made)
+
+    def _terms(self, degree: int) -> Floats:
+        return _terms(self.centres, self.shape, degree)
+
+    def _local(self, c: Coefficients, degree: int) -> Coefficients:
+        """(blocks, n) the coefficients at each block, of c (n, terms)."""
+        return np.asarray(self._terms(degree) @ c.T)
+
+    def _gains(self, colour: int, c: Coefficients) -> Floats:
+        """(blocks,) how much of a block's energy coefficients (blocks, n) explain."""
+        first = 2 * (c.conj() * self.right[colour]).sum(axis=1).real
+        image = np.matmul(self.gram[colour], c[:, :, None].astype(np.complex64))[:, :, 0]
+        return np.asarray(first - (c.conj() * image).sum(axis=1).real)
+
+    def _solved(self, colour: int, weights: Floats, degree: int) -> tuple[Coefficients, Coefficients]:
+        """Coefficients (n, terms), and the inverse of their normal equations."""
+        terms, n = self._terms(degree), self.right.shape[2]
+        count = terms.shape[1]
+        pairs = (weights[:, None, None] * terms[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
+        gram = (pairs.T @ self.gram[colour].reshape(len(terms), -1)).reshape(count, count, n, n)
+        whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count).astype(np.complex128)
+        right = (self.right[colour].T @ (weights[:, None] * terms)).reshape(n * count).astype(np.complex128)
+        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole).real) / len(whole), 1e-30)
+        inverse = np.linalg.inv(whole)
+        return (inverse @ right).reshape(n, count), inverse
+
+    def held_out(self, degree: int) -> float:
+        """Log likelihood that coefficients gain over the mean alone, on the blocks that they were not fitted to."""
+        total = -self.explained(None)
+        for colour, weights in enumerate(self.weights):
+            for fold in (self.odd, ~self.odd):
+                if not fold.any() or fold.all():
+                    continue
+                c, _ = self._solved(colour, np.where(fold, 0.0, weights), degree)
+                total += float((weights * self._gains(colour, self._local(c, degree)))[fold].sum()) / 2
+        return total
+
+    def explained(self, other: Shadow | None) -> float:
+        """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none."""
+        total, n = 0.0, self.right.shape[2]
+        for colour, weights in enumerate(self.weights):
+            local = np.zeros((len(weights), n), dtype=np.complex128)
+            if other is not None:
+                c = other.coefficients[min(colour, len(other.coefficients) - 1)]
+                local = _terms(self.centres, self.shape, other.degree) @ np.concatenate([0 * c[:1], c, c.conj()]).T
+            local[:, 0] = 1
+            image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
+            found = (local.conj() * (self.right[colour] + self.gram[colour][:, :, 0])).sum(axis=1).real
+            whole = (local.conj() * image).sum(axis=1).real
+            local *= (weights @ found) / max(float(weights @ whole), 1e-30)
+            local[:, 0] -= 1
+            total += float((weights * self._gains(colour, local)).sum()) / 2
+        return total
+
+    def fitted(self, degree: int) -> Shadow:
+        """The frame's own shadow; each term is trusted as far as it stands above its error between blocks."""
+        half = slice(1, len(self.orders) + 1)
+        coefficients, sigmas = [], []
+        for colour, weights in enumerate(self.weights):
+            c, inverse = self._solved(colour, weights, degree)
+            local, terms = self._local(c, degree), self._terms(degree)
+            image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
+            scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
+            errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
+            variance = (np.abs(errors) ** 2).sum(axis=0)
+            trust = np.clip(1 - variance / np.maximum(np.abs(c) ** 2, 1e-30), 0, 1)
+            coefficients.append((c * trust)[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
+            sigmas.append(math.sqrt(2 * float(((trust * variance)[half] @ (terms**2).mean(axis=0)).sum())))
+        return Shadow(
+            self.shape, self.at, self.orders, np.array(coefficients), degree, ShadowFrom.FRAME, np.array(sigmas)
+        )
+
+    def lattice(self) -> Lattice | None:
+        """The lattice that the phases of the blocks agree on best, by one Gauss–Newton step; None where it is so near
+        that nothing changes."""
+        half, count = np.array(self.orders, dtype=np.float64), len(self.orders)
+        normal, right = np.zeros((4 + count, 4 + count)), np.zeros(4 + count)
+        bins = np.repeat(1 / np.array(self.shape), 2)  # δ as rows (ky, kx) of columns (y, x), in columns y y x x
+        for colour, weights in enumerate(self.weights):
+            c = self._solved(colour, weights, 0)[0][1 : count + 1, 0]
+            own = self.gram[colour][:, 0, 0].real
+            for k, order in enumerate(half):
+                turned = weights * (np.conj(c[k]) * self.right[colour][:, k + 1]).imag
+                sure = weights * own * abs(c[k]) ** 2
+                lever = 2 * np.pi * np.column_stack([self.centres[:, [0]] * order, self.centres[:, [1]] * order]) * bins
+                normal[:4, :4] += (lever * sure[:, None]).T @ lever
+                normal[:4, 4 + k] += lever.T @ sure
+                normal[4 + k, 4 + k] += sure.sum()
+                right[:4] += lever.T @ turned
+                right[4 + k] += turned.sum()
+        normal[4:, :4] = normal[:4, 4:].T
+        normal += np.diag([*[1 / _FOUND_BINS**2] * 4, *[1e-9] * count])
+        step = np.linalg.solve(normal, right)[:4]
+        if float(np.abs(step).max()) < _STILL_BINS:
+            return None
+        delta = (step * bins).reshape(2, 2).T  # rows ky, kx
+        (a, b), (c2, d) = self.at.matrix() + delta
+        return Lattice((float(a), float(b)), (float(c2), float(d)))

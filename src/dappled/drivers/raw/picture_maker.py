@@ -1,0 +1,217 @@
+"""Make the picture at the sensor's own resolution of a frame's file, by the recipe that light fields are decoded by."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rawpy
+from numpy.typing import NDArray
+
+from dappled.config import profiles
+from dappled.decode import srgb
+from dappled.decode.array_types import Floats
+from dappled.decode.decoder import MaskDecoder
+from dappled.decode.lightfield.aperture import SHAPES, Aperture, angular_frequencies, kappa, transfer
+from dappled.decode.optics import LAWS, Lattice, Order, Sensor
+from dappled.decode.optics.visibility import OrderStrength, order_strengths
+from dappled.decode.picture.blocks import EMPTY, MosaicPlane
+from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
+from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of, shadow_of
+from dappled.decode.spectrum import plane as planes
+from dappled.drivers.raw import reading
+from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
+from dappled.findings import Code, Finding, Level, Subject, finding, worst
+
+_TURNED, _SCALED = 0.03, 0.02  # radians, and of the period: how far a mask may lie from a law's prediction
+_TURNED_SINCE, _SCALED_SINCE = 0.02, 0.006  # since its calibration
+_WEAK = 2e-3  # of the mean: orders that are never stronger cast no shadow that is worth its error
+_DEEP = 0.03  # standard deviation of W: where as much is predicted at least, some must be found
+_UNCERTAIN = 0.02  # standard error of W
+_TOLD_SIGMA = 0.02  # of a predicted W: f-number and stop
+_MANY_DARK = 0.01  # of the pixels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MadePicture:
+    """The picture of one file: `raw` is the file's, `sensor` that of `picture` (a staggered chip's is spread),
+    `colour_matrix` (3, 3) from XYZ to the camera's red, green and blue, None where LibRaw knows none."""
+
+    picture: UnmaskedPicture
+    raw: RawFile
+    sensor: Sensor
+    focal_length_mm: float
+    f_number: float | None
+    colour_matrix: Floats | None
+    findings: tuple[Finding, ...]
+
+    @property
+    def in_doubt(self) -> bool:
+        """Whether anything is worse than a note."""
+        return worst(self.findings) > Level.NOTE
+
+
+class PictureMaker:
+    """Makes pictures of frames by one recipe; keeps the shadow of its white frame."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self._darkroom = Darkroom(replace(recipe, white=""))
+        self._recipe = recipe
+        self._white: Shadow | None = None
+
+    def check(self) -> None:
+        """Raise DappledError when the recipe names something that is missing or wrong, or lenslets."""
+        if self._recipe.mask == profiles.LENSLET:
+            raise DarkroomError("a picture of full resolution is made behind printed masks, not behind lenslets")
+        Darkroom(self._recipe).check()
+
+    def picture(
+        self, path: Path | str, *, focal_length_mm: float | None = None, f_number: float | None = None
+    ) -> MadePicture:
+        """The picture of a frame; arguments that are None are taken from its file. Raises DappledError."""
+        raw = self._darkroom.read(path)
+        focal_length_mm, f_number = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
+        if focal_length_mm is None:
+            raise DarkroomError(f"{path}: its focal length is unknown: give it with --focal-length")
+        with self._darkroom.naming(path):
+            mosaic = self._mosaic(raw)
+            decoder = self._darkroom.mask_decoder(mosaic.shape, raw.camera_model or "")
+            shadow = self._shadow(mosaic, decoder, focal_length_mm, f_number)
+            made = picture_of(mosaic, shadow, period_of(shadow.lattice))
+        found = self._findings(Subject("frame", str(path)), raw, made, decoder, (focal_length_mm, f_number))
+        return MadePicture(made, raw, decoder.sensor, focal_length_mm, f_number, _colour_matrix(path, raw), found)
+
+    def _mosaic(self, raw: RawFile) -> MosaicPlane:
+        """A frame's linear values with its colours as they are; a staggered chip's samples at their places."""
+        cfa, black = raw.colour_pattern()
+        pattern = np.zeros((1, 1), dtype=np.intp) if cfa is None else np.asarray(cfa, dtype=np.intp)
+        dark = reading.read(Path(self._recipe.dark)).mosaic if self._recipe.dark else None
+        ones = np.ones(int(pattern.max()) + 1)
+        plane = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=ones, dark=dark)
+        if raw.developed:
+            plane = np.asarray(srgb.decoded(np.clip(plane, 0, 1)), dtype=np.float32)
+        valid = shares_of_white(raw, 1) < WHITE_SHARE
+        profile = self._darkroom.camera(raw.camera_model or "")
+        if profile.staggered(plane.shape):
+            plane, valid, pattern = _spread(plane), _spread(valid), _spread_pattern(pattern)
+        return MosaicPlane(plane, pattern, None if valid.all() else valid)
+
+    def _shadow(
+        self, mosaic: MosaicPlane, decoder: MaskDecoder, focal_length_mm: float, f_number: float | None
+    ) -> Shadow:
+        orders, lattice = _orders(decoder, focal_length_mm, f_number), decoder.lattice_at(focal_length_mm)
+        known = decoder.calibration is not None
+        others = [self._white_shadow(decoder, orders, lattice)] if self._recipe.white else []
+        if known and f_number:
+            others += _told(decoder, mosaic, orders, focal_length_mm=focal_length_mm, f_number=f_number)
+        turned, scaled = (_TURNED_SINCE, _SCALED_SINCE) if known else (_TURNED, _SCALED)
+        made = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others)
+        if made.source == ShadowFrom.NONE and self._recipe.try_laws and not known:
+            for law in LAWS:
+                if law != decoder.law and (there := replace(decoder, law=law)).predict(focal_length_mm)[1:]:
+                    orders, lattice = _orders(there, focal_length_mm, f_number), there.lattice_at(focal_length_mm)
+                    tried = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
+                    made = tried if tried.source != ShadowFrom.NONE else made
+        return made
+
+    def _white_shadow(self, decoder: MaskDecoder, orders: list[Order], lattice: Lattice) -> Shadow:
+        if self._white is None:
+            with self._darkroom.naming(self._recipe.white):
+                mosaic = self._mosaic(self._darkroom.read(self._recipe.white))
+                found = shadow_of(mosaic, lattice, orders, turned=_TURNED, scaled=_SCALED)
+                self._white = replace(found, source=ShadowFrom.WHITE)
+        return self._white
+
+    def _findings(
+        self,
+        subject: Subject,
+        raw: RawFile,
+        made: UnmaskedPicture,
+        decoder: MaskDecoder,
+        lens: tuple[float, float | None],
+    ) -> tuple[Finding, ...]:
+        found, shadow = [], made.shadow
+        if raw.developed:
+            found.append(finding(Code.PICTURE_DEVELOPED, subject, why=raw.developed))
+        clipped = float(np.mean(shares_of_white(raw, 1) >= WHITE_SHARE))
+        if clipped > MOST_CLIPPED:
+            found.append(finding(Code.PICTURE_CLIPPED, subject, share=clipped))
+        if shadow.source == ShadowFrom.NONE:
+            least = _least_depth(decoder, *lens)
+            level = Level.CAUTION if least > _DEEP else Level.NOTE
+            found.append(finding(Code.PICTURE_SHADOW_UNSEEN, subject, level, least_depth=least))
+        elif float(shadow.sigma.max()) > _UNCERTAIN:
+            found.append(finding(Code.PICTURE_SHADOW_UNCERTAIN, subject, sigma=float(shadow.sigma.max())))
+        if made.dark_share > _MANY_DARK:
+            found.append(finding(Code.PICTURE_DARK, subject, share=made.dark_share, below=DARK))
+        return tuple(found)
+
+
+def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[Order]:
+    """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them."""
+    predicted = _strengths(decoder, focal_length_mm, f_number)
+    return [one.order for one in predicted if one.most > _WEAK] or [one.order for one in predicted]
+
+
+def _strengths(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[OrderStrength]:
+    lattice = decoder.lattice_at(focal_length_mm)
+    distance = decoder.mask_distance_mm
+    if decoder.calibration is not None:
+        distance = decoder.calibration.nearest(focal_length_mm).mask_distance_mm
+    found = order_strengths(decoder.mask, decoder.sensor, lattice, mask_distance_mm=distance, f_number=f_number)
+    return [one for one in found if one.on_sensor]
+
+
+def _least_depth(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> float:
+    """The least standard deviation of W that is predicted."""
+    return math.sqrt(2 * sum(one.least**2 for one in _strengths(decoder, focal_length_mm, f_number)))
+
+
+def _told(
+    decoder: MaskDecoder, mosaic: MosaicPlane, orders: list[Order], *, focal_length_mm: float, f_number: float
+) -> list[Shadow]:
+    """What a calibration predicts, behind a stop of each shape."""
+    assert decoder.calibration is not None
+    known = decoder.calibration.nearest(focal_length_mm)
+    magnitudes = dict(zip(decoder.mask.half_orders(), known.transfer, strict=True))
+    transfers = transfer(orders, [magnitudes[order] for order in orders], known.origin)
+    cycles = kappa(decoder.mask.frequency_per_mm * known.print_scale, known.mask_distance_mm, focal_length_mm, f_number)
+    angular = angular_frequencies(orders, cycles, known.rotation_rad)
+    lattice = decoder.lattice_at(focal_length_mm)
+    made = []
+    for shape in SHAPES:
+        through = transfers * Aperture(decoder.mask.views_per_axis, shape).transform(angular)
+        each = np.repeat(through[None, :, None], mosaic.colours, axis=0)
+        sigma = np.full(mosaic.colours, _TOLD_SIGMA)
+        made.append(Shadow(mosaic.shape, lattice, tuple(orders), each, 0, ShadowFrom.CALIBRATION, sigma))
+    return made
+
+
+def _spread(values: NDArray[Any]) -> NDArray[Any]:
+    """A staggered chip's samples at their places, on twice as many columns; what is between is 0."""
+    wide = np.zeros((values.shape[0], 2 * values.shape[1]), dtype=values.dtype)
+    wide[0::2, 0::2], wide[1::2, 1::2] = values[0::2], values[1::2]
+    return wide
+
+
+def _spread_pattern(pattern: NDArray[np.intp]) -> NDArray[np.intp]:
+    rows = pattern if len(pattern) % 2 == 0 else np.tile(pattern, (2, 1))
+    wide = np.full((len(rows), 2 * rows.shape[1]), EMPTY, dtype=np.intp)
+    wide[0::2, 0::2], wide[1::2, 1::2] = rows[0::2], rows[1::2]
+    return wide
+
+
+def _colour_matrix(path: Path | str, raw: RawFile) -> Floats | None:
+    """LibRaw's matrix of the body, from XYZ to red, green and blue; None where it knows none."""
+    if raw.cfa is None:
+        return None
+    try:
+        with rawpy.imread(str(path)) as file:
+            matrix = np.asarray(file.rgb_xyz_matrix, dtype=np.float64)[:3]
+    except rawpy.LibRawError:
+        return None
+    return matrix if np.any(matrix) else None

@@ -1,0 +1,111 @@
+"""The mask's shadow from frames alone, against rays that share nothing with dappled: what raw over it leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
+from dappled.decode.picture.blocks import MosaicPlane
+from dappled.decode.picture.picture import UnmaskedPicture, picture_of
+from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of, shadow_of
+from tests.decode.picture.full_rays import Shot, psnr
+
+MASK = Mask(15.5, 2)
+GREY = np.zeros((1, 1), dtype=np.intp)
+
+
+def _lattice(shot: Shot) -> Lattice:
+    """What the law predicts of the print as it was drawn."""
+    return geometric(MASK, Sensor(shot.shape, (0.01, 0.0), (0.0, 0.01)), 0.48, 50.0)
+
+
+def _shadow(shot: Shot, mosaic: MosaicPlane, *others: Shadow) -> Shadow:
+    return shadow_of(mosaic, _lattice(shot), MASK.half_orders(), turned=0.03, scaled=0.02, others=others)
+
+
+def _picture(shot: Shot, mosaic: MosaicPlane | None = None) -> UnmaskedPicture:
+    mosaic = mosaic or MosaicPlane(shot.frame, GREY)
+    return picture_of(mosaic, _shadow(shot, mosaic), period_of(_lattice(shot)))
+
+
+@pytest.mark.parametrize(
+    ("shot", "least_db"),
+    [
+        (Shot(disparity_px=0.03), 44),
+        (Shot(disparity_px=0.1), 43),
+        (Shot(disparity_px=0.1, exponent=1.5), 45),
+        (Shot(disparity_px=0.3), 37),
+        (Shot(disparity_px=1.0, exponent=1.5), 37),
+        (Shot(snr=20), 32),
+        (Shot(f_number=15.0), 42),
+        (Shot(f_number=25.0), 41),
+        (Shot(f_number=62.0), 39),
+        (Shot(stop="square", f_number=9.9), 42),
+        (Shot(scale=1.003), 43),
+        (Shot(scale=0.998, turn_deg=1.0, shift_mm=(0.05, -0.03), falloff=0.4), 43),
+    ],
+    ids=repr,
+)
+def test_raw_over_its_own_shadow_is_as_good_as_over_the_true_one(shot: Shot, least_db: float) -> None:
+    found = psnr(_picture(shot).plane, shot.truth)
+    assert found >= psnr(shot.frame / shot.shadow, shot.truth) - 0.4
+    assert found >= least_db
+    assert found > psnr(shot.frame, shot.truth) + 8
+
+
+def test_the_lattice_is_found_where_the_print_stands() -> None:
+    shot = Shot(scale=1.003, turn_deg=-0.7)
+    found = _shadow(shot, MosaicPlane(shot.frame, GREY)).lattice.matrix()
+    predicted = _lattice(shot).matrix()[0, 0]
+    assert np.hypot(*found[0]) / predicted == pytest.approx(1.003, abs=2e-4)
+    assert np.degrees(np.arctan2(found[0, 1], found[0, 0])) == pytest.approx(-0.7, abs=0.02)
+
+
+def test_its_error_is_told() -> None:
+    shot = Shot(disparity_px=0.0, snr=50)
+    shadow = _shadow(shot, MosaicPlane(shot.frame, GREY))
+    off = shadow.at(next(MosaicPlane(shot.frame, GREY).places())) - shot.shadow
+    assert 0.5 < off.std() / shadow.sigma[0] < 2
+
+
+def test_clipped_pixels_are_left_out_and_not_trusted() -> None:
+    shot = Shot(f_number=15.0)
+    limit = float(np.quantile(shot.frame, 0.95))
+    valid = shot.frame < limit
+    found = _picture(shot, MosaicPlane(np.minimum(shot.frame, np.float32(limit)), GREY, valid))
+    assert (
+        np.abs(found.shadow.at(next(MosaicPlane(shot.frame, GREY).places())) - shot.shadow).std() < 0.025
+    )  # 0.32 of it is shadow
+    assert not found.trusted[~valid].any()
+    assert psnr(np.where(valid, found.plane, shot.truth), shot.truth) > 40
+
+
+def test_each_colour_has_a_shadow_of_its_own() -> None:
+    shots = [Shot(f_number=f, shape=(256, 320)) for f in (15.0, 12.0, 20.0)]
+    pattern = np.array([[0, 1], [1, 2]])
+    index = np.tile(pattern, (128, 160))
+    frame = np.choose(index, [one.frame * gain for one, gain in zip(shots, (0.5, 1.0, 0.7), strict=True)])
+    found = _picture(shots[1], MosaicPlane(frame.astype(np.float32), pattern))
+    truth = np.choose(index, [one.truth * gain for one, gain in zip(shots, (0.5, 1.0, 0.7), strict=True)])
+    assert psnr(found.plane, truth) > 40
+
+
+def test_where_the_mask_lets_little_through_the_picture_is_not_trusted() -> None:
+    shot = Shot(f_number=62.0)
+    found = _picture(shot)
+    dark = shot.shadow < 0.15
+    assert dark.any()
+    assert not found.trusted[dark].any()
+    assert found.sigma[dark].mean() > 3 * found.sigma[shot.shadow > 1].mean()
+
+
+def test_a_shadow_that_a_white_frame_shows_goes_before_none() -> None:
+    shot = Shot(disparity_px=0.1, exponent=1.1, contrast=0.3, snr=20, shape=(96, 96))
+    card = replace(shot, white=True, shape=(288, 352))
+    white = _shadow(card, MosaicPlane(card.frame, GREY))
+    told = replace(white, shape=shot.shape, source=ShadowFrom.WHITE)
+    made = _shadow(shot, MosaicPlane(shot.frame, GREY), told)
+    assert made.source == ShadowFrom.WHITE
