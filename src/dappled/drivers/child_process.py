@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.clock import Clock, SystemClock
+from dappled.drivers.reader_process import python_module
 from dappled.workers import Loop
 
 _MESSAGE_BYTES = 131072  # below net.core.wmem_default, 212992, which bounds a packet
@@ -210,12 +211,6 @@ def _parsed(raw: bytes, flags: int) -> dict[str, Any]:
 
 
 # --- in the parent
-
-
-def python_module(module: str, *arguments: str) -> list[str]:
-    """Return the command that runs a module with this Python. `-P`: Python would look for modules in the current folder
-    first, and that may be a stranger's."""
-    return [sys.executable, "-P", "-m", module, *arguments]
 
 
 def start_child(

@@ -11,6 +11,7 @@ import pytest
 from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import ulog
 from dappled.drivers.mavlink.ulog import ULogError
+from dappled.drivers.reader_process import Budget
 from dappled.mocks.autopilot.path import FlightPath
 from tests.drivers.mavlink.true_logs import (
     BOOT_US,
@@ -119,3 +120,32 @@ def test_estimates_that_px4_calls_invalid_are_left_out(tmp_path: Path) -> None:
 def test_utc_holds_at_the_time_that_the_receivers_message_says(tmp_path: Path) -> None:
     stamps = [stamp_us for _, stamp_us, _ in ulog.packets(ulog_written(tmp_path, ahead_us=40_000))]
     assert stamps[0] == UTC_US
+
+
+def nested(levels: int) -> bytes:
+    """A log of a few hundred bytes whose topic has 8 to the power of `levels` fields: formats within formats."""
+    formats = [f"l{n}:" + "".join(f"l{n + 1} {field};" for field in "abcdefgh") for n in range(levels)]
+    formats += [f"l{levels}:uint8_t a;", "vehicle_attitude:uint64_t timestamp;l0 a;"]
+    head = b"ULog\x01\x12\x35\x01" + bytes(8)
+    return head + b"".join(ulog_message("F", one.encode()) for one in formats) + ulog_message(
+        "A", struct.pack("<BH", 0, 1) + b"vehicle_attitude"
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("data", "budget", "says"),
+    [
+        (nested(8), Budget(1e6, memory=1 << 27), "has more than 10000 fields"),
+        (b"ULog\x01\x12\x35\x01" + bytes(600_000), Budget(1e9, patience_s=1.0), "not come to an end|no messages"),
+    ],
+    ids=["formats in formats", "zeros"],
+)
+def test_a_log_that_is_made_to_exhaust_the_machine_is_one_sentence(
+    data: bytes, budget: Budget, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(ulog, "_BUDGET", budget)
+    path = tmp_path / "1.ulg"
+    path.write_bytes(data)
+    assert len(data) < 1000 or not any(data[8:])
+    with pytest.raises(ULogError, match=f"1.ulg.*({says})"):
+        list(ulog.packets(path))

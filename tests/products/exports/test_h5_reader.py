@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dappled.drivers.reader_process import Budget
 from dappled.products.exports import h5_reader
 from dappled.products.exports.light_files import LightFileError, load, save
 from tests.products.exports.test_light_files import light_field
@@ -38,7 +39,7 @@ def test_a_library_that_hangs_or_crashes_is_a_sentence(
     other.write_text(f"#!/bin/sh\nexec sh -c '{program}'\n")
     other.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(other))
-    monkeypatch.setattr(h5_reader, "_PATIENCE_S", 0.5)
+    monkeypatch.setattr(h5_reader, "_BUDGET", Budget(20e6, patience_s=0.5))
     with pytest.raises(LightFileError, match=words) as caught:
         load(h5)
     assert str(h5) in str(caught.value)

@@ -7,8 +7,7 @@ the receiver `vehicle_gps_position` (or `sensor_gps`). UTC comes from the receiv
 from __future__ import annotations
 
 import contextlib
-import errno
-import io
+import importlib.util
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,8 +16,8 @@ from typing import Any, Self
 
 import numpy as np
 
-from dappled import durable
 from dappled.decode.array_types import Floats
+from dappled.drivers import reader_process
 from dappled.drivers.mavlink import log_evidence, log_packets
 from dappled.drivers.mavlink.log_evidence import (
     BOOT_MAX_US,
@@ -30,6 +29,7 @@ from dappled.drivers.mavlink.log_evidence import (
     Receiver,
 )
 from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
+from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import UtcBounds
 from dappled.errors import first_line, install_extra
 from dappled.findings import Finding
@@ -42,6 +42,7 @@ _PLACES, _SPEEDS, _TURNS, _HOME = (
 )
 _TRIGGERS, _CAPTURES = "camera_trigger", "camera_capture"
 _RECEIVERS = ("vehicle_gps_position", "sensor_gps")
+_BUDGET = Budget(bytes_a_second=1e6, ratio=16)  # pyulog reads some megabytes a second
 _HEADER_BYTES = 16
 _MESSAGE = struct.Struct("<HB")  # before each message: its length and its kind
 _GAP_US = 1_000_000  # an estimate further away says no place
@@ -141,12 +142,9 @@ class _Topics:
     @classmethod
     def read(cls, path: Path, names: Sequence[str]) -> Self:
         """A log that was cut off is read up to there."""
-        log = _opened(path, names)
-        first = {one.name: one.data for one in reversed(log.data_list) if one.multi_id == 0}
-        receivers = {
-            name: [one.data for one in sorted(log.data_list, key=lambda one: int(one.multi_id)) if one.name == name]
-            for name in _RECEIVERS
-        }
+        topics = _opened(path, names)
+        first = {name: data for (name, instance), data in topics.items() if instance == 0}
+        receivers = {name: [topics[key] for key in sorted(topics) if key[0] == name] for name in _RECEIVERS}
         stamps = [
             topic["timestamp"] for topic in (*first.values(), *(one for each in receivers.values() for one in each))
         ]
@@ -169,32 +167,25 @@ class _Topics:
         return np.where(topic["timestamp_sample"] > 0, sampled, published)
 
 
-def _opened(path: Path, names: Sequence[str]) -> Any:
-    """pyulog's log with these topics and the receivers'."""
+def _opened(path: Path, names: Sequence[str]) -> dict[tuple[str, int], dict[str, Any]]:
+    """These topics and the receivers', by name and instance."""
+    if importlib.util.find_spec("pyulog") is None:  # an extra; only this log needs it
+        raise ULogError(f"{path} is a log of PX4, and that needs pyulog; {install_extra('ground')}")
     try:
-        from pyulog import ULog  # noqa: PLC0415  an extra; only this log needs it
-        from pyulog.exceptions import ULogException  # noqa: PLC0415
-    except ImportError:
-        raise ULogError(f"{path} is a log of PX4, and that needs pyulog; {install_extra('ground')}") from None
-    wanted = [*names, *_RECEIVERS]
-    try:
-        with open(path, "rb", opener=durable.without_waiting) as file, contextlib.redirect_stdout(io.StringIO()):
-            return ULog(file, wanted)  # it prints what it skips
+        arrays, _ = reader_process.read(
+            "dappled.drivers.mavlink.ulog_reader", path, (*names, *_RECEIVERS), library="pyulog", budget=_BUDGET
+        )
     except OSError as error:
-        if error.errno != errno.EINVAL:  # pyulog seeks to before the start of a file in which nothing makes sense
-            raise ULogError(f"{path} can't be read: {error.strerror}") from None
-        raise ULogError(f"{path} is damaged as a log of PX4 (cut off, or not one): copy it again") from None
-    except (
-        ULogException,
-        ValueError,
-        TypeError,
-        KeyError,
-        IndexError,
-        AttributeError,
-        RecursionError,
-        struct.error,
-    ) as error:
+        raise ULogError(f"{path} can't be read: {error.strerror}") from None
+    except MemoryError as error:
+        raise ULogError(f"{path} is damaged as a log of PX4, or made to exhaust memory: {error}") from None
+    except ValueError as error:
         raise ULogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
+    topics: dict[tuple[str, int], dict[str, Any]] = {}
+    for name, values in arrays.items():
+        topic, instance, field = name.split("/", 2)
+        topics.setdefault((topic, int(instance)), {})[field] = values
+    return topics
 
 
 def _clock(

@@ -21,8 +21,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.drivers.child_process import python_module
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
+from dappled.drivers.reader_process import python_module
 from dappled.mocks.autopilot.on_request import OnRequest
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.autopilot.personality import PERSONALITIES, CameraPort, CameraTriggers

@@ -8,7 +8,7 @@ import subprocess
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from dappled.drivers.child_process import python_module
+from dappled.drivers.reader_process import python_module
 
 END_S = 20.0
 

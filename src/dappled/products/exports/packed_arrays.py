@@ -18,7 +18,7 @@ import numpy as np
 
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
-from dappled.bounds.parsing import MOST_BYTES, parse_json, read_bytes
+from dappled.bounds.parsing import MOST_BYTES, parse_json, read_log
 
 _METADATA = "zarr.json"
 _MOST_CHUNKS = 20_000  # a light field has one for each slice and view
@@ -85,7 +85,7 @@ def check_h5(file: Any, names: Collection[str], text_name: str) -> None:
 
 
 def _metadata(path: Path, kind: str, what: str) -> dict[str, Any]:
-    found = _mapping(parse_json(read_bytes(path)), f"metadata of {what}")
+    found = _mapping(parse_json(read_log(path)), f"metadata of {what}")
     if found.get("node_type") != kind:
         raise ClaimError(f"its {what} is not a Zarr {kind}: make it anew")
     return found

@@ -1,0 +1,145 @@
+"""Read strangers' files in processes of their own, within a budget of time and memory.
+
+The libraries that read them hang, crash, and take what memory there is, on bytes that somebody made for that.
+The process writes arrays end to end into a temporary file, and an answer in JSON to its standard output: `{"arrays":
+[[name, dtype, shape], …], "text": …}`, or `{"kind": …, "words": …}` for a file that is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import mmap
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dappled.bounds import claims
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import parse_json, stored_size
+from dappled.errors import first_line
+
+_ANSWER_BYTES = 8 << 20  # twice the longest text, for JSON's escapes
+_STATM = Path("/proc/self/statm")
+_RAISED: dict[str, type[Exception]] = {
+    "claim": ClaimError,
+    "key": KeyError,
+    "damage": ValueError,
+    "memory": MemoryError,
+}
+ReadArrays = tuple[Iterable[tuple[str, NDArray[Any]]], str]
+"""Arrays with their names, of which one at a time is in memory, and a text."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What reading one file may take: `patience_s`, and a second more for so many bytes of it; memory of `memory`
+    bytes, and `ratio` bytes more for each of its bytes."""
+
+    bytes_a_second: float
+    patience_s: float = 20.0  # a loaded machine takes seconds to start Python
+    memory: int = 2 * claims.FREE_BYTES
+    ratio: int = claims.RATIO
+
+
+def python_module(module: str, *arguments: str) -> list[str]:
+    """Return the command that runs a module with this Python. `-P`: Python would look for modules in the current folder
+    first, and that may be a stranger's."""
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+def read(
+    module: str, path: Path, words: Sequence[str], *, library: str, budget: Budget
+) -> tuple[dict[str, NDArray[Any]], str]:
+    """Let `python -m module` read a file: it calls `serve`. The arrays may be written to.
+
+    Raises ClaimError for a file that claims too much, KeyError for what is missing, ValueError for a damaged file,
+    MemoryError, and OSError.
+    """
+    with tempfile.TemporaryDirectory(prefix="dappled-", ignore_cleanup_errors=True) as folder:
+        out, size = Path(folder, "arrays"), stored_size(path)
+        memory = budget.memory + budget.ratio * size
+        try:
+            done = subprocess.run(
+                python_module(module, str(path), str(out), str(memory), *words),
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                timeout=budget.patience_s + size / budget.bytes_a_second,
+                check=False,
+                env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
+            )
+        except subprocess.TimeoutExpired:
+            raise ValueError(f"the {library} library did not come to an end with it") from None
+        if done.returncode != 0:
+            raise ValueError(f"the {library} library failed on it")
+        answer = parse_json(done.stdout, _ANSWER_BYTES)
+        if "kind" in answer:
+            raise _RAISED[answer["kind"]](answer["words"])
+        return _mapped(out, answer["arrays"]), answer["text"]
+
+
+def serve(answer: Callable[[str, Sequence[str]], ReadArrays]) -> None:
+    """In the process: let `answer(path, words)` read the file, and hand over what it returns or raises."""
+    path, out, memory, *words = sys.argv[1:]
+    _limit(int(memory))
+    stdout = sys.stdout
+    sys.stdout = sys.stderr  # libraries print
+    stdout.write(json.dumps(_answered(answer, path, words, out, int(memory))))
+    stdout.flush()
+
+
+def _answered(
+    answer: Callable[[str, Sequence[str]], ReadArrays], path: str, words: Sequence[str], out: str, memory: int
+) -> dict[str, Any]:
+    try:
+        arrays, text = answer(path, words)
+        with open(out, "wb") as file:
+            return {"arrays": [_written(file, name, array) for name, array in arrays], "text": text}
+    except ClaimError as error:
+        return {"kind": "claim", "words": str(error)}
+    except KeyError as error:
+        return {"kind": "key", "words": str(error.args[0])[:200]}
+    except MemoryError:
+        _limit(None)
+        most = claims.in_words(memory)
+        return {"kind": "memory", "words": f"it takes more memory to read than is free, or than {most}"}
+    except Exception as error:  # noqa: BLE001  # these libraries raise anything on damaged bytes
+        return {"kind": "damage", "words": first_line(error)}
+
+
+def _written(file: IO[bytes], name: str, array: NDArray[Any]) -> tuple[str, str, list[int]]:
+    array = np.ascontiguousarray(array)
+    file.write(array.reshape(-1).view(np.uint8).data)
+    return name, array.dtype.str, list(array.shape)
+
+
+def _limit(memory: int | None) -> None:
+    """Limit the memory that this process may take from now on, where the system can; None: end the limit."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource  # noqa: PLC0415  # Windows has none
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        taken = int(_STATM.read_text(encoding="ascii").split()[0]) * resource.getpagesize()
+        resource.setrlimit(resource.RLIMIT_AS, (most if memory is None else taken + memory, most))
+
+
+def _mapped(path: Path, described: list[tuple[str, str, list[int]]]) -> dict[str, NDArray[Any]]:
+    """The arrays in a file. They may be written to: the pages are this process' own from then on."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        data = memoryview(mmap.mmap(file.fileno(), size, access=mmap.ACCESS_COPY)) if size else memoryview(bytearray())
+    found, at = {}, 0
+    for name, kind, shape in described:
+        count = math.prod(shape)
+        found[name] = np.frombuffer(data, kind, count, at).reshape(shape) if count else np.empty(shape, kind)
+        at += found[name].nbytes
+    return found
