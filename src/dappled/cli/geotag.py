@@ -13,11 +13,14 @@ from typing import Any
 from tqdm import tqdm
 
 from dappled.cli import sealing
+from dappled.cli.arguments import system_id
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import late_tags
+from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.decode.geometry import Vector3, camera_pose
 from dappled.errors import DappledError, counted
-from dappled.flight import layout, seals
+from dappled.findings import told
+from dappled.flight import Tag, layout, seals
 from dappled.flight.layout import LockHeldError
 from dappled.flight.seal_key import SealKey
 from dappled.products.geotags import geotags, marks
@@ -65,6 +68,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--copies", type=Path, metavar="DIR", help="also write copies of the frames with their position in EXIF"
     )
+    parser.add_argument(
+        "--vehicle", type=system_id, metavar="SYSID",
+        help="system id of the vehicle that carried the camera (default: the one that the flight followed)",
+    )  # fmt: skip
+    parser.add_argument("--anyway", action="store_true", help="exit with 0 though results are in doubt")
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings file, for record.seal_key")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -73,7 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
     facts = layout.read_facts(layout.open_folder(arguments.flight))
     key = sealing.key_of(arguments.config)
     into_flight = arguments.output is None
-    tagged_late = _tag_late(arguments.flight, key, into_flight=into_flight)
+    tagged_late = _tag_late(arguments.flight, key, arguments.vehicle, into_flight=into_flight)
+    tags, doubts = _vehicle(arguments)
     mounting, geoid = _mounting(arguments, facts), _geoid(arguments.geoid)
     marked = None
     if arguments.pos:
@@ -86,14 +95,17 @@ def run(arguments: argparse.Namespace) -> int:
             mounting,
             geoid=geoid,
             marked=marked,
+            tags=tags,
             output=arguments.output,
             replace_extension=arguments.lightroom,
             force=arguments.force,
         )
-    made = geotags.copies(arguments.flight, arguments.copies, mounting, geoid, marked) if arguments.copies else ()
+    copies_of = (arguments.flight, arguments.copies, mounting, geoid, marked)
+    made = geotags.copies(*copies_of, tags=tags) if arguments.copies else ()
     found = dict(tqdm(made, unit="frame", disable=None, delay=1.0, leave=False))
     copied = [str(path) for path in found.values() if isinstance(path, Path)]
     without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}
+    doubts += [f"{name}: {text}" for name, text in geotags.doubts(arguments.flight)]
     if arguments.json:
         print(
             json.dumps(
@@ -106,6 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
                     "copies": copied,
                     "without_copy": without_copy,
                     "geoid": geoid.name if geoid else None,
+                    "doubts": doubts,
                     "marks": _marks_json(marked) if marked else None,
                 },
                 indent=2,
@@ -128,7 +141,10 @@ def run(arguments: argparse.Namespace) -> int:
     for name, reason in without_copy.items():
         if name not in (*written.without_position, *written.without_tag):
             print(f"no copy of {name}: {reason}", file=sys.stderr)
-    return 0
+    for text in doubts:
+        print(f"in doubt: {text}", file=sys.stderr)
+    doubted = bool(doubts or (marked and marked.doubts))
+    return 1 if doubted and not arguments.anyway else 0
 
 
 def add_mark_arm(parser: argparse.ArgumentParser) -> None:
@@ -150,11 +166,24 @@ def mark_arm(arguments: argparse.Namespace, mounting: Mounting) -> Vector3:
     return (forward - own[0], right - own[1], down - own[2])
 
 
-def _tag_late(flight: Path, key: SealKey | None, *, into_flight: bool) -> list[int]:
+def _vehicle(arguments: argparse.Namespace) -> tuple[dict[int, Tag] | None, list[str]]:
+    """The tags by another vehicle than the flight followed, where one is named or evidence says so, and doubts."""
+    try:
+        tags, found = late_tags.by_vehicle(arguments.flight, arguments.vehicle)
+    except VehicleError as error:
+        if arguments.vehicle is not None:
+            raise
+        return None, [str(error)]
+    for one in found:
+        print(f"{one.level.word}: {told(one)}", file=sys.stderr)
+    return tags, []
+
+
+def _tag_late(flight: Path, key: SealKey | None, vehicle: int | None, *, into_flight: bool) -> list[int]:
     """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others. Raises
     LockHeldError, which no sidecar could be written under either."""
     try:
-        added = late_tags.add_missing(flight, TimeOfDayClock(), key)
+        added = late_tags.add_missing(flight, TimeOfDayClock(), key, vehicle)
     except DappledError as error:
         if into_flight and isinstance(error, LockHeldError):
             raise

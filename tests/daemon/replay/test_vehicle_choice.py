@@ -4,34 +4,22 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from dappled.cli import main
-from dappled.drivers.mavlink import MavlinkMessage, mavlink, pack
+from tests.daemon.replay.two_vehicles import (
+    Extra,
+    camera_of_2,
+    camera_of_both,
+    feedback_of_2,
+    nothing_more,
+    records,
+)
 
 STAMP_US = 1_795_256_103 * 10**6
-Extra = Callable[[int], list[tuple[int, int, MavlinkMessage]]]  # of a step: system, component, message
-
-
-def nothing_more(step: int) -> list[tuple[int, int, MavlinkMessage]]:
-    return []
-
-
-def camera_of_2(step: int) -> list[tuple[int, int, MavlinkMessage]]:
-    return [(2, 100, mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_CAMERA, 8, 0, 0, 4, 3))]
-
-
-def feedback_of_2(step: int) -> list[tuple[int, int, MavlinkMessage]]:
-    values = STAMP_US, 2, 0, step, 0, 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0
-    return [(2, 1, mavlink.MAVLink_camera_feedback_message(*values))]
-
-
-def camera_of_both(step: int) -> list[tuple[int, int, MavlinkMessage]]:
-    return [*camera_of_2(step), (1, 100, camera_of_2(step)[0][2])]
 
 
 @pytest.fixture
@@ -42,23 +30,10 @@ def frames(tmp_path: Path) -> Path:
 
 
 def logged(folder: Path, *, extra: Extra = nothing_more, moving: tuple[int, ...] = (), version_1: bool = False) -> Path:
-    """Ten seconds of vehicles 1 (at 10° north) and 2 (at 20° north); 1 is heard first."""
-    data = b""
-    for step in range(100):
-        packets = list(extra(step))
-        for system in (1, 2):
-            north = system * 10**8 + (step * 100 if system in moving else 0)
-            packets += [
-                (system, 1, mavlink.MAVLink_global_position_int_message(
-                    9000 + step * 100, north, 0, 10**5, 10**4, 0, 0, 0, 0
-                )),
-                (system, 1, mavlink.MAVLink_attitude_quaternion_message(9000 + step * 100, 1, 0, 0, 0, 0, 0, 0)),
-            ]  # fmt: skip
-        for system, component, message in packets:
-            packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-            data += struct.pack(">Q", STAMP_US + step * 100_000) + pack(message, packer, version_1=version_1)
-    (folder / "flight.tlog").write_bytes(data)
-    return folder / "flight.tlog"
+    log = folder / "flight.tlog"
+    found = records(STAMP_US, extra=extra, moving=moving, version_1=version_1)
+    log.write_bytes(b"".join(struct.pack(">Q", stamp_us) + raw for stamp_us, raw in found))
+    return log
 
 
 def north_deg(capsys: pytest.CaptureFixture[str]) -> float:

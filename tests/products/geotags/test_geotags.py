@@ -34,6 +34,7 @@ from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.maps.earth import Geoid
 from dappled.products.mounting import Mounting
+from tests.daemon.replay.two_vehicles import Extra, camera_of_2, nothing_more, records
 from tests.flight.makers import deliver, pose, request, tag
 from tests.needs import without
 
@@ -162,6 +163,58 @@ def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> 
     (point,) = json.loads((flight / "geotags" / "track.geojson").read_text())["features"]
     assert point["geometry"]["coordinates"][2] == pytest.approx(181.6)
     assert point["properties"]["gnss"]["fix_type"] == 6
+
+
+def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "") -> Path:
+    """A frame 5 s after the start of two vehicles' telemetry, tagged where the first one was."""
+    begun = recording.begin(root / "flights", RecordedClock(START_NS))
+    for stamp_us, raw in records(START_NS // 1000, extra=extra):
+        begun.telemetry.append(stamp_us, raw)
+    request(begun, 0)
+    made = replace(tag(deliver(begun, 0, b"raw")), utc_ns=START_NS + 5 * 10**9)
+    begun.ledger.add_tag(replace(made, pose=replace(pose(), latitude_rad=math.radians(10.0))))
+    if doubt:
+        begun.ledger.add_event("doubt", doubt, 0)
+    begun.close()
+    return begun.folder.path
+
+
+def tagged_north(flight: Path) -> float:
+    line = (flight / "geotags" / "geo.txt").read_text().splitlines()[1]
+    return float(line.split()[2])
+
+
+def test_the_vehicle_is_chosen_where_the_flight_never_knew_whose_the_camera_was(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = flown_by_two(tmp_path)
+    assert main(["geotag", str(flight)]) == 1
+    assert "vehicles 1 and 2" in capsys.readouterr().err
+    assert main(["geotag", str(flight), "--anyway"]) == 0
+    for vehicle in (2, 1):
+        assert main(["geotag", str(flight), "--vehicle", str(vehicle)]) == 0
+        assert tagged_north(flight) == pytest.approx(10.0 * vehicle)
+    assert main(["geotag", str(flight), "--vehicle", "9"]) == 1
+    assert "it holds vehicles 1 and 2" in capsys.readouterr().err
+
+
+def test_the_vehicle_that_reports_a_camera_is_taken_and_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flight = flown_by_two(tmp_path, camera_of_2)
+    assert main(["geotag", str(flight)]) == 0
+    assert "vehicle 2 counts, by its camera" in capsys.readouterr().err
+    assert tagged_north(flight) == pytest.approx(20.0)
+
+
+def test_a_frame_in_doubt_decides_the_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = flown_by_two(tmp_path, camera_of_2, "it may be of shot 7 as well")
+    assert main(["geotag", str(flight), "--json"]) == 1
+    shown = capsys.readouterr()
+    assert json.loads(shown.out)["doubts"] == ["frames/000000.cr2: it may be of shot 7 as well"]
+    assert "in doubt: frames/000000.cr2: it may be of shot 7 as well" in shown.err
+    assert (flight / "geotags" / "geo.txt").exists()
+    assert main(["geotag", str(flight), "--anyway"]) == 0
 
 
 def test_geo_txt_has_both_accuracies_or_none(tmp_path: Path) -> None:

@@ -231,6 +231,14 @@ def test_heights_that_are_off_by_a_geoid_are_doubted(tmp_path: Path) -> None:
     assert "30.2 m above" in found.doubts[0]
 
 
+def test_doubts_of_the_marks_decide_the_exit_code(tmp_path: Path) -> None:
+    path = pos(tmp_path, HEAD + "".join(line(at_s, up_m=30.2) for at_s in TIMES_S))
+    call = ["geotag", str(fly(tmp_path)), "--pos", str(path), "--geoid", "-30", "-o", str(tmp_path / "out")]
+    assert main(call) == 1
+    assert (tmp_path / "out" / "geo.txt").exists()
+    assert main([*call, "--anyway"]) == 0
+
+
 def test_the_command_writes_marks_and_leaves_the_ledger(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = fly(tmp_path)
     path = pos(tmp_path, HEAD + "".join(line(at_s) for at_s in TIMES_S[1:]))

@@ -11,14 +11,16 @@ from pathlib import Path
 
 from dappled.clock import Clock
 from dappled.config import settings as configuration
-from dappled.daemon.navigation import BodyLatency
+from dappled.daemon.navigation import BodyLatency, ExposureTime, recorded_vehicles
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import playback, replay
 from dappled.daemon.replay.playback import FlownWith
-from dappled.daemon.replay.replay import RecordedFlight, ReplayProgress
+from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, ReplayProgress
+from dappled.daemon.replay.vehicle_choice import vehicle_of
 from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
+from dappled.findings import Finding
 from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Tag, layout, seals
 from dappled.flight.seal_key import SealKey
 
@@ -55,8 +57,9 @@ class MissingTagWriter(ReplayVerifier):
         return one.frame is not None and one.tag_sha256 is None
 
 
-def add_missing(flight: Path, clock: Clock, key: SealKey | None) -> list[int]:
-    """Tag the frames of a closed flight that have no tag; their image indices. `key` signs the seal after it.
+def add_missing(flight: Path, clock: Clock, key: SealKey | None, vehicle: int | None = None) -> list[int]:
+    """Tag the frames of a closed flight that have no tag; their image indices. `key` signs the seal after it. By the
+    telemetry of `vehicle` (its system id), where one is given.
 
     Raises DappledError where that can't be done now: a flight that is still recorded, a record that can't be written.
     """
@@ -76,6 +79,10 @@ def add_missing(flight: Path, clock: Clock, key: SealKey | None) -> list[int]:
         stack.enter_context(seals.work(folder, clock, "late tags", "tags frames in", key))
         last = max(_untagged(folder), default=-1)  # another process may have tagged them meanwhile
         recording = replay.of_flight(flight)
+        if vehicle is None and not recording.vehicles and recording.telemetry is not None:
+            vehicle, _ = vehicle_of(recording.telemetry, None)
+        if vehicle is not None:
+            recording = replace(recording, vehicles=[(0, vehicle)])
         recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= last])
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         writer = MissingTagWriter(recording, ledger)
@@ -83,6 +90,31 @@ def add_missing(flight: Path, clock: Clock, key: SealKey | None) -> list[int]:
         for index in writer.added:
             ledger.add_event("tagged late", "the recording ended before it was tagged; it is tagged now", index)
     return writer.added
+
+
+def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None, list[Finding]]:
+    """A flight's tags with the positions of the vehicle that is `wanted`, and what is to be said of it; None where the
+    tags are of that vehicle. Where the flight never knew whose the camera was, evidence decides (see `vehicle_of`).
+
+    Raises VehicleError and FlightError.
+    """
+    folder = layout.open_folder(flight)
+    with LedgerReader.open(folder.ledger) as reader:
+        followed, tags = {system for _, system in recorded_vehicles(reader)}, reader.tags()
+    if not folder.telemetry.is_file() or followed == {wanted} or (followed and wanted is None):
+        return None, []
+    system, told = vehicle_of(folder.telemetry, wanted)
+    if system is None or (wanted is None and not told):
+        return None, []
+    facts = layout.read_facts(folder)
+    settings = configuration.of_tables(facts.get("settings", {}), str(folder.settings))
+    rules = replay.tagging_rules(facts)
+    telemetry = RecordedTelemetry.flown(settings, folder.telemetry, {}, [(0, system)], rules=rules)
+    made = {}
+    for tag in sorted(tags.values(), key=lambda one: one.utc_ns):
+        exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)
+        made[tag.index] = replace(tag, pose=telemetry.pose(tag.index, exposure)[1])
+    return made, told
 
 
 def _untagged(folder: FlightFolder) -> set[int]:

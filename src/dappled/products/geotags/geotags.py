@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
@@ -50,12 +50,17 @@ class Written:
 
 
 def read(
-    flight: Path, mounting: Mounting, geoid: Geoid | None = None, marked: Marked | None = None
+    flight: Path,
+    mounting: Mounting,
+    geoid: Geoid | None = None,
+    marked: Marked | None = None,
+    tags: Mapping[int, Tag] | None = None,
 ) -> tuple[list[Placed], list[str]]:
     """A flight's tagged frames in order, and the names of frames without a tag. Where a frame has a mark, its time and
-    position are the mark's. Raises FlightError and EarthError."""
+    position are the mark's. `tags` replace the recorded ones. Raises FlightError and EarthError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
-        tags, frames, correction_ns = ledger.tags(), ledger.frames(), ledger.utc_correction_ns()
+        tags = ledger.tags() if tags is None else tags
+        frames, correction_ns = ledger.frames(), ledger.utc_correction_ns()
     placed = []
     for frame in frames:
         tag = tags.get(frame.index)
@@ -69,19 +74,28 @@ def read(
     return placed, [frame.name for frame in frames if frame.index not in tags]
 
 
+def doubts(flight: Path) -> list[tuple[str, str]]:
+    """(name, sentence) of each frame that may be another shot's, as the ledger has it. Raises FlightError."""
+    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
+        names = {frame.index: frame.name for frame in ledger.frames()}
+        doubted = [(event.index, event.text) for event in ledger.events() if event.kind == "doubt"]
+    return [(names[index], text) for index, text in doubted if index in names]
+
+
 def write(
     flight: Path,
     mounting: Mounting,
     *,
     geoid: Geoid | None = None,
     marked: Marked | None = None,
+    tags: Mapping[int, Tag] | None = None,
     output: Path | None = None,
     replace_extension: bool = False,
     force: bool = False,
 ) -> Written:
     """Write sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson into `<flight>/geotags/`; or all of
     them into `output`. Raises FlightError, SidecarError and EarthError."""
-    placed, without_tag = read(flight, mounting, geoid, marked)
+    placed, without_tag = read(flight, mounting, geoid, marked, tags)
     inside = layout.FlightFolder(flight)
     forms: dict[str, Callable[[Sequence[Placed]], str]] = {
         "geo.txt": odm,
@@ -104,7 +118,13 @@ def write(
 
 
 def copies(
-    flight: Path, folder: Path, mounting: Mounting, geoid: Geoid | None = None, marked: Marked | None = None
+    flight: Path,
+    folder: Path,
+    mounting: Mounting,
+    geoid: Geoid | None = None,
+    marked: Marked | None = None,
+    *,
+    tags: Mapping[int, Tag] | None = None,
 ) -> Iterator[tuple[str, Path | str]]:
     """Copy the placed frames to `folder`, with positions in EXIF; yields (frame, its copy or why there is none).
 
@@ -112,7 +132,7 @@ def copies(
     """
     if folder.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot write copies into the flight itself ({folder}): give another folder")
-    placed, without_tag = read(flight, mounting, geoid, marked)
+    placed, without_tag = read(flight, mounting, geoid, marked, tags)
     originals = [layout.FlightFolder(flight).file(one.frame.name) for one in placed]
     _make(folder)
     for one, original in zip(placed, originals, strict=True):
