@@ -31,9 +31,11 @@ BUDGET = $(BIN)/python tools/budget.py
 test: setup ## lint, types, import contracts, and the default tests
 	@$(BUDGET) "make test" 240 400 $(MAKE) -s checked-tests
 
-# The checks take a core for a minute: beside the tests, not before them.
+# The checks take a core for a minute: beside the tests, not before them. pytest's own bytecode of the tests is made once, in
+# a new clone, and not by each worker.
 checked-tests:
 	@failed=; { $(CHECKS); } & checks=$$!; \
+	[ -d tests/__pycache__ ] || $(BIN)/pytest -q --collect-only >/dev/null; \
 	$(TESTS) || failed=tests; \
 	wait $$checks || { echo "the checks failed: see what they say above, or run make check" >&2; failed=checks; }; \
 	[ -z "$$failed" ]

@@ -56,7 +56,7 @@ def test_a_light_field_is_served_until_the_command_is_interrupted(tmp_path: Path
     assert b"dappled" in seen.read_bytes()
 
 
-@pytest.mark.slow  # the example is flown: 15 s
+@pytest.mark.long  # the example is flown: 20 s
 def test_the_example_is_small_and_whole_or_not_there(tmp_path: Path) -> None:
     """Without a name: three frames with their truth, in 5 MB; interrupted while it is made, nothing is kept."""
     words = [sys.executable, "-m", "dappled", "open", "--no-browser", "--json"]

@@ -186,7 +186,7 @@ def test_a_simulated_camera_without_a_link_to_an_autopilot_is_refused(
     assert wrong.value.code == 2
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_simulated_camera_flies_with_the_autopilot_that_the_settings_lead_to(
     tmp_path: Path, port: int, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -148,7 +148,7 @@ def sockets() -> Iterator[Path]:
         yield Path(folder)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_simulated_daemon_has_no_circle_of_references(tmp_path: Path, sockets: Path) -> None:
     given = configuration.resolve(Settings())
     given = replace(

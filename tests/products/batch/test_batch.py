@@ -97,7 +97,7 @@ def test_a_batch_goes_on_where_it_was_stopped(
     assert hashes(output)[f"{flight.folder.name}/000001.tif"] != made[f"{flight.folder.name}/000001.tif"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_light_field_of_a_batch_holds_its_pose(flight: Flown, tmp_path: Path) -> None:
     (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz"], tmp_path)
     done = batch.make(first)
@@ -129,7 +129,7 @@ def test_a_bad_frame_is_noted_and_the_others_are_made(
     }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_bad_flight_is_said_and_the_others_are_made(
     flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -144,7 +144,7 @@ def test_a_bad_flight_is_said_and_the_others_are_made(
     assert capsys.readouterr().err.count("is not a flight folder") == 1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_flight_that_is_named_twice_is_made_once(
     flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -41,6 +41,7 @@ def test_nerfstudio_s_transforms_are_the_poses(handed: Path, short_flight: Flown
             assert picture.size == (one["w"], one["h"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("fitted", [True, False])
 def test_views_stand_as_the_frame_shows(short_flight: Flown, tmp_path: Path, fitted: bool) -> None:
     """The f-number is told a fifth wrong. The carriers show it, if the calibration knows the mask's distance."""

@@ -20,7 +20,7 @@ from dappled.products.handover.forms import FORMS
 from dappled.products.maps.georeference import Options
 from tests.products.flown import START_NS, Flown
 
-pytestmark = pytest.mark.slow  # a frame in all forms, twice: 20 s
+pytestmark = pytest.mark.long  # a frame in all forms, twice: 20 s
 
 LARGEST = 4096  # bytes: all that is made of a frame is larger, but its records
 
