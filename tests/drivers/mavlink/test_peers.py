@@ -14,8 +14,23 @@ from dappled.clock import SystemClock
 from dappled.drivers.mavlink import MavlinkLinks, Packet, make_key, mavlink, open_signing, pack, read_key
 from dappled.drivers.mavlink.peers import MOST, Peers
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from tests.drivers.mavlink.strangers import Strangers
 
 S = 10**9
+
+
+class Log:
+    """A telemetry log of which only the numbers are wanted."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def log_packet(self, _stamp_us: int, _raw: bytes) -> int:
+        self.count += 1
+        return self.count - 1
+
+    def on_packet(self, packet: Packet) -> None:
+        """What was logged, received or sent."""
 
 
 class Port:
@@ -32,15 +47,17 @@ class Port:
             ["udpin:127.0.0.1:0"], system_id=1, component_id=100, clock=SystemClock(), signing=signing
         )
         self.heard = threading.Semaphore(0)
-        self.logged = 0
+        self.known = self.strange = 0
 
-    def log_packet(self, _stamp_us: int, _raw: bytes) -> int:
-        self.logged += 1
-        return self.logged - 1
+    def start(self) -> None:
+        self.links.start(Log(), self)
 
     def on_packet(self, packet: Packet) -> None:
-        if not packet.sent:
+        if packet.trusted:
+            self.known += 1
             self.heard.release()
+        else:
+            self.strange += 1
 
     def send(self) -> bool:
         return self.links.sender.send(mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3))
@@ -86,7 +103,7 @@ class Station:
 @pytest.fixture(params=[False, True], ids=["unsigned", "signed"])
 def port(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Port]:
     made = Port(tmp_path, signed=request.param)
-    made.links.start(made, made)
+    made.start()
     yield made
     made.links.stop()
 
@@ -107,7 +124,7 @@ def test_seventeen_strangers_who_send_a_byte_each_hear_nothing_and_displace_nobo
 
 def test_a_packet_that_is_recorded_and_sent_again_makes_no_peer(tmp_path: Path) -> None:
     port = Port(tmp_path, signed=True)
-    port.links.start(port, port)
+    port.start()
     station, stranger = Station(port), Station(port)
     recorded = station.packet()
     station.socket.send(recorded)
@@ -153,3 +170,39 @@ def test_who_is_only_heard_is_sent_at_most_as_much_as_it_sent() -> None:
     for number in range(2000):  # of many addresses few are kept
         peers.shown(("b", number), 50, "old", S)
     assert len(peers.receivers(1, S)) < MOST
+
+
+def test_what_strangers_send_to_a_signed_port_costs_the_station_nothing(tmp_path: Path) -> None:
+    """Random, mutated, replayed, foreign and unsigned packets, between the station's own."""
+    port = Port(tmp_path, signed=True)
+    port.start()
+    station, crowd = Station(port), [Station(port) for _ in range(20)]
+    own = [station.packet() for _ in range(60)]
+    sent = [0] * len(crowd)
+    strangers = Strangers(own[:20], 3)
+    try:
+        for raw in own[:20]:
+            station.socket.send(raw)
+            assert port.heard.acquire(timeout=20)
+        for number, raw in enumerate(own[20:]):
+            for at in range(10):
+                who = (10 * number + at) % len(crowd)
+                sent[who] += crowd[who].socket.send(strangers.datagram())
+            station.socket.send(raw)
+            assert port.heard.acquire(timeout=20), number
+            assert port.send()
+        port.until_refused(300)
+        one = port.links.statistics()[0]
+        assert one.signing is not None
+        assert one.signing.good == 60
+        assert port.known == 60
+        assert port.strange == one.signing.unsigned_taken <= 400 // 6  # radios' reports, some of them
+        assert one.signing.replayed > 20
+        assert one.signing.forged > 20
+        came = [each.received() for each in crowd]
+        assert [more for more, went in zip(came, sent, strict=True) if more > went] == []
+        assert station.received() >= 40 * 34
+    finally:
+        port.links.stop()
+        for each in (station, *crowd):
+            each.socket.close()
