@@ -27,6 +27,7 @@ from dappled.drivers.camera import (
     Fired,
     Identity,
     LivePicture,
+    Noticed,
     QueuedCamera,
     Setting,
     SettingName,
@@ -45,11 +46,12 @@ from dappled.drivers.child_process import (
 )
 from dappled.drivers.gphoto2.messages import Carryover, lost_file, message_event
 from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings, parse_settings
+from dappled.findings import Code, Subject, finding
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 _PING_S = 1.0
-_STOP_S = 1.2
+_STOP_S = 1.4
 _KILL_S = 0.6
 _SPAWN_S = 1.0
 _LIVE_S = 2.0
@@ -178,7 +180,8 @@ class GPhoto2Camera(QueuedCamera):
                 self._channel.send({"do": "delete", "folder": folder, "name": arrival.facts["name"]})
 
     def stop(self) -> None:
-        """Ask the process to end, and kill it after 1.2 s. Shots that had not ended fail."""
+        """Ask the process to end, which lists the card once more, and kill it after 1.4 s. Shots that had not ended
+        fail."""
         self._loop.stopping.set()
         with self._lock, contextlib.suppress(ChannelError):  # it is killed below
             if self._channel is not None:
@@ -188,6 +191,8 @@ class GPhoto2Camera(QueuedCamera):
         with self._lock:
             if self._process is not None:
                 self._process.kill()
+        if self._identity is not None and self._settings.capture_target == "card":
+            self.report(Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), self._clock.monotonic_ns()))
         self._loop.stop(_KILL_S)
 
     def dead_threads(self) -> list[str]:

@@ -45,6 +45,7 @@ from dappled.drivers.gphoto2.viewfinder import Viewfinder
 _POLL_BUSY_S = 0.005
 _POLL_IDLE_S = 0.3
 _REOPEN_S = 0.25
+_LAST_TRIES = 3
 _HEAD_BYTES = 65536
 _QUIET_S = 5.0
 """A card is listed anew only when the camera had nothing to do for so long: that takes a new session."""
@@ -99,14 +100,18 @@ class CameraLoop:
 
     def _look_last(self) -> None:
         """Name the pictures that stay on the card."""
-        if self._session is None or not self._session.keeps_files:
+        if self._session is not None and not self._session.keeps_files:
             return
-        self._session.close()
-        self._session = None
-        with contextlib.suppress(SessionError):
-            self._session = self._open_camera(self._settings, self._state.serial)
-            if self._session.identity.serial == self._state.serial:
-                self._sender.send(*self._state.left(self._session.contents(), self._now_ns()))
+        for _ in range(0 if self._session is None else _LAST_TRIES):  # the body may still be closing
+            if self._session is not None:
+                self._session.close()
+                self._session = None
+            with contextlib.suppress(SessionError):
+                self._session = self._open_camera(self._settings, self._state.serial)
+                if self._session.identity.serial == self._state.serial:
+                    self._sender.send(*self._state.left(self._session.contents(), self._now_ns()))
+                    return
+        self._sender.send(*self._state.not_listed(self._now_ns()))
 
     def _patience_s(self) -> float:
         """Return how long to wait for a command before the camera is polled again."""

@@ -280,6 +280,11 @@ class CameraState:
         waiting = [file for file in self._to_fetch if not file.in_memory]
         return [*told, *(_on_card(file, now_ns) for file in waiting)]
 
+    def not_listed(self, now_ns: int) -> list[CameraEvent]:
+        """The card can't be listed for the last time."""
+        is_known = self._card.is_listed
+        return [Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), now_ns)] if is_known else []
+
     def list_due(self, now_ns: int, quiet_s: float) -> bool:
         """Whether a picture may have been missed, and the camera had nothing to do for so long."""
         return self._missed and not self.is_busy and not self._to_fetch and now_ns - self._quiet_ns >= _ns(quiet_s)

@@ -3,9 +3,9 @@
     python -m dappled.mocks.body.body --seed 1 --scale 0.25
 
 prints `port N` once it listens, then obeys lines on standard input: a fault of `faults` ("busy 2"), "releases",
-"contact", "card", "move", "change card", or what a hand turns or runs low: "turn dial 2" (see `eos450d`). It answers
-every line with one line, `ok …` or `error …`. It ends when its input ends, so it never outlives the process that
-started it.
+"contact", "card", "move", "change card", or what a hand turns or runs low: "turn dial 2", "turn clock -3600" (see
+`eos450d`). It answers every line with one line, `ok …` or `error …`. It ends when its input ends, so it never outlives
+the process that started it.
 """
 
 from __future__ import annotations

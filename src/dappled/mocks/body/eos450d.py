@@ -65,7 +65,7 @@ class Eos450d:
         self._clock = clock
         self._lock = threading.Lock()  # held around all that follows
         self._session = self._working = False
-        self._releases = self._looks = self._numbered = 0
+        self._releases = self._looks = self._numbered = self._wrong_s = 0
         self._card = Card(card_bytes, faults, clock.utc_ns() // 10**9)
         self._properties = Properties(serial, pairs=pairs, f_number=f_number, exposure_s=exposure_s)
         self._handlers: dict[int, Handler] = {
@@ -108,9 +108,13 @@ class Eos450d:
             self._numbered = self._releases
 
     def turn(self, what: str, value: int) -> None:
-        """A hand turns something at the body, or something in it runs low; it announces that. Raises ValueError."""
+        """A hand turns something at the body, or something in it runs low; it announces that. Its clock is turned by
+        seconds, in silence. Raises ValueError."""
         with self._lock:
-            self._properties.turn(what, value)
+            if what == "clock":
+                self._wrong_s += value
+            else:
+                self._properties.turn(what, value)
 
     def disconnected(self) -> None:
         """The link is gone, and the session with it. The card and a running capture stay."""
@@ -221,7 +225,7 @@ class Eos450d:
         stem = f"IMG_{max(number - self._numbered, 1) % 10000:04d}"
         handle, parent = (2 * number, 0) if to_memory else (FOLDER + 2 * number, FOLDER)
         code = Format.JPEG if extension.lower() in ("jpg", "jpeg") else Format.RAW
-        taken_s = self._clock.utc_ns() // 10**9
+        taken_s = self._clock.utc_ns() // 10**9 + self._wrong_s
         made = [StoredObject(handle, parent, f"{stem}.{extension.upper()}", code, data, taken_s)]
         if self._properties.pairs:
             made.append(StoredObject(handle + 1, parent, f"{stem}.JPG", Format.JPEG, thumbnail(number), taken_s))
