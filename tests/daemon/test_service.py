@@ -34,6 +34,7 @@ from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChang
 from dappled.errors import DappledError
 from dappled.flight import FlightError, LedgerReader, Recording, flight_report, layout
 from dappled.flight.checks import flight_check
+from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
 from tests.daemon.test_settings_check import MASK, calibration
 
@@ -234,6 +235,26 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
         assert "clock" not in "".join(service.health()["problems"])
         service._navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
         assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
+    finally:
+        service.stop()
+
+
+def test_another_component_with_our_ids_is_a_problem(
+    camera: FakeCamera, settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two daemons of which one forgot its component id: the pilot and the health record name where it sends from."""
+    service = started(replace(settings, mavlink=replace(settings.mavlink, url=("udpin:127.0.0.1:0",))), [])
+    try:
+        service._component._identity.settled = True  # as after three seconds
+        said = list[str]()
+        monkeypatch.setattr(service._component, "say", lambda text, *_: said.append(text))
+        with Peer(service._links.port(0), 1, settings.mavlink.component_id) as twin:
+            twin.packer.seq = 200
+            twin.heartbeat()
+            eventually(lambda: "sends as 1/100 too, which is this camera" in problems(service), "the other camera")
+            assert f"127.0.0.1:{twin._socket.getsockname()[1]}" in problems(service)
+            service._publish_health()
+            assert any("sends as 1/100 too" in text for text in said)
     finally:
         service.stop()
 

@@ -382,6 +382,7 @@ class Service:
         ]
         doubts = (
             self._component.doubt(),
+            *(findings.told(one) for one in self._component.findings()),
             navigation.utc.doubt(),
             *navigation.telemetry.doubts(self._clock.utc_ns()),
             self._control.shortage,

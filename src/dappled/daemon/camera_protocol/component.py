@@ -32,6 +32,7 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
+from dappled.findings import Code, Finding, Subject, finding
 
 PROOF_NS = 500_000_000
 _STEADY_NS = 300_000_000  # telemetry is requested at 50 Hz
@@ -42,6 +43,7 @@ _REPORTS = 256
 HEARTBEAT_NS = 10**9
 STATUS_NS = 600_000_000  # at most twice a second, and the last state within a second
 _OLD_IMAGES_A_TICK = 2
+_SAME_IDS_NS = 15 * 10**9
 
 
 class ReportRoutes:
@@ -169,6 +171,7 @@ class Component:
         self._files = FtpServer(self._status)
         self._dedup, self._routes = PacketDedup(), ReportRoutes()
         self._lines, self._stations = PilotMessages(), GroundStations()
+        self._same_ids: dict[int, tuple[str, int]] = {}  # link: who sends with our ids, and when last
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
         self._status_wanted = threading.Event()
@@ -188,6 +191,16 @@ class Component:
         """A sentence where the camera may belong to the wrong system (see `SystemIdentity.doubt`)."""
         return self._identity.doubt()
 
+    def findings(self) -> list[Finding]:
+        """Other components on the links that send with our own ids: who hears both can't tell them apart."""
+        now_ns = self._clock.monotonic_ns()
+        system, component = self._links.system_id, self._links.component_id
+        return [
+            finding(Code.LINK_SAME_IDS, Subject("link", link), source=source, system=system, component=component)
+            for link, (source, heard_ns) in sorted(self._same_ids.items())
+            if now_ns - heard_ns <= _SAME_IDS_NS
+        ]
+
     # what comes in
 
     def on_packet(self, packet: Packet) -> None:
@@ -197,7 +210,9 @@ class Component:
             return
         source = message.get_srcSystem(), message.get_srcComponent()
         if source == (self._links.system_id, self._links.component_id):
-            return  # our own, forwarded to another link
+            if packet.same_ids and packet.trusted:
+                self._heard_same_ids(packet)
+            return  # mostly our own, forwarded to another link
         if packet.trusted and source == (self._identity.system_id, 1):
             self._routes.autopilot_heard(packet.link, self._clock.monotonic_ns())
         handler = _HANDLERS.get(message.get_type())
@@ -214,6 +229,15 @@ class Component:
                     self._routes.heartbeat(message, packet.link, now_ns)
         elif packet.trusted and message.get_srcSystem() == self._identity.system_id:
             self._autopilot.heard(message)
+
+    def _heard_same_ids(self, packet: Packet) -> None:
+        """Names one source on a link while it is heard; before the ids are decided it may be nobody's."""
+        if not self._identity.settled:
+            return
+        now_ns = self._clock.monotonic_ns()
+        source, heard_ns = self._same_ids.get(packet.link, (packet.same_ids, now_ns))
+        if packet.same_ids == source or now_ns - heard_ns > _SAME_IDS_NS:
+            self._same_ids[packet.link] = packet.same_ids, now_ns
 
     def _command(self, packet: Packet) -> None:
         if not self._is_for_us(packet.message):

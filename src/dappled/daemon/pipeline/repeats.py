@@ -36,7 +36,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from dappled.drivers.mavlink import Packet, mavlink
+from dappled.drivers.mavlink import Framed, Packet
 
 SAME_LINK_NS = 500_000_000
 OTHER_LINK_NS = 2_500_000_000  # a radio may be seconds behind a cable
@@ -266,10 +266,9 @@ class AutopilotCommands:
 
 
 def _packet_key(packet: Packet) -> _PacketKey:
-    message, raw = packet.message, packet.raw
-    start = 10 if raw[0] == mavlink.PROTOCOL_MARKER_V2 else 6
-    payload = raw[start : start + raw[1]].rstrip(b"\0")  # version 2 leaves trailing zeros out
-    return message.get_srcSystem(), message.get_srcComponent(), message.get_seq(), message.get_msgId(), payload
+    message = packet.message
+    seq, payload = Framed(packet.raw, message).numbered()
+    return message.get_srcSystem(), message.get_srcComponent(), seq, message.get_msgId(), payload
 
 
 def _instant(request: CaptureRequest) -> tuple[str, str, int | None, int]:

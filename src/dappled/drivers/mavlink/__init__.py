@@ -5,6 +5,7 @@ into packets, `signing` signs and verifies.
 """
 
 from dappled.drivers.mavlink.channels import LinkError, parse
+from dappled.drivers.mavlink.framing import Framed
 from dappled.drivers.mavlink.links import (
     LinkStatistics,
     MavlinkLinks,
@@ -28,6 +29,7 @@ from dappled.drivers.mavlink.signing import (
 )
 
 __all__ = [
+    "Framed",
     "LinkError",
     "LinkStatistics",
     "MavlinkLinks",

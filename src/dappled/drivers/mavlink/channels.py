@@ -127,6 +127,9 @@ class ByteChannel(Protocol):
     def shown(self, evidence: Shown) -> None:
         """A packet of what was read last was judged. Under the link's lock."""
 
+    def source(self) -> str:
+        """Return the address that what was read last came from, "" where only one can be at the other end."""
+
     def write(self, data: bytes) -> bool:
         """Send without blocking. False: not sent (no receiver, or the buffer is full). Raises OSError when broken."""
 
@@ -203,13 +206,17 @@ class _Udp:
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
         self._sock = sock
+        self._last: tuple[bytes, Source] | None = None
 
     def descriptors(self) -> Sequence[int]:
         return (self._sock.fileno(),)
 
     def read(self) -> bytes | None:
-        received = self._receive()
-        return b"" if received is None else received[0]
+        self._last = self._receive()
+        return b"" if self._last is None else self._last[0]
+
+    def source(self) -> str:
+        return "" if self._last is None else "{}:{}".format(*self._last[1])
 
     def shown(self, evidence: Shown) -> None:
         return
@@ -251,7 +258,6 @@ class UdpIn(_Udp):
         self._peers = Peers()
         self._known, self._strange = deque[tuple[bytes, Source]](), deque[tuple[bytes, Source]]()
         self._waiting = Counter[Source]()  # in `_strange`: a peer that proves itself meanwhile keeps its order
-        self._last: tuple[bytes, Source] | None = None
         for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):  # the first one passes the kernel's limit, where it may
             try:
                 sock.setsockopt(socket.SOL_SOCKET, option, _KERNEL_BYTES)
@@ -345,6 +351,9 @@ class ByteStream:
         self.flush()
         return True
 
+    def source(self) -> str:
+        return ""
+
     def wants_write(self) -> bool:
         return bool(self._waiting)
 
@@ -402,6 +411,9 @@ class TcpServer:
                 return self._client.write(data) if self._client else False
         except OSError:  # the next `read` finds that it has gone
             return False
+
+    def source(self) -> str:
+        return ""
 
     def wants_write(self) -> bool:
         return self._client is not None and self._client.wants_write()

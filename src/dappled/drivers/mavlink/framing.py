@@ -56,6 +56,12 @@ class Framed:
         """MAVLink 1 or 2."""
         return 1 if self.raw[0] == _MAGIC_1 else 2
 
+    def numbered(self) -> tuple[int, bytes]:
+        """Return the sender's number of the packet, and its payload: no link changes them. Version 2 leaves trailing
+        zeros out."""
+        start = 6 if self.version == 1 else 10
+        return self.message.get_seq(), self.raw[start : start + self.raw[1]].rstrip(b"\0")
+
 
 class Framer:
     """Cut bytes into packets. Keeps less than one packet (280 bytes) between calls.

@@ -6,7 +6,7 @@ import logging
 import select
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import or_
 from typing import Protocol
@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 _REOPEN_S = 1.0
 _STAMP_BYTES = 8  # before each packet in the telemetry log
 _POLL_S = 0.2
+_RETURNS_NS = 30 * 10**9  # a radio may hold packets for seconds
 
 
 # --- one packet
@@ -49,7 +50,8 @@ class Packet:
     """One packet, received or (`sent`) sent. `number` is its place in the telemetry log, None if it was not logged.
 
     `trusted`: False for an unsigned packet on a signed link, which may be heard but not obeyed. `exposed`: it came
-    unsigned over a network, so anyone there may have sent it.
+    unsigned over a network, so anyone there may have sent it. `same_ids`: where a heartbeat of another
+    component came from that has our own ids; "" for any other packet.
     """
 
     number: int | None
@@ -60,6 +62,7 @@ class Packet:
     sent: bool = False
     trusted: bool = True
     exposed: bool = False
+    same_ids: str = ""
 
 
 class PacketLog(Protocol):
@@ -157,6 +160,27 @@ class Link:
 # --- all links
 
 
+class _OwnHeartbeats:
+    """The heartbeats that were sent lately: one of them that comes back was forwarded by a router, and any other one
+    with our ids is another component's. Of 256 of those, one for each second and link is taken for ours."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self._sent: dict[tuple[int, bytes], int] = {}
+
+    def add(self, framed: Framed) -> None:
+        """One is sent."""
+        now_ns = self._clock.monotonic_ns()
+        while self._sent and now_ns - self._sent[next(iter(self._sent))] > _RETURNS_NS:
+            del self._sent[next(iter(self._sent))]
+        self._sent.pop(framed.numbered(), None)
+        self._sent[framed.numbered()] = now_ns
+
+    def __contains__(self, framed: Framed) -> bool:
+        sent_ns = self._sent.get(framed.numbered())
+        return sent_ns is not None and self._clock.monotonic_ns() - sent_ns <= _RETURNS_NS
+
+
 class PacketSender:
     """Send messages on the links, and pass each packet, received or sent, to the log, in the order of its number.
 
@@ -169,6 +193,7 @@ class PacketSender:
         self.system_id, self.component_id = system_id, component_id
         self._links, self._clock = links, clock
         self._log: PacketLog | None = None
+        self._own_heartbeats = _OwnHeartbeats(clock)
 
     def start(self, packet_log: PacketLog) -> None:
         """Send from now on."""
@@ -213,6 +238,12 @@ class PacketSender:
         self.hand(link, packet, packet_log)
         return packet
 
+    def has_same_ids(self, framed: Framed) -> bool:
+        """Whether it is a heartbeat of another component with our own ids, and not one of ours that came back."""
+        message = framed.message
+        ours = (message.get_srcSystem(), message.get_srcComponent()) == (self.system_id, self.component_id)
+        return ours and message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT and framed not in self._own_heartbeats
+
     def hand(self, link: Link, packet: Packet, receiver: PacketReceiver) -> None:
         """Hand a packet to a receiver. An exception is logged and counted: one packet must not end the link."""
         try:
@@ -237,7 +268,10 @@ class PacketSender:
             link.packets_unsent += 1
             return False
         link.packets_out += 1
-        self.logged(link, stamp_us, Framed(raw, message), sent=True)
+        framed = Framed(raw, message)
+        if message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
+            self._own_heartbeats.add(framed)
+        self.logged(link, stamp_us, framed, sent=True)
         return True
 
 
@@ -405,6 +439,8 @@ class MavlinkLinks:
             link.heard_2 |= framed.version == 2
             exposed = link.address.exposed and not signed
             packet = self.sender.logged(link, stamp_us, framed, trusted=trusted, exposed=exposed)
+            if self.sender.has_same_ids(framed):
+                packet = replace(packet, same_ids=f"{channel.source() or 'the other end'} of {link.address.url}")
             if receiver is not None:
                 self.sender.hand(link, packet, receiver)
 
