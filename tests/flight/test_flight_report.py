@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from dappled import findings
 from dappled.cli import main
+from dappled.findings import Code, Subject, finding
 from dappled.flight import FlightFolder, Recording, Result, flight_report
 from dappled.flight.flight_report import SourceReport, by_source
 from tests.flight.makers import deliver, request, tag
@@ -46,6 +48,23 @@ def test_the_report_prints_a_line_for_each_source(recorded: FlightFolder, capsys
     said = capsys.readouterr().out.splitlines()
     assert said[1].split() == ["source", "requests", "refused", "shots", "safe", "failed", "open", "tagged", "decoded"]
     assert said[2].split() == ["mavlink:255/190", "3", "0", "3", "2", "1", "0", "2", "1"]
+
+
+def test_the_report_names_frames_in_doubt_and_what_the_card_holds(
+    flight: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By what a driver's findings left in the ledger; a frame that may be another shot's makes it exit with 1."""
+    card = findings.told(finding(Code.PICTURE_ON_CARD, Subject("picture", "/DCIM/IMG_0004.CR2")))
+    doubt = findings.text(finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 0), rival=1))
+    request(flight, 0)
+    deliver(flight, 0, bytes(1000))
+    flight.ledger.add_event(Code.PICTURE_ON_CARD.value, card)
+    flight.ledger.add_event("doubt", doubt, 0)
+    flight.close()
+    assert main(["flight", "report", str(flight.folder.path)]) == 1
+    said = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    assert f"card: {card}" in said
+    assert "in doubt: frame 0: it may be of shot 1 as well" in said
 
 
 def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:

@@ -16,6 +16,8 @@ from dappled.flight.records import Frame, LedgerEvent, Result, ShotRow, Stray, T
 from dappled.refusals import OTHERS, LostTriggers, Refusals
 
 LOST = "lost trigger"
+_DOUBT = "doubt"
+_CARD = ("card.", "picture.")  # what a driver said of the camera's card: codes of `findings`
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +28,8 @@ class Balance:
     `by_source` counts shots, `following` the failed ones whose files are still on the camera, `companions` files beside
     frames. `began_utc_ns` is None where UTC was never known. `judged` counts frames by their verdict in flight (a frame
     without one is unknown; empty where none was judged), `bad` says of each bad one why, `unknown` of each unknown one.
+    `doubts` says of each frame that may be another shot's why, `card` what happened to the camera's card, and what
+    stays on it.
     """
 
     flight: str
@@ -49,6 +53,8 @@ class Balance:
     judged: Mapping[str, int] = field(default_factory=dict)
     bad: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    card: tuple[str, ...] = ()
 
     @property
     def balanced(self) -> bool:
@@ -128,6 +134,8 @@ def balance(path: Path) -> Balance:
             judged=_by_verdict(judged, len(frames)),
             bad=_reasons("bad", judged, frames),
             unknown=_reasons("unknown", judged, frames),
+            doubts=tuple(f"frame {event.index}: {event.text}" for event in events if event.kind == _DOUBT),
+            card=tuple(event.text for event in events if event.kind.startswith(_CARD)),
         )
 
 

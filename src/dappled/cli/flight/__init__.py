@@ -42,7 +42,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     intact = actions.add("check", "check that every byte is intact; exits 1 if not", f"dappled flight check {_FLIGHT}")
     report = actions.add(
         "report",
-        "count which requests became frames; exits 1 if the counts don't agree or there was no shot",
+        "count which requests became frames; exits 1 if they don't agree, a frame is in doubt, or no shot was",
         "dappled flight report",
         f"dappled flight report {_FLIGHT} --log 00000012.BIN",
     )
@@ -186,7 +186,7 @@ def _report(flight: Path, logs: list[Path], as_json: bool) -> int:
     found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
     sources = [asdict(one) for one in by_source]
     values = {**_plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
-    agree = found.balanced and found.wishes > 0
+    agree = found.balanced and found.wishes > 0 and not found.doubts
     said = [*flight_lines.of_report(found, by_source)]
     if logs:
         from dappled.cli.flight import books  # noqa: PLC0415  as above
