@@ -49,6 +49,7 @@ class Code(StrEnum):
     LOG_CUT_SHORT = "log.cut_short"
     LOG_RECEIVER_BETTER = "log.receiver_better"
     LOG_RECEIVER_USED = "log.receiver_used"
+    LOG_STAMPS_UNSET = "log.stamps_unset"
     LOG_VALUES_MISSING = "log.values_missing"
     LOG_VEHICLE = "log.vehicle"
     PICTURE_CLIPPED = "picture.clipped"

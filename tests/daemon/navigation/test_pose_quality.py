@@ -85,6 +85,19 @@ def test_the_receivers_word_is_carried_along() -> None:
     assert math.sqrt(ee) == pytest.approx(0.82 / math.sqrt(2), abs=0.01)
 
 
+@pytest.mark.parametrize(("first", "second", "counts"), [(1, 6, 6), (2, 6, 6), (3, 6, 3), (1, 2, 1)])
+def test_the_second_receiver_counts_while_the_first_has_no_fix(first: int, second: int, counts: int) -> None:
+    link = Link()
+    for step in range(STEPS):
+        link.vehicle(step / 10)
+        link.send(step / 10, receiver(fix=first))
+        second_one = 0, second, 1, 1, 0, 70, 110, 0, 0, 14, 0, 0, 0, 0, 20, 30, 50
+        link.send(step / 10, mavlink.MAVLink_gps2_raw_message(*second_one))
+    pose = link.pose(2.0)
+    assert pose.gnss is not None
+    assert pose.gnss.fix_type == counts
+
+
 @pytest.mark.parametrize(
     ("message", "horizontal_m", "vertical_m"),
     [

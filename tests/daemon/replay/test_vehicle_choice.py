@@ -10,6 +10,8 @@ import pytest
 from PIL import Image
 
 from dappled.cli import main
+from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.flight.log_reading import split
 from tests.daemon.replay.two_vehicles import (
     Extra,
     camera_of_2,
@@ -86,3 +88,23 @@ def test_the_two_vehicles_of_a_report(shared_data: Path, frames: Path, capsys: p
     assert main(["replay", str(frames), "--telemetry", log]) == 1
     assert main(["replay", str(frames), "--telemetry", log, "--vehicle", "2", "--json"]) == 0
     assert north_deg(capsys) == 47.4
+
+
+def test_a_tlog_whose_stamps_were_never_set_is_doubted(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log = logged(frames.parent, extra=camera_of_2)
+    data = log.read_bytes()
+    early = b"".join(struct.pack(">Q", stamp_us - STAMP_US + 60 * 10**6) + raw for stamp_us, raw in split(data))
+    log.write_bytes(early)
+    assert main(["replay", str(frames), "--telemetry", str(log)]) == 1
+    assert "stamps begin at 1970-01-01 00:01, which can't be true" in capsys.readouterr().err
+
+
+def test_messages_that_can_t_be_true_are_counted_and_told(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def off_the_globe(step: int) -> list[tuple[int, int, MavlinkMessage]]:
+        values = 9050 + step * 100, 2**31 - 1, 2**31 - 1, 0, 0, 0, 0, 0, 0
+        wrong = (2, 1, mavlink.MAVLink_global_position_int_message(*values))
+        return [*camera_of_2(step), *([wrong] if step == 2 else [])]
+
+    log = logged(frames.parent, extra=off_the_globe)
+    assert main(["replay", str(frames), "--telemetry", str(log), "--start", "2026-11-21T10:15:06Z"]) == 0
+    assert "can't be true count as missing: 1 of its messages" in capsys.readouterr().err

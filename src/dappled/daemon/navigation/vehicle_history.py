@@ -306,10 +306,11 @@ class VehicleHistory:
         self._finder, self._jumps = JumpFinder(), list[Jump]()
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
+        self._second: list[GnssSample] = []  # of another receiver: it counts while the first one has no fix
         self._ground: list[GroundSample] = []
         self._feedbacks: list[Feedback] = []
         self._histories: tuple[list[Any], ...] = (self._positions, self._jumps, self._attitudes, self._receiver,
-                                                  self._ground, self._feedbacks)  # fmt: skip
+                                                  self._second, self._ground, self._feedbacks)  # fmt: skip
         self._attitude_sigma: tuple[float | None, int] = (None, 0)  # as the autopilot told it, and when
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
@@ -332,8 +333,8 @@ class VehicleHistory:
         return between(self._feedbacks, *self.time.span(limit, utc_ns))
 
     def has_fix(self) -> bool:
-        """Whether the receiver's last message says a fix: then UTC is the satellites'."""
-        return bool(self._receiver) and self._receiver[-1].reported.fix_type >= _FIX_3D
+        """Whether a receiver's last message says a fix: then UTC is the satellites'."""
+        return any(_fixed(history[-1]) for history in (self._receiver, self._second) if history)
 
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
@@ -347,7 +348,14 @@ class VehicleHistory:
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
         first, limit = self.time.span(limit, utc_ns)
-        heard = [one for one in between(self._receiver, first, limit) if abs(one.stamp_ns - utc_ns) <= NEAREST_NS]
+        heard, other = (
+            min(
+                (one for one in between(history, first, limit) if abs(one.stamp_ns - utc_ns) <= NEAREST_NS),
+                key=lambda sample: abs(sample.stamp_ns - utc_ns),
+                default=None,
+            )
+            for history in (self._receiver, self._second)
+        )
         gimbals, gimbal_boot_ns = self.gimbals.around(utc_ns, boot_ns, first, limit)
         return Around(
             utc_ns,
@@ -355,7 +363,7 @@ class VehicleHistory:
             sigma_ns,
             around_instant(between(self._positions, first, limit), boot_ns, gap_ns=POSITION_GAP_NS),
             around_instant(between(self._attitudes, first, limit), boot_ns, gap_ns=ATTITUDE_GAP_NS),
-            min(heard, key=lambda sample: abs(sample.stamp_ns - utc_ns), default=None),
+            other if other and _fixed(other) and not (heard and _fixed(heard)) else heard,
             gimbals,
             gimbal_boot_ns,
             placed,
@@ -390,7 +398,8 @@ class VehicleHistory:
 
     def _gnss(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
-            keep(self._receiver, telemetry_samples.gnss(number, stamp_ns, message))
+            history = self._receiver if message.get_type() == "GPS_RAW_INT" else self._second
+            keep(history, telemetry_samples.gnss(number, stamp_ns, message))
 
     def _height(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message) and (sample := ground_sample(number, stamp_ns, message)):
@@ -458,6 +467,10 @@ class VehicleHistory:
         return True
 
 
+def _fixed(sample: GnssSample) -> bool:
+    return sample.reported.fix_type >= _FIX_3D
+
+
 _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]] = {
     "GLOBAL_POSITION_INT": VehicleHistory._position,
     "ATTITUDE_QUATERNION": VehicleHistory._attitude,
@@ -465,6 +478,7 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "ATTITUDE": VehicleHistory._attitude,
     "ODOMETRY": VehicleHistory._odometry,
     "GPS_RAW_INT": VehicleHistory._gnss,
+    "GPS2_RAW": VehicleHistory._gnss,
     "DISTANCE_SENSOR": VehicleHistory._height,
     "TERRAIN_REPORT": VehicleHistory._height,
     "GIMBAL_DEVICE_ATTITUDE_STATUS": VehicleHistory._gimbal,
@@ -475,4 +489,4 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)
-SINCE_RULES = {"ODOMETRY": 3, "DISTANCE_SENSOR": 6, "TERRAIN_REPORT": 6}  # others: since the first
+SINCE_RULES = {"ODOMETRY": 3, "DISTANCE_SENSOR": 6, "TERRAIN_REPORT": 6, "GPS2_RAW": 7}  # others: since the first

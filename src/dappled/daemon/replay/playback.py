@@ -99,6 +99,8 @@ def run(
         pipeline.start()
         stack.callback(pipeline.stop, _STOP_S)
         replay.play(recording, shots, progress, time=time, pace=pace)
+        for one in telemetry.findings():
+            report(one)
         if publisher is not None:
             counts = {"wished": len(recording.shots), "safe": progress.frames}
             publisher.publish("end", {"utc_ns": time.utc_ns(), "shots": counts})

@@ -7,6 +7,7 @@ import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from time import sleep
 from typing import Any, Self
@@ -24,7 +25,7 @@ from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot
-from dappled.drivers.utc_choice import UtcBounds
+from dappled.drivers.utc_choice import Date, UtcBounds
 from dappled.drivers.wired.matching import seconds
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding
@@ -153,6 +154,9 @@ def of_folder(
     bounds = _bounds(paths, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
     if start_utc_ns is None:
         start_utc_ns = _first_position_utc_ns(telemetry, bounds, system) if telemetry else 0
+        if telemetry and not own_log(telemetry) and bounds.judge(start_utc_ns) is not Date.TRUE:
+            said = datetime.fromtimestamp(start_utc_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M")
+            told.append(finding(Code.LOG_STAMPS_UNSET, Subject("log", str(telemetry)), utc=said))
     elif telemetry is not None and own_log(telemetry):
         next(_packets(telemetry, bounds=bounds), None)  # one that can't be used is refused before all else
     shots, files, expected = [], [], []
@@ -245,6 +249,7 @@ class RecordedTelemetry:
             attitude_sigma_rad=attitude_sigma_rad,
             rules=rules,
         )
+        self._path = path
         self._packets = _packets(path, report, bounds) if path else iter(())
         self._fed = 0
 
@@ -293,6 +298,13 @@ class RecordedTelemetry:
     def rates(self, pose: Pose) -> Vector3 | None:
         """See PoseSource."""
         return self._telemetry.rates(pose)
+
+    def findings(self) -> list[Finding]:
+        """What is to be said of what was fed."""
+        if not (count := self._telemetry.statistics().impossible):
+            return []
+        subject = Subject("log", str(self._path))
+        return [finding(Code.LOG_VALUES_MISSING, subject, values=f"{count} of its messages")]
 
 
 class ReplayProgress(Observer):
