@@ -37,6 +37,7 @@ class Code(StrEnum):
     CAMERA_CLOCK_FAR = "camera.clock_far"
     CARD_CHANGED = "card.changed"
     CARD_NOT_LISTED = "card.not_listed"
+    CARD_PICTURES_LEFT = "card.pictures_left"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
     FRAME_RIVAL_PICTURE = "frame.rival_picture"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"

@@ -7,6 +7,7 @@ other shot is left: where the body's own time speaks against it, it is a stray, 
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ TOLERANCE_S = 3.0
 _LEAST_S = 1.5
 """Two times in whole seconds differ by less than one, and the shutter's latencies by some tenths."""
 _SIGMAS = 4.0
+_SLOW_S = 5.0
 _FEW = 4
 _KEPT = 16
 _DNG_VERSION = 50706
@@ -38,6 +40,7 @@ class FileClue:
 
     `taken_s`: when it was made by the body's clock, which may be wrong; None where the body doesn't say. `arrived_ns`:
     when it was announced or first listed. `since_ns`: every picture made before is known already (None: unknown).
+    `following`: how many files that were taken later came with it.
     `after` and `before`: the shots whose certain frames stand next to it by the camera's count of names, on the same
     card; None where there are none, or where names don't count.
     """
@@ -47,18 +50,29 @@ class FileClue:
     since_ns: int | None = None
     after: int | None = None
     before: int | None = None
+    following: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class RivalTime:
+    """How far the body's time of a file was from a shot's, if it was that shot's; and of how many files before it, in a
+    row, that was so far from theirs."""
+
+    claim: Claim
+    offset_s: float
+    before: int = 0
 
 
 @dataclass(frozen=True, slots=True)
 class BodyClock:
     """The body's time minus this machine's, in seconds, from the last 16 files whose shot was certain.
 
-    `rivals_s` are those of the last files that disagree with them and agree with one another: the body's clock may have
-    been set.
+    `rivals` are those of the last files, which disagreed with them, to each shot that they may be of: the body's clock
+    may have been set.
     """
 
     offsets_s: tuple[float, ...] = ()
-    rivals_s: tuple[float, ...] = ()
+    rivals: tuple[RivalTime, ...] = ()
 
     @property
     def limit_s(self) -> float:
@@ -82,18 +96,20 @@ class BodyClock:
         new_s = taken_s - claim.fired_ns / 1e9
         known = self.offsets_s
         if known and abs(self.off_s(claim, taken_s)) > TOLERANCE_S:
-            known = self.rivals_s if self.agreeing(claim, taken_s) else ()
+            known = tuple(one.offset_s for one in self.rivals if abs(one.offset_s - new_s) <= TOLERANCE_S)
         return BodyClock((*known, new_s)[-_KEPT:])
 
-    def against(self, claim: Claim, taken_s: float) -> BodyClock:
-        """With a file that would be this shot's only if the body's clock had been set."""
-        kept = self.rivals_s if self.agreeing(claim, taken_s) else ()
-        return replace(self, rivals_s=(*kept, taken_s - claim.fired_ns / 1e9)[-_KEPT:])
-
-    def agreeing(self, claim: Claim, taken_s: float) -> int:
-        """How many files before, in a row, were as far from their shots as this one is from this shot."""
-        near = self.rivals_s and abs(taken_s - claim.fired_ns / 1e9 - median(self.rivals_s)) <= TOLERANCE_S
-        return len(self.rivals_s) if near else 0
+    def rivalling(self, claims: Sequence[Claim], taken_s: float) -> list[tuple[RivalTime, float]]:
+        """What a file says that would be of one of these shots only if the body's clock had been set, and how far it is
+        from the file before it: the likeliest first."""
+        found = []
+        for claim in claims:
+            new_s = taken_s - claim.fired_ns / 1e9
+            near = [(abs(new_s - one.offset_s), one) for one in self.rivals if one.claim.fired_ns <= claim.fired_ns]
+            apart_s, last = min(near, key=lambda one: one[0], default=(math.inf, None))
+            agrees = last is not None and apart_s <= TOLERANCE_S
+            found.append((RivalTime(claim, new_s, 1 + last.before if last and agrees else 0), apart_s))
+        return sorted(found, key=lambda one: (-one[0].before, one[1]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,19 +139,24 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     awaited = next((one for one in waiting if one in claims), None)
     taken_s = clue.taken_s
     if not claims or taken_s is None or not clock.offsets_s:
-        return _by_order(claims, awaited, late, taken_s, clock)
+        return _by_order(claims, awaited, late, clue, clock)
     if fitting := [one for one in claims if clock.fits(one, taken_s)]:
-        return _by_order(fitting, awaited, late, taken_s, clock)
+        return _by_order(fitting, awaited, late, clue, clock)
     nearest = min(claims, key=lambda one: abs(clock.off_s(one, taken_s)))
     if abs(clock.off_s(nearest, taken_s)) <= TOLERANCE_S:
         return Attribution(nearest.shot, clock.learnt(nearest, taken_s), _disagrees(nearest, taken_s, clock))
     if awaited is None:
         return Attribution(None, clock)
-    agreeing = clock.agreeing(awaited, taken_s) + (not _of_another_moment(clue, taken_s, clock))
-    if agreeing > 1:
-        return Attribution(awaited.shot, clock.learnt(awaited, taken_s))
-    doubt = _disagrees(awaited, taken_s, clock) if agreeing else None
-    return Attribution(awaited.shot if doubt else None, clock.against(awaited, taken_s), doubt)
+    rivalling = clock.rivalling([one for one in waiting if one in claims], taken_s)
+    likely, apart_s = rivalling[0]
+    alone = all(one.before < likely.before or other_s > apart_s + 1.0 for one, other_s in rivalling[1:])
+    agreeing = likely.before + (not _of_another_moment(clue, taken_s, clock))
+    chosen = likely.claim if likely.before else awaited
+    if agreeing > (1 if len(rivalling) == 1 else _FEW) and alone and apart_s <= _LEAST_S:
+        return Attribution(chosen.shot, clock.learnt(chosen, taken_s))
+    doubt = _disagrees(chosen, taken_s, clock) if agreeing else None
+    told = replace(clock, rivals=(*(one for one, _ in rivalling), *clock.rivals)[:_KEPT])
+    return Attribution(chosen.shot if doubt else None, told, doubt)
 
 
 def _possible(claim: Claim, clue: FileClue) -> bool:
@@ -145,12 +166,18 @@ def _possible(claim: Claim, clue: FileClue) -> bool:
 
 
 def _by_order(
-    claims: Sequence[Claim], awaited: Claim | None, late: Sequence[Claim], taken_s: float | None, clock: BodyClock
+    claims: Sequence[Claim], awaited: Claim | None, late: Sequence[Claim], clue: FileClue, clock: BodyClock
 ) -> Attribution:
     """Choose among shots that the body's clock doesn't exclude: by time where it is known, else the awaited one."""
+    taken_s = clue.taken_s
     dated_s = taken_s if clock.offsets_s else None
     rivals = [one for one in claims if one in late]
     chosen = awaited if awaited in claims else claims[0] if len(claims) == 1 else None
+    if dated_s is not None and chosen is not None and not rivals:
+        nearest = min(claims, key=lambda one: abs(clock.off_s(one, dated_s)))
+        off_s = abs(clock.off_s(chosen, dated_s))
+        if off_s > _LEAST_S and abs(clock.off_s(nearest, dated_s)) < off_s - 1.0:
+            chosen = nearest  # the awaited shot's file is late, or there is none
     if dated_s is not None and rivals:
         chosen = min(claims, key=lambda one: abs(clock.off_s(one, dated_s)))
     if chosen is None:
@@ -158,9 +185,19 @@ def _by_order(
     subject = Subject("frame", chosen.shot)
     if rival := next((one for one in reversed(rivals if chosen not in rivals else claims) if one != chosen), None):
         return Attribution(chosen.shot, clock, finding(Code.FRAME_RIVAL_SHOTS, subject, rival=rival.shot))
+    last = claims[max(len(claims) - 1 - clue.following, 0)]
+    if not clock.offsets_s and chosen == awaited and _is_rather_of(last, chosen, clue.arrived_ns):
+        return Attribution(chosen.shot, clock, finding(Code.FRAME_RIVAL_SHOTS, subject, rival=last.shot))
     if rivals and dated_s is None:
         return Attribution(chosen.shot, clock, finding(Code.FRAME_UNCONFIRMED, subject, shot=chosen.shot))
     return Attribution(chosen.shot, clock if taken_s is None else clock.learnt(chosen, taken_s))
+
+
+def _is_rather_of(other: Claim, chosen: Claim, arrived_ns: int) -> bool:
+    """Whether the first file came so soon after another shot, and so late after the chosen one, that this one may have
+    made none: the body's clock can't tell yet."""
+    waited_ns = arrived_ns - chosen.fired_ns
+    return waited_ns > _SLOW_S * 1e9 and arrived_ns - other.fired_ns < waited_ns / 4
 
 
 def _of_another_moment(clue: FileClue, taken_s: float, clock: BodyClock) -> bool:

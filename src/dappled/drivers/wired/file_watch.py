@@ -52,9 +52,11 @@ class FileWatch:
     def __init__(self, source: FileSource, clock: Clock, *, in_flight: bool, file_s: float, pair_s: float) -> None:
         self._source, self._clock = source, clock
         self._in_flight, self._file_s, self._pair_s = in_flight, file_s, pair_s
+        self._began_ns = clock.monotonic_ns()
         self._lock = threading.Lock()
         self._claims: list[Claim] = []
         self._late: list[Claim] = []
+        self._past_ns = -1
         self._body_clock = BodyClock()
         self._done: set[FoundFile] = set()
         self._looked = False
@@ -70,13 +72,11 @@ class FileWatch:
         self._brought: dict[str, BroughtFile] = {}  # by name
         self._frames: dict[str, BroughtFile] = {}  # by stem, of this card: for companions that come after
         self._left: list[FoundFile] = []
-        self._fired_ns: int | None = None
 
     def expect(self, claim: Claim) -> None:
         """A shot was fired; its file may come."""
         with self._lock:
             self._claims.append(claim)
-            self._fired_ns = claim.fired_ns if self._fired_ns is None else self._fired_ns
 
     def look(self) -> FileEvents:
         """List the source and yield what is new: each complete file, and a card that was changed. Raises what a source
@@ -106,17 +106,24 @@ class FileWatch:
         with self._lock:
             overdue = [claim for claim in self._claims if claim.fired_ns < limit_ns]
             self._claims = [claim for claim in self._claims if claim.fired_ns >= limit_ns]
-        self._late = [*self._late, *overdue][-_LATE:]
+        self._late = [*self._late, *(one for one in overdue if one.fired_ns > self._past_ns)][-_LATE:]
         reason = f"no file came within {self._file_s:g} s of the release"
         reason += f": {self._trouble}" if self._trouble else ""
         return [ShotFailed(claim.shot, reason, now_ns) for claim in overdue]
 
     def left(self) -> Iterator[Noticed]:
-        """The pictures of this flight that stay on the card."""
+        """The pictures that stay on the card: those of this flight by name, and how many may be of it."""
         now_ns = self._clock.monotonic_ns()
+        known, others = self._is_known_card(self._before), []
         for group in groups(self._left):
-            if self._is_known_card(self._before) or self._is_of_flight(self._dates.get(group.main), now_ns):
-                yield Noticed(finding(Code.PICTURE_ON_CARD, Subject("picture", group.main.name)), now_ns)
+            name, taken_s = group.main.name, self._dates.get(group.main)
+            if known or self._is_of_flight(taken_s, now_ns):
+                yield Noticed(finding(Code.PICTURE_ON_CARD, Subject("picture", name)), now_ns)
+            else:
+                others.append(name)
+        if others:
+            subject, first = Subject("card"), others[0]
+            yield Noticed(finding(Code.CARD_PICTURES_LEFT, subject, pictures=len(others), first=first), now_ns)
 
     def close(self) -> None:
         """Close the source."""
@@ -167,13 +174,11 @@ class FileWatch:
         return old == self._card if old and self._card else self._first <= now
 
     def _is_of_flight(self, taken_s: float | None, now_ns: int) -> bool:
-        """Whether a picture was taken since the first shot, by the body's clock as it is known."""
+        """Whether a picture was taken since the driver began, by the body's clock as it is known."""
         offsets_s = self._body_clock.offsets_s
-        if taken_s is None or not offsets_s or self._fired_ns is None:
+        if taken_s is None or not offsets_s:
             return False
-        return (
-            -matching.WINDOW_S <= taken_s - median(offsets_s) - self._fired_ns / 1e9 <= (now_ns - self._fired_ns) / 1e9
-        )
+        return self._began_ns / 1e9 - matching.WINDOW_S <= taken_s - median(offsets_s) <= now_ns / 1e9
 
     # files
 
@@ -210,14 +215,17 @@ class FileWatch:
             dates = {group.main: self._date(group.main) for group in new}
         except CameraError:
             return  # the next look may find it again
-        for group in picture_order.by_time(new, lambda one: one.main.name, lambda one: dates[one.main]).items:
+        ordered = picture_order.by_time(new, lambda one: one.main.name, lambda one: dates[one.main]).items
+        for place, group in enumerate(ordered, 1):
             now_ns = self._clock.monotonic_ns()
             first_ns = self._first_seen.setdefault(group.main.stem, now_ns)
             beside = self._beside(group.main, found)
             if beside is not None and beside.shot is not None:
                 yield from self._accompany(beside.shot, (group.main, *group.companions))
             elif group.main.raw or beside is not None or now_ns - first_ns >= self._pair_s * 1e9:
-                yield from self._bring_in_flight(group, found, first_ns)
+                after, before = self._neighbours(group.main, dates[group.main], found)
+                clue = FileClue(dates[group.main], first_ns, None, after, before, len(ordered) - place)
+                yield from self._bring_in_flight(group, clue)
 
     def _beside(self, one: FoundFile, found: Iterable[FoundFile]) -> BroughtFile | None:
         """The frame of the same exposure that was brought before it: it has its stem and time, and is still there."""
@@ -228,18 +236,17 @@ class FileWatch:
         apart_s = 0.0 if taken_s is None or frame.taken_s is None else abs(taken_s - frame.taken_s)
         return frame if apart_s <= _BESIDE_S else None
 
-    def _bring_in_flight(self, group: FileGroup, found: list[FoundFile], first_ns: int) -> FileEvents:
+    def _bring_in_flight(self, group: FileGroup, clue: FileClue) -> FileEvents:
         """Attribute a file that comes while shots wait for theirs."""
-        taken_s = self._date(group.main)
         with self._lock:
-            waiting = list(self._claims)
-        after, before = self._neighbours(group.main, taken_s, found)
-        clue = FileClue(taken_s, first_ns, after=after, before=before)
+            waiting = [one for one in self._claims if one.fired_ns > self._past_ns]
         made = attribute(clue, self._late, waiting, self._body_clock)
         facts = {"doubt": findings.text(made.doubt)} if made.doubt else {}
         if (yield from self._bring(made.shot, group, facts)):
             self._body_clock = made.clock
             self._late = [] if made.doubt else [one for one in self._late if one.shot != made.shot]
+            if made.doubt:  # files come in order: no file of an older shot is expected any more
+                self._past_ns = max((one.fired_ns for one in waiting if one.shot == made.shot), default=self._past_ns)
 
     def _neighbours(
         self, file: FoundFile, taken_s: float | None, found: Iterable[FoundFile]

@@ -60,7 +60,8 @@ class FileSource(Protocol):
     `removable`: they lie on a card or a disk, which can be changed for another.
     """
 
-    removable: bool
+    @property
+    def removable(self) -> bool: ...
 
     def list(self) -> list[FoundFile]:
         """List all pictures in the order of their names. Raises CameraError where the source is not there."""
