@@ -36,7 +36,7 @@ class Log:
 class Port:
     """A link that listens, signed or not, and counts what it heard."""
 
-    def __init__(self, folder: Path, *, signed: bool) -> None:
+    def __init__(self, folder: Path, *, signed: bool, scheme: str = "udpin") -> None:
         self.key = None
         signing = None
         if signed:
@@ -44,7 +44,7 @@ class Port:
             self.key = read_key(folder / "key")
             signing = open_signing([folder / "key"], folder / "time", SystemClock())
         self.links = MavlinkLinks(
-            ["udpin:127.0.0.1:0"], system_id=1, component_id=100, clock=SystemClock(), signing=signing
+            [f"{scheme}:127.0.0.1:0"], system_id=1, component_id=100, clock=SystemClock(), signing=signing
         )
         self.heard = threading.Semaphore(0)
         self.known = self.strange = 0
@@ -205,4 +205,48 @@ def test_what_strangers_send_to_a_signed_port_costs_the_station_nothing(tmp_path
     finally:
         port.links.stop()
         for each in (station, *crowd):
+            each.socket.close()
+
+
+class TcpStation(Station):
+    """The same over a connection."""
+
+    def __init__(self, port: Port) -> None:
+        super().__init__(port)
+        self.socket.close()
+        self.socket = socket.create_connection(("127.0.0.1", port.links.port(0)), 20)
+
+
+def test_a_stranger_on_a_signed_tcp_port_hears_nothing_and_displaces_nobody(tmp_path: Path) -> None:
+    port = Port(tmp_path, signed=True, scheme="tcpin")
+    port.start()
+    station, strangers = TcpStation(port), list[TcpStation]()
+    recorded = station.packet()
+    try:
+        station.socket.sendall(recorded)
+        assert port.heard.acquire(timeout=20)
+        for _ in range(6):
+            strangers.append(TcpStation(port))
+            strangers[-1].socket.sendall(recorded)
+            refused = len(strangers)
+            port.until_refused(refused)
+        for _ in range(20):
+            assert port.send()
+        whole = station.packet()
+        strangers[-1].socket.sendall(b"\xfd\xff")  # as if a packet began, which is no part of the station's
+        station.socket.sendall(whole)
+        assert port.heard.acquire(timeout=20)
+        assert sum(len(one.socket.recv(300)) for one in strangers[-1:]) <= len(recorded)
+        assert strangers[0].socket.recv(300) == b""  # of those who wait for nothing four are kept
+        heard = 0
+        while heard < 20 * len(recorded):
+            heard += len(station.socket.recv(300))
+        successor = TcpStation(port)
+        strangers.append(successor)
+        successor.socket.sendall(station.packet())
+        assert port.heard.acquire(timeout=20)
+        assert station.socket.recv(300) == b""
+    finally:
+        port.links.stop()
+        for each in (station, *strangers):
             each.socket.close()

@@ -7,15 +7,30 @@ import ipaddress
 import os
 import socket
 import termios
-import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
 from dappled.drivers.mavlink.peers import Peers, Shown, Source
+from dappled.drivers.mavlink.streams import ByteStream, TcpServer, over_tcp
 from dappled.errors import DappledError
+
+__all__ = [
+    "Address",
+    "ByteChannel",
+    "ByteStream",
+    "LinkError",
+    "TcpServer",
+    "UdpIn",
+    "UdpOut",
+    "open_channel",
+    "over_serial",
+    "over_tcp",
+    "parse",
+    "serial_address",
+]
 
 LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/ttyX[,BAUD]"
@@ -29,17 +44,10 @@ _SCHEMES: dict[str, LinkKind] = {
     "tcpin": "tcpin",
 }
 _CHUNK = 65536
-_OUTBOX_LIMIT = 65536
-_GONE_S = 5
 _DRAINED = 512  # datagrams at once, so that the kernel's buffer holds those that come meanwhile
 _KERNEL_BYTES = 4 << 20
 _SO_RCVBUFFORCE = 33  # socket(7)
 _NO_DATAGRAM = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED)  # the last: no program listens there yet
-_NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO, errno.ENETDOWN, errno.ENETUNREACH,
-              errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENONET)  # fmt: skip
-"""Errors of `accept` that are the client's and not the listening socket's: see accept(2)."""
-
-
 _FINAL = (errno.EADDRINUSE, errno.EACCES, errno.EPERM)
 """What waiting does not mend: another program has the port, or this user may not open the device."""
 
@@ -116,6 +124,13 @@ class ByteChannel(Protocol):
     """One open connection. One thread reads; `write` is called under the link's lock."""
 
     datagrams: bool  # `read` returns whole packets
+
+    @property
+    def origin(self) -> int:
+        """Whose bytes were read last, where several are read in turn."""
+
+    def ask_proof(self) -> None:
+        """The link has a key: nobody is served who has not proven itself."""
 
     def descriptors(self) -> Sequence[int]:
         """The descriptors to poll: any of them may become readable."""
@@ -207,6 +222,13 @@ class _Udp:
         sock.setblocking(False)
         self._sock = sock
         self._last: tuple[bytes, Source] | None = None
+
+    @property
+    def origin(self) -> int:
+        return 0
+
+    def ask_proof(self) -> None:
+        return
 
     def descriptors(self) -> Sequence[int]:
         return (self._sock.fileno(),)
@@ -320,149 +342,7 @@ class UdpOut(_Udp):
         return self._send(data, self._to)
 
 
-# --- TCP and serial
-
-
-class ByteStream:
-    """A descriptor that carries bytes both ways. What it can't take at once waits: whole packets, at most 64 KiB."""
-
-    datagrams = False
-
-    def __init__(self, fd: int, close: Callable[[], None], port: int = 0) -> None:
-        self._fd, self._close, self._port = fd, close, port
-        self._waiting = bytearray()
-
-    def descriptors(self) -> Sequence[int]:
-        return (self._fd,)
-
-    def read(self) -> bytes | None:
-        try:
-            return os.read(self._fd, _CHUNK) or None
-        except BlockingIOError:
-            return b""
-
-    def shown(self, evidence: Shown) -> None:
-        return
-
-    def write(self, data: bytes) -> bool:
-        if len(self._waiting) + len(data) > _OUTBOX_LIMIT:
-            return False
-        self._waiting += data
-        self.flush()
-        return True
-
-    def source(self) -> str:
-        return ""
-
-    def wants_write(self) -> bool:
-        return bool(self._waiting)
-
-    def flush(self) -> None:
-        while self._waiting:
-            try:
-                count = os.write(self._fd, self._waiting)
-            except BlockingIOError:
-                return
-            del self._waiting[:count]
-
-    def port(self) -> int:
-        return self._port
-
-    def close(self) -> None:
-        self._close()
-
-
-class TcpServer:
-    """A TCP server for one client at a time, the newest. A client whose radio went out of range never closes its
-    connection, and must not keep the next one waiting."""
-
-    datagrams = False
-
-    def __init__(self, sock: socket.socket) -> None:
-        self._sock = sock
-        self._client: ByteStream | None = None
-        self._change = threading.Lock()  # the reading thread closes clients; no other may write to one meanwhile
-
-    def descriptors(self) -> Sequence[int]:
-        return (self._sock.fileno(), *(self._client.descriptors() if self._client else ()))
-
-    def read(self) -> bytes | None:
-        newcomer = self._accepted()
-        if newcomer is not None:
-            self._replace_client(newcomer)
-            return b""
-        if self._client is None:
-            return b""
-        try:
-            data = self._client.read()
-        except OSError:
-            data = None
-        if data is None:
-            self._replace_client()
-            return b""
-        return data
-
-    def shown(self, evidence: Shown) -> None:
-        return
-
-    def write(self, data: bytes) -> bool:
-        try:
-            with self._change:
-                return self._client.write(data) if self._client else False
-        except OSError:  # the next `read` finds that it has gone
-            return False
-
-    def source(self) -> str:
-        return ""
-
-    def wants_write(self) -> bool:
-        return self._client is not None and self._client.wants_write()
-
-    def flush(self) -> None:
-        try:
-            with self._change:
-                if self._client:
-                    self._client.flush()
-        except OSError:  # as above
-            return
-
-    def port(self) -> int:
-        return int(self._sock.getsockname()[1])
-
-    def close(self) -> None:
-        self._replace_client()
-        self._sock.close()
-
-    def _accepted(self) -> ByteStream | None:
-        """Accept a client; None where none is there, or it has left again. Raises OSError when the socket is broken."""
-        try:
-            sock = self._sock.accept()[0]
-        except OSError as error:
-            if error.errno in _NO_CLIENT:
-                return None
-            raise
-        try:
-            return over_tcp(sock)
-        except OSError:  # it has left by now
-            sock.close()
-            return None
-
-    def _replace_client(self, newcomer: ByteStream | None = None) -> None:
-        with self._change:
-            client, self._client = self._client, newcomer
-            if client:
-                client.close()
-
-
-def over_tcp(sock: socket.socket) -> ByteStream:
-    """Make a connected TCP socket a stream that fails 5 s after the other side vanished. Raises OSError."""
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, 1000 * _GONE_S)  # what was sent and not acknowledged
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # where nothing was sent
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 2)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 1)
-    sock.setblocking(False)
-    return ByteStream(sock.fileno(), sock.close, int(sock.getsockname()[1]))
+# --- serial
 
 
 def over_serial(address: Address) -> ByteStream:

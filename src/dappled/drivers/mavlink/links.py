@@ -37,6 +37,7 @@ __all__ = [
 
 log = logging.getLogger(__name__)
 _REOPEN_S = 1.0
+_FRAMERS = 8  # clients of a TCP server that are read in turn, and some that have gone
 _STAMP_BYTES = 8  # before each packet in the telemetry log
 _POLL_S = 0.2
 _RETURNS_NS = 30 * 10**9  # a radio may hold packets for seconds
@@ -129,6 +130,13 @@ class Link:
             return pack(message, self.packer, version_1=self.heard_1 and not self.heard_2)
         self.guard.prepare(self.packer)
         return pack(message, self.packer, version_1=False)
+
+    def opened(self) -> ByteChannel:
+        """Open another channel. Raises LinkError."""
+        channel = open_channel(self.address)
+        if self.guard is not None:
+            channel.ask_proof()
+        return channel
 
     def fail(self, problem: object) -> None:
         """Mark the channel as broken: the receiving thread opens another."""
@@ -306,7 +314,7 @@ class MavlinkLinks:
         try:
             for link in self._links:
                 try:
-                    link.channel = open_channel(link.address)
+                    link.channel = link.opened()
                 except LinkError as error:
                     if not error.may_come:
                         raise
@@ -363,17 +371,20 @@ class MavlinkLinks:
     # --- the receiving threads
 
     def _receive(self, link: Link, receiver: PacketReceiver | None) -> None:
-        framer = Framer()
+        framers = dict[int, Framer]()  # by origin
         while not self._stop.is_set():
             channel = link.channel
             if channel is None or link.error is not None:
                 self._reopen(link)
-                framer = Framer()
+                framers.clear()
                 continue
             try:
                 if not self._wait(channel):
                     continue
                 while (data := channel.read()) and not self._stop.is_set():
+                    framer = framers.setdefault(channel.origin, Framer())
+                    if len(framers) > _FRAMERS:
+                        del framers[next(iter(framers))]
                     self._take(link, channel, framer, data, receiver)
                     if not channel.datagrams:  # a stream that never ends must not keep its own output waiting
                         break
@@ -423,8 +434,8 @@ class MavlinkLinks:
                 source = (message.get_srcSystem(), message.get_srcComponent())
                 trust = link.guard.judge(framed.raw, *source, message.get_msgId())
                 if trust == "refuse":
-                    if channel.datagrams and is_signed(framed.raw):
-                        channel.shown("old")  # `sift` let it pass: its signature is right
+                    if is_signed(framed.raw) and link.guard.rightly_signed(framed.raw):
+                        channel.shown("old")
                     return
                 trusted = trust != "hear"
             signed = link.guard is not None and is_signed(framed.raw)
@@ -450,7 +461,7 @@ class MavlinkLinks:
         if self._stop.wait(_REOPEN_S):
             return
         try:
-            channel = open_channel(link.address)
+            channel = link.opened()
         except LinkError as error:
             link.error = str(error)
             return

@@ -4,8 +4,8 @@ A peer is *unproven* until a packet of it says something, and costs nothing: its
 *heard* when a packet of it is rightly signed, but is no new one (a clock that is behind, a copy that another link
 brought first): it is sent at most as many bytes as it sent, so that a station whose clock is behind learns the time.
 It is *proven* by a new packet that is obeyed, and is sent everything: for a minute where the packet was signed, else
-for 5 s. At most 16 peers of a port are proven; one that still is is never displaced. Over a serial line or TCP the one
-at the other end can't be another one than it says.
+for 5 s. At most 16 peers of a port are proven; one that still is is never displaced. Over a serial line
+the one at the other end can't be another one; a TCP server with a key serves who has proven itself (`TcpServer`).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Shown = Literal["signed", "sound", "old"]
 MOST = 16
 _PROVEN_NS: dict[Shown, int] = {"signed": 60 * 10**9, "sound": 5 * 10**9}
 _HEARD_NS = 5 * 10**9
-_CREDIT_BYTES = 280  # one packet
+CREDIT_BYTES = 280  # one packet
 
 
 @dataclass(slots=True)
@@ -77,7 +77,7 @@ class Peers:
             if len(self._heard) >= MOST:
                 return
         peer = self._heard.setdefault(source, Peer(0))
-        peer.until_ns, peer.credit = now_ns + _HEARD_NS, min(peer.credit + size, _CREDIT_BYTES)
+        peer.until_ns, peer.credit = now_ns + _HEARD_NS, min(peer.credit + size, CREDIT_BYTES)
 
 
 def _forget_gone(peers: dict[Source, Peer], now_ns: int) -> None:

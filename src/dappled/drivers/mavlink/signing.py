@@ -313,7 +313,7 @@ class SignatureGuard:
         it."""
         if not is_signed(raw):
             return self._judge_unsigned(message_id)
-        if not self._rightly_signed(raw):
+        if not self.rightly_signed(raw):
             self._forged += 1
             return "refuse"
         stream = (system, component, raw[-SIGNATURE_BYTES])
@@ -341,7 +341,7 @@ class SignatureGuard:
             raw = datagram[at : at + length]
             at += length
             if is_signed(raw):
-                if self._rightly_signed(raw):
+                if self.rightly_signed(raw):
                     kept.append(raw)
                 else:
                     self._forged += 1
@@ -374,7 +374,8 @@ class SignatureGuard:
         """Whether it is a radio's own report, of which few are heard: anybody may say that he is the radio."""
         return message_id == mavlink.MAVLINK_MSG_ID_RADIO_STATUS and rate.takes(1, self._time.monotonic_ns())
 
-    def _rightly_signed(self, raw: bytes) -> bool:
+    def rightly_signed(self, raw: bytes) -> bool:
+        """Whether the signature of a signed packet was made with the key, whenever that was."""
         return hmac.compare_digest(hashlib.sha256(self._key + raw[:-6]).digest()[:6], raw[-6:])
 
 
