@@ -186,7 +186,7 @@ def test_no_picture_goes_astray_in_a_random_sequence_with_a_body() -> None:
     check([1], 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.timeout(900)
 def test_no_picture_goes_astray_in_40_random_sequences_with_bodies() -> None:
     check(range(2, 42), 8)

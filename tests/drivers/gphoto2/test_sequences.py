@@ -375,8 +375,11 @@ class World:
                     self.framed.add(event.shot)
         for one in self.body.pictures:
             # On a card that was taken out unseen; or without times, when nothing but a name that a card may have had
-            # before tells a new process of it.
+            # before tells a new process of it; or of the very name, size and second of another card's, by a clock that
+            # was set back.
             gone = (one.card is not self.body.card and not one.listed) or (self.restarted and not self.body.dated)
+            facts = [(each.file, each.taken_s) for each in self.body.pictures]
+            gone = gone or (self.body.dated and facts.count((one.file, one.taken_s)) > 1)
             if one.data not in accounted and not gone:
                 found.wrong.append(f"{one.data!r} of {one.shot} made at {one.made_s:.1f} s is unaccounted for")
         ended = {event.shot for _, event, _ in self.events if isinstance(event, Arrival | ShotFailed)}
@@ -448,6 +451,6 @@ def test_no_picture_goes_astray_in_100_random_sequences() -> None:
     check(range(100))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_no_picture_goes_astray_in_2000_random_sequences() -> None:
     check(range(2000))

@@ -22,12 +22,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
+from dappled import findings
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Gnss, Pose, camera_pose, from_euler
 from dappled.decode.geometry.camera_pose import FORWARD, NADIR, Angles
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.errors import DappledError
+from dappled.findings import Code, Subject, finding
 from dappled.flight import recording
 from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import exif_gps, geotags, sidecars
@@ -177,6 +179,15 @@ def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "") -> Pa
         begun.ledger.add_event("doubt", doubt, 0)
     begun.close()
     return begun.folder.path
+
+
+def test_a_doubt_that_came_after_the_tag_is_in_the_sidecar_and_decides_the_exit_code(tmp_path: Path) -> None:
+    doubt = findings.text(finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2"))
+    flight = flown_by_two(tmp_path, doubt=doubt)
+    assert main(["geotag", str(flight), "--vehicle", "1"]) == 1
+    (sidecar,) = (flight / "frames").glob("*.xmp")
+    assert f"in doubt: {doubt}" in sidecar.read_text()
+    assert main(["geotag", str(flight), "--vehicle", "1", "--anyway"]) == 0
 
 
 def tagged_north(flight: Path) -> float:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -57,10 +57,12 @@ def read(
     tags: Mapping[int, Tag] | None = None,
 ) -> tuple[list[Placed], list[str]]:
     """A flight's tagged frames in order, and the names of frames without a tag. Where a frame has a mark, its time and
-    position are the mark's. `tags` replace the recorded ones. Raises FlightError and EarthError."""
+    position are the mark's. `tags` replace the recorded ones. A doubt whose a frame is that came after
+    its tag is in its time's source too. Raises FlightError and EarthError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags = ledger.tags() if tags is None else tags
         frames, correction_ns = ledger.frames(), ledger.utc_correction_ns()
+        doubted = {event.index: event.text for event in ledger.events() if event.kind == "doubt"}
     placed = []
     for frame in frames:
         tag = tags.get(frame.index)
@@ -70,6 +72,9 @@ def read(
         if marked is not None and frame.index in marked.marks:
             tag = marked.tag(tag, geoid)
             utc_ns = tag.utc_ns
+        doubt = doubted.get(frame.index, "")
+        if doubt not in tag.time_source:
+            tag = replace(tag, time_source=f"{tag.time_source}; in doubt: {doubt}")
         placed.append(Placed(frame, tag, _camera(tag.pose, mounting, geoid), utc_ns))
     return placed, [frame.name for frame in frames if frame.index not in tags]
 
