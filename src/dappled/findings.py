@@ -61,6 +61,7 @@ class Code(StrEnum):
     PICTURE_RIVAL_SHOTS = "picture.rival_shots"
     PICTURE_SHADOW_UNCERTAIN = "picture.shadow_uncertain"
     PICTURE_SHADOW_UNSEEN = "picture.shadow_unseen"
+    PICTURE_SOFT = "picture.soft"
     PICTURE_UNDATED = "picture.undated"
     TIME_WEEK_MENDED = "time.week_mended"
     TIME_WEEK_ROLLOVER = "time.week_rollover"

@@ -56,6 +56,24 @@ def test_raw_over_its_own_shadow_is_as_good_as_over_the_true_one(shot: Shot, lea
     assert found > psnr(shot.frame, shot.truth) + 8
 
 
+@pytest.mark.parametrize(
+    ("disparity_px", "exponent", "least_db"), [(1.0, 1.1, 36), (1.0, 1.5, 42), (2.0, 1.1, 43), (3.3, 1.5, 55)]
+)
+def test_out_of_focus_it_is_no_worse_than_sharp_picture_and_band(
+    disparity_px: float, exponent: float, least_db: float
+) -> None:
+    shot = Shot(disparity_px=disparity_px, exponent=exponent, shape=(320, 432))
+    found = _picture(shot)
+    band = np.fft.rfft2(shot.frame)
+    fy, fx = np.fft.fftfreq(shot.shape[0])[:, None], np.fft.rfftfreq(shot.shape[1])[None, :]
+    band[(np.abs(fy) > 0.0767) | (np.abs(fx) > 0.0767)] = 0
+    others = shot.frame / shot.shadow, np.fft.irfft2(band, s=shot.shape)
+    measured = psnr(found.plane, shot.truth)
+    assert measured >= max(psnr(one, shot.truth) for one in others) - 0.3
+    assert measured >= least_db
+    assert (found.soft_share > 0.9) == (disparity_px > 1)
+
+
 def test_the_lattice_is_found_where_the_print_stands() -> None:
     shot = Shot(scale=1.003, turn_deg=-0.7)
     found = _shadow(shot, MosaicPlane(shot.frame, GREY)).lattice.matrix()

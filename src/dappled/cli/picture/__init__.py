@@ -96,6 +96,7 @@ def _facts(target: Path, made: MadePicture) -> dict[str, Any]:
         "shadow_sigma": float(shadow.sigma.max()),
         "lattice": shadow.lattice.matrix().tolist(),
         "dark_share": made.picture.dark_share,
+        "soft_share": made.picture.soft_share,
         "trusted_share": float(made.picture.trusted.mean()),
         "findings": [one.to_json() for one in findings.in_order(made.findings)],
     }

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane, local_mean
-from dappled.decode.picture.shadow import Shadow
+from dappled.decode.picture.focus import Sharp, mixed
+from dappled.decode.picture.shadow import Shadow, ShadowFrom
 
 DARK = 0.2  # of the mean: behind less of the mask the picture has five times the noise
 _NOISE_PX = 16  # samples on a side of the parts that the noise is measured in
@@ -23,6 +24,8 @@ _EVEN_OUT = 36.0  # sum of the squares of (1, −2, 1) times itself
 class UnmaskedPicture:
     """`plane` float32 (H, W), linear, 1.0 = sensor white behind no mask of the same mean, with the frame's `pattern` of
     colours (see `MosaicPlane`). `sigma` (H, W) is the standard error of each pixel: noise, and the shadow's own;
+    what focus leaves is not in it. `dark_share` of the pixels lie behind less than `DARK` of the mask's mean, in
+    `soft_share` of the blocks more than half of the detail is left out, as they are out of focus (see `focus`).
     `trusted` is False where the frame was clipped or the mask let less than `DARK` of its mean through."""
 
     plane: Singles
@@ -31,6 +34,7 @@ class UnmaskedPicture:
     trusted: NDArray[np.bool_]
     shadow: Shadow
     dark_share: float
+    soft_share: float
 
 
 def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPicture:
@@ -40,6 +44,7 @@ def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPi
     plane, sigma = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     trusted = np.zeros(shape, dtype=bool)
     dark = samples = 0
+    sharp = []
     for place in mosaic.places():
         known, values = shadow.at(place), mosaic.plane[place.cut]
         made = values / known
@@ -48,13 +53,23 @@ def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPi
         if mosaic.valid is not None and not (good := mosaic.valid[place.cut]).all():
             weights = known * good
             around = local_mean(values * weights, period, place.step, known * weights)
-            made = np.where(good, made, np.maximum(made, around))
+            made = np.asarray(np.where(good, made, np.maximum(made, around)), dtype=np.float32)
             sound &= good
-        base, slope = noise_of(made, known)
-        variance = np.maximum(base + slope * values, base) / (known * known)
-        variance += (made * np.float32(shadow.sigma[place.colour]) / known) ** 2
-        plane[place.cut], sigma[place.cut], trusted[place.cut] = made, np.sqrt(variance), sound
-    return UnmaskedPicture(plane, mosaic.pattern, sigma, trusted, shadow, dark / max(samples, 1))
+        base, slope = (np.float32(one) for one in noise_of(made, known))
+        light = np.maximum(base + slope * values, base) / (known * known)
+        variance = light + (made * np.float32(shadow.sigma[place.colour]) / known) ** 2
+        sigma[place.cut], trusted[place.cut] = np.sqrt(variance), sound
+        sharp.append(Sharp(place, made, made * known, float(variance.mean())))
+    mix = np.ones((1, 1))
+    if shadow.source == ShadowFrom.NONE:
+        shown = [one.picture for one in sharp]
+    else:
+        shown, mix = mixed(sharp, shadow)
+    for one, image in zip(sharp, shown, strict=True):
+        plane[one.place.cut] = image
+    return UnmaskedPicture(
+        plane, mosaic.pattern, sigma, trusted, shadow, dark / max(samples, 1), float(np.mean(mix < 0.5))
+    )
 
 
 def noise_of(made: Singles, shadow: Singles) -> tuple[float, float]:

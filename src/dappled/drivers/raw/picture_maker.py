@@ -148,6 +148,8 @@ class PictureMaker:
             found.append(finding(Code.PICTURE_SHADOW_UNCERTAIN, subject, sigma=float(shadow.sigma.max())))
         if made.dark_share > _MANY_DARK:
             found.append(finding(Code.PICTURE_DARK, subject, share=made.dark_share, below=DARK))
+        if made.soft_share > 0:
+            found.append(finding(Code.PICTURE_SOFT, subject, share=made.soft_share))
         return tuple(found)
 
 

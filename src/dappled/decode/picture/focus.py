@@ -1,0 +1,139 @@
+"""Where a picture is out of focus: what parallax over the stop leaves of the mask's pattern, and what to show there.
+
+Out of focus a carrier's band holds another function of the scene than its local mean times a constant, so the frame
+over the shadow keeps a ghost: about Σ e^{2πi k·F x} a_k·∇L with L the band around the mean, which has no ghost and no
+detail beyond half of the carriers' distance. Detail of the scene itself goes with ∇L at the carriers no more than
+between them. Block by block the two are compared; where the ghost stands out, sharp picture and band are mixed as their
+errors tell (a Wiener weight).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from dappled.decode.array_types import Floats, Singles
+from dappled.decode.picture.blocks import PatternPlace, wave_sums
+from dappled.decode.picture.shadow import Shadow, period_of
+
+_BLOCK_PX, _BLOCK_PERIODS = 64, 8  # a block's side is at least both
+_EDGE = (0.45, 0.55)  # of the carriers' distance: where the band ends
+_SEEN, _SURE = 3.0, 8.0  # ghost and detail over detail: from where on it counts, and counts in full
+_GEOMETRIC = 1.2  # mean of Gamma(2) variables over the exponential of their mean logarithm, of four
+_NOISE = 1.25  # times what is measured: detail is rather left out than noise kept
+_GAIN = 0.2  # a square period: by how much a ghost gains on detail, found for f^-1.1 to f^-1.5, 1 to 5 px a view
+_MARGIN_PERIODS = 4  # reflected around the frame before it is transformed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sharp:
+    """The samples of one place of the colour pattern: over the shadow, before that, and the mean variance of their
+    noise."""
+
+    place: PatternPlace
+    picture: Singles
+    frame: Singles
+    noise: float
+
+
+def band_of(frame: Singles, step: tuple[int, int], shadow: Shadow) -> Singles:
+    """What a frame's samples (h, w) hold around the mean, up to half of the way to the carriers."""
+    margins = [
+        min(side - 1, round(_MARGIN_PERIODS * period_of(shadow.lattice) / one))
+        for side, one in zip(frame.shape, step, strict=True)
+    ]
+    size = [fft.next_fast_len(n + 2 * margin, real=True) for n, margin in zip(frame.shape, margins, strict=True)]
+    widths = [(margin, whole - n - margin) for n, margin, whole in zip(frame.shape, margins, size, strict=True)]
+    padded = np.pad(frame, [(a, min(b, n - 1)) for (a, b), n in zip(widths, frame.shape, strict=True)], mode="reflect")
+    waves = fft.rfft2(padded)
+    fy, fx = fft.fftfreq(padded.shape[0])[:, None] / step[0], fft.rfftfreq(padded.shape[1])[None, :] / step[1]
+    inverse = np.linalg.inv(shadow.lattice.matrix())
+    for column in (0, 1):
+        out = np.abs(fy * inverse[0, column] + fx * inverse[1, column])
+        waves *= np.clip((_EDGE[1] - out) / (_EDGE[1] - _EDGE[0]), 0, 1).astype(np.float32)
+    made = fft.irfft2(waves, s=padded.shape)
+    top, left = margins
+    return np.ascontiguousarray(made[top : top + frame.shape[0], left : left + frame.shape[1]], dtype=np.float32)
+
+
+def mixed(samples: Sequence[Sharp], shadow: Shadow) -> tuple[list[Singles], Floats]:
+    """The picture's samples with the band in place of ghosts, and the weights (blocks down, across) of the sharp
+    one."""
+    shape, step = shadow.shape, samples[0].place.step
+    side = max(_BLOCK_PX, round(_BLOCK_PERIODS * period_of(shadow.lattice)))
+    lengths = [-(-side // one) * one for one in step]
+    blocks = [max(1, whole // one) for whole, one in zip(shape, lengths, strict=True)]
+    edges = tuple(np.arange(number) * (one // each) for number, one, each in zip(blocks, lengths, step, strict=True))
+    carriers, between, nearest = _frequencies(shadow)
+    count = len(carriers)
+    ghost, detail = np.zeros((2, *blocks))
+    total, noise, pixels = np.zeros((3, *blocks))
+    bands = []
+    for one in samples:
+        band = band_of(one.frame, step, shadow)
+        bands.append(band)
+        rows, columns = one.place.at(shape)
+        rest = one.picture - band
+        slopes = [np.gradient(band, axis=axis).astype(np.float32) for axis in (0, 1)]
+        both = np.concatenate([carriers, between])
+        sums = [wave_sums(rest * slope, rows, columns, both, (edges[0], edges[1])) for slope in slopes]
+        yy, yx, xx = (_sums(a * b, edges) for a, b in ((slopes[0],) * 2, slopes, (slopes[1],) * 2))
+        own = np.maximum(yy * xx - yx * yx, 1e-12 * (yy + xx) ** 2 + 1e-30)[..., None]
+        power = (
+            xx[..., None] * np.abs(sums[0]) ** 2
+            + yy[..., None] * np.abs(sums[1]) ** 2
+            - 2 * yx[..., None] * (sums[0] * sums[1].conj()).real
+        ) / own
+        around = np.exp(np.log(power[..., count:][..., nearest] + 1e-30).mean(axis=-1))
+        ghost += power[..., :count].sum(axis=-1)
+        detail += _GEOMETRIC * around.sum(axis=-1)
+        total += _sums(rest * rest, edges)
+        noise += one.noise * _sums(np.ones_like(rest), edges)
+        pixels += _sums(np.ones_like(rest), edges)
+    gain = _GAIN * lengths[0] * lengths[1] / period_of(shadow.lattice) ** 2
+    weights = _weights(ghost / np.maximum(detail, 1e-30), gain, total / pixels, noise / pixels)
+    smooth = [
+        _between(np.arange(n, dtype=np.float64) + 0.5, one, number)
+        for n, one, number in zip(shape, lengths, blocks, strict=True)
+    ]
+    made = []
+    for one, band in zip(samples, bands, strict=True):
+        down, across = smooth[0][one.place.row :: step[0]], smooth[1][one.place.column :: step[1]]
+        weight = (down @ weights @ across.T).astype(np.float32)
+        made.append(band + weight * (one.picture - band))
+    return made, weights
+
+
+def _weights(ratio: Floats, gain: float, total: Floats, noise: Floats) -> Floats:
+    """Weights of the sharp picture: 1 where no ghost stands out; else detail over detail, noise and ghost, which are
+    `total`. A ghost adds up over a block, detail doesn't: `ratio` is 1 + `gain` · ghost / (detail and noise)."""
+    seen = np.clip((ratio - _SEEN) / (_SURE - _SEEN), 0, 1)
+    detail = np.maximum(total / (1 + np.maximum(ratio - 1, 0) / gain) - _NOISE * noise, 0)
+    return np.asarray(1 - seen * (1 - detail / np.maximum(total, 1e-30)))
+
+
+def _frequencies(shadow: Shadow) -> tuple[Floats, Floats, NDArray[np.intp]]:
+    """Carriers (K, 2), the points (M, 2) midway between four carriers each, and (K, 4) which of them lie around
+    which."""
+    orders = np.array(shadow.orders, dtype=np.float64)
+    around = orders[:, None, :] + np.array([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
+    flipped = np.where((around[..., :1] < 0) | ((around[..., :1] == 0) & (around[..., 1:] < 0)), -around, around)
+    points, index = np.unique(flipped.reshape(-1, 2), axis=0, return_inverse=True)
+    matrix = shadow.lattice.matrix()
+    return orders @ matrix, points @ matrix, index.reshape(len(orders), 4)
+
+
+def _sums(values: Singles, edges: Sequence[NDArray[np.intp]]) -> Floats:
+    """Sums over blocks that begin at `edges`."""
+    lines = np.add.reduceat(values, edges[0], axis=0, dtype=np.float64)
+    return np.asarray(np.add.reduceat(lines, edges[1], axis=1))
+
+
+def _between(places: Floats, length: int, count: int) -> Floats:
+    """(n, blocks): linear interpolation between the blocks' middles, constant beyond the outer ones."""
+    at = np.clip(places / length - 0.5, 0, count - 1)
+    return np.asarray(np.maximum(0, 1 - np.abs(at[:, None] - np.arange(count))))
