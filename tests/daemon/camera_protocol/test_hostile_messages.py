@@ -356,3 +356,35 @@ def camera_idle(camera: Camera, peer: Peer) -> None:
     peer.command(mavlink.MAV_CMD_GET_MESSAGE_INTERVAL, 262)
     peer.one("MESSAGE_INTERVAL")
     camera.idle()
+
+
+def test_a_signed_request_that_two_links_bring_is_one_shot_and_answered_on_both(tmp_path: Path) -> None:
+    """And what a thief sends again is none."""
+    mavlink_signing.make_key(tmp_path / "key")
+    key = mavlink_signing.read_key(tmp_path / "key")
+    signing = mavlink_signing.open_signing([tmp_path / "key"] * 2, tmp_path / "time", SystemClock())
+    with (
+        Camera(urls=["udpin:127.0.0.1:0"] * 2, signing=signing) as camera,
+        Peer(camera.links.port(0)) as near,
+        Peer(camera.links.port(1)) as far,
+        Peer(camera.links.port(1)) as thief,
+    ):
+        signer = near.packer.signing
+        signer.secret_key, signer.sign_outgoing = key, True
+        signer.timestamp = round((time.time() - mavlink_signing.EPOCH_UNIX_S) * mavlink_signing.UNITS_PER_S)
+        fire = near.packed(mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, 7, 0, 0, 0))
+        near.raw(fire)
+        assert near.ack(2000) == ACCEPTED
+        far.raw(fire)
+        assert far.ack(2000) == ACCEPTED
+        for _ in range(5):
+            thief.raw(fire)
+
+        def replayed() -> int:
+            counts = camera.links.statistics()[1].signing
+            assert counts is not None
+            return counts.replayed
+
+        eventually(lambda: replayed() == 5, "the thief's packets")
+        camera.idle()
+        assert [cause.sequence for cause in camera.causes] == [7]
