@@ -151,6 +151,15 @@ def test_a_picture_by_hand_that_stays_on_the_card_is_named() -> None:
     assert (left.finding.code, left.finding.subject.which) == (Code.PICTURE_ON_CARD, "100_FUJI/DSCF0002.RAF")
 
 
+def test_a_card_that_can_t_be_listed_at_the_end_is_told_where_shots_lack_files() -> None:
+    card = Card(there=False)
+    watched = Watched(card, in_flight=False)
+    assert list(watched.watch.left()) == []
+    watched.fire(0, 3.0)
+    watched.look()
+    assert [one.finding.code for one in watched.watch.left()] == [Code.CARD_NOT_LISTED]
+
+
 @pytest.mark.parametrize("in_flight", [True, False])
 def test_a_picture_of_another_hour_is_not_the_next_shot_s(in_flight: bool) -> None:
     """Shots 0 to 3 have their files; then one comes whose own time is an hour before shot 4, and shot 4's is lost."""

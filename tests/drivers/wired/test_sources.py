@@ -66,6 +66,22 @@ def test_mass_storage_is_found_where_it_is_mounted(tmp_path: Path) -> None:
         source.list()
 
 
+def test_of_two_cards_the_one_that_was_read_before_counts_and_else_none(tmp_path: Path) -> None:
+    body = FinePix(tmp_path)
+    other = tmp_path / "media" / "OTHER"
+    (other / "DCIM").mkdir(parents=True)
+    (other / "DCIM" / "IMG_0001.CR2").write_bytes(b"of another camera")
+    (body.card / "DCIM" / "100_FUJI" / "DSCF0001.RAF").write_bytes(b"one")
+    body.plug()
+    both = f"/dev/sdc1 {other} vfat rw 0 0\n{body.mounts.read_text()}"
+    source = StorageSource(body.mounts, body.places)
+    assert [one.base for one in source.list()] == ["DSCF0001.RAF"]
+    body.mounts.write_text(both)
+    assert [one.base for one in source.list()] == ["DSCF0001.RAF"]
+    with pytest.raises(CameraError, match=r"2 cards are mounted, .*OTHER and .*FINEPIX: unmount all but one"):
+        StorageSource(body.mounts, body.places).list()
+
+
 def test_a_mount_that_can_t_be_read_is_a_sentence_and_hides_no_other(tmp_path: Path) -> None:
     body = FinePix(tmp_path)
     (body.card / "DCIM" / "100_FUJI" / "DSCF0001.RAF").write_bytes(b"one")

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from dappled import findings
+from dappled import findings, picture_order
 from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute
 from dappled.drivers.camera import (
     Arrival,
@@ -269,7 +269,7 @@ class CameraState:
         fresh = [file for file in strange if made[file] or not only_recent]
         self._cut_off = ()
         self._suspects.clear()
-        self._queue(sorted(fresh, key=_place), now_ns)
+        self._queue(picture_order.by_name(fresh, lambda file: f"{file.folder}/{file.name}"), now_ns)
         self._card.list(found, self._to_fetch)
         self._missed, self._since_ns = False, now_ns
         return told
@@ -431,10 +431,6 @@ class CameraState:
         """One was changed on request, and all were read."""
         self.settings = found
         return [SettingsChanged(found, now_ns)]
-
-
-def _place(file: CameraFile) -> tuple[str, str]:
-    return file.folder, file.name
 
 
 def _is_jpeg(name: str) -> bool:

@@ -112,8 +112,10 @@ class FileWatch:
         return [ShotFailed(claim.shot, reason, now_ns) for claim in overdue]
 
     def left(self) -> Iterator[Noticed]:
-        """The pictures that stay on the card: those of this flight by name, and how many may be of it."""
+        """What stays on the card: pictures of this flight by name, how many may be of it, or that none can be seen."""
         now_ns = self._clock.monotonic_ns()
+        if self._source.removable and self._away and self._claims:
+            yield Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), now_ns)
         known, others = self._is_known_card(self._before), []
         for group in groups(self._left):
             name, taken_s = group.main.name, self._dates.get(group.main)

@@ -1,7 +1,7 @@
 """Sources of the files that a camera keeps: a folder or card, or a removable disk when it appears.
 
 A source lists and opens files; it never writes. Settings and commands name it as a folder's path or `folder:DIR`, as
-`storage` (the first removable disk with a DCIM folder), or as a libgphoto2 port (`usb:`, `ptpip:…`; see `ptp_source`).
+`storage` (the removable disk with a DCIM folder), or as a libgphoto2 port (`usb:`, `ptpip:…`; see `ptp_source`).
 """
 
 from __future__ import annotations
@@ -183,18 +183,22 @@ class StorageSource(FolderSource):
         self._mounts, self._places = mounts or MOUNTS, places or PLACES
 
     def list(self) -> list[FoundFile]:
-        """See FileSource."""
-        unreadable = ""
+        """See FileSource. Of several cards the one that was read before counts, or none."""
+        unreadable, cards = "", []
         for where in self._mounted():
             try:
-                there = (where / "DCIM").is_dir()
+                if (where / "DCIM").is_dir():
+                    cards.append(where / "DCIM")
             except OSError as error:
                 unreadable = f"; {where} can't be read: {error.strerror}"
-                continue
-            if there:
-                self.folder = where / "DCIM"
-                return super().list()
-        raise CameraError(f"no card and no camera as mass storage is mounted: connect it{unreadable}")
+        if not cards:
+            raise CameraError(f"no card and no camera as mass storage is mounted: connect it{unreadable}")
+        if len(cards) > 1 and self.folder not in cards:
+            names = " and ".join(str(one.parent) for one in cards)
+            raise CameraError(f"{len(cards)} cards are mounted, {names}: unmount all but one, or name its folder")
+        if self.folder not in cards:
+            self.folder = cards[0]
+        return super().list()
 
     def _mounted(self) -> Iterator[Path]:
         try:
