@@ -96,7 +96,7 @@ faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=
 bench: setup ## run the benchmarks, print one table with the limits, write docs/performance.md; REPEATS=n
 	@$(BIN)/python benchmarks/table.py --page --repeats $(or $(REPEATS),1)
 
-lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, the documents, and what flies
+lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, the documents, what flies, what builds it, and uv
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \
 	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group peers \
@@ -104,7 +104,11 @@ lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group docs \
 	  -o requirements-docs.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
-	  --no-annotate pyproject.toml -o requirements-onboard.lock
+	  --no-annotate pyproject.toml -o requirements-onboard.lock; \
+	echo hatchling | $$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements.lock \
+	  --no-annotate - -o requirements-build.lock; \
+	echo uv | $$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
+	  --upgrade - -o requirements-uv.lock
 
 deb: setup ## build Debian packages for amd64 and arm64 in build/deb (SUITE=trixie for Debian 13)
 	@$(BIN)/python tools/deb.py --suite $(or $(SUITE),bookworm) $(foreach a,$(ARCH),--arch $(a))

@@ -29,7 +29,8 @@ VENV = ROOT / ".venv"
 APART = ("peers", "docs")
 STAMP = "dappled-set-up"
 # uv's own releases, for machines whose Python has neither pip nor ensurepip. DAPPLED_UV_RELEASES names a mirror.
-RELEASES = "https://github.com/astral-sh/uv/releases/latest/download"
+UV_LOCK = ROOT / "requirements-uv.lock"  # one version, with the hashes of its wheels
+RELEASES = "https://github.com/astral-sh/uv/releases/download"
 
 
 def find_uv() -> str | None:
@@ -47,11 +48,12 @@ def fetch_uv() -> str:
     with tempfile.TemporaryDirectory() as folder:
         wheel = None if importlib.util.find_spec("pip") else debian_pip(Path(folder))
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check", "install", "--target", str(TOOLS)]
-        pip += ["--root-user-action=ignore", "--upgrade", "uv"]
+        pip += ["--root-user-action=ignore", "--upgrade", "--require-hashes", "-r", str(UV_LOCK)]
         environment = {**os.environ, "PYTHONPATH": str(wheel)} if wheel else None
         if subprocess.run(pip, env=environment, check=False).returncode == 0 and (found := find_uv()):
             return found
-    fetch_release(os.environ.get("DAPPLED_UV_RELEASES", RELEASES))
+    version = UV_LOCK.read_text(encoding="utf-8").partition("==")[2].split()[0]
+    fetch_release(os.environ.get("DAPPLED_UV_RELEASES", f"{RELEASES}/{version}"))
     found = find_uv()
     if not found:
         raise SystemExit("uv could not be fetched: install it (https://docs.astral.sh/uv) and run make again")

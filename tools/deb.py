@@ -16,7 +16,7 @@ import sys
 from pathlib import Path
 
 from bootstrap import ROOT, fetch_uv, find_uv
-from install import COMMAND, FLOWN, service_files
+from install import BUILD_LOCK, COMMAND, FLOWN, service_files
 
 HOME = Path("/usr/lib/dappled")
 PYTHONS = {"bookworm": "3.11", "trixie": "3.13"}
@@ -123,7 +123,7 @@ def packages(home: Path, arch: str, python: str) -> None:
     into = [*there, "--target", str(home), "--link-mode", "copy"]
     call(uv, "pip", "install", "-q", *into, "--require-hashes", "-r", str(ROOT / "requirements-onboard.lock"))
     wheels = home.parent / "wheels"
-    call(uv, "build", "-q", "--wheel", "--out-dir", str(wheels), str(ROOT))
+    call(uv, "build", "-q", "--wheel", *BUILD_LOCK, "--out-dir", str(wheels), str(ROOT))
     call(uv, "pip", "install", "-q", *into, str(next(wheels.glob("*.whl"))))
     shutil.rmtree(wheels)
     shutil.rmtree(home / "bin", ignore_errors=True)

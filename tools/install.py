@@ -21,6 +21,7 @@ from bootstrap import ROOT, fetch_uv, find_uv
 
 SYSTEMD = ROOT / "systemd"
 MANIFEST = "lib/dappled/installed.json"
+BUILD_LOCK = ("--build-constraints", str(ROOT / "requirements-build.lock"), "--require-hashes")
 COMMAND = '#!/bin/sh\nPYTHONPATH={home} exec {python} -P -m dappled "$@"\n'
 """`-P`, and no PYTHONPATH but its own: a folder that somebody else filled must not lend it modules."""
 FLOWN = "import dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process"
@@ -140,7 +141,7 @@ def environment(uv: str, python: str, home: Path) -> None:
     lock = ["--require-hashes", "--no-deps", "-r", str(ROOT / "requirements-onboard.lock")]
     call(uv, "pip", "install", "-q", *into, *lock)
     with tempfile.TemporaryDirectory() as folder:
-        call(uv, "build", "-q", "--wheel", "--out-dir", folder, str(ROOT))
+        call(uv, "build", "-q", "--wheel", *BUILD_LOCK, "--out-dir", folder, str(ROOT))
         wheel = next(Path(folder).glob("*.whl"))
         call(uv, "pip", "install", "-q", "--no-deps", *into, str(wheel))
     for tests in [path for path in home.glob("lib/python3*/site-packages/*/**/tests") if path.is_dir()]:

@@ -184,3 +184,13 @@ def test_vignetting_is_a_doubt_unless_a_white_frame_takes_it_off(
     bright = dng_of(tmp_path / "bright.dng", SHOT, np.full(QUARTER.shape, 1.3) * lens)
     assert main([*words, "--white", str(bright)]) == 1
     assert "in doubt: white frame: " in capsys.readouterr().out
+
+
+def test_names_of_files_are_shown_without_what_a_terminal_obeys(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    frames = [str(tmp_path / f"{name}\x1b[2J.dng") for name in "ab"]
+    assert main(["decode", *frames, "--mask", "reference-5x5", "-o", str(tmp_path / "out")]) == 1
+    shown = capsys.readouterr()
+    assert "\x1b" not in shown.out + shown.err
+    assert "\\x1b[2J.dng" in shown.err

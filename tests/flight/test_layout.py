@@ -156,3 +156,13 @@ def test_a_file_system_without_inodes_reports_none(tmp_path: Path, monkeypatch: 
     btrfs = SimpleNamespace(f_frsize=4096, f_blocks=9, f_bfree=5, f_bavail=4, f_files=0, f_favail=0)
     monkeypatch.setattr(os, "statvfs", lambda _: btrfs)
     assert layout.disk_space(tmp_path) == layout.DiskSpace(9 * 4096, 4 * 4096, 4 * 4096, None)
+
+
+@pytest.mark.parametrize(("umask", "mode"), [(0o000, 0o750), (0o022, 0o750), (0o077, 0o700)])
+def test_a_flight_is_not_for_every_user_of_the_machine(tmp_path: Path, umask: int, mode: int) -> None:
+    before = os.umask(umask)
+    try:
+        folder = layout.create(tmp_path, START_UTC_NS, {})
+    finally:
+        os.umask(before)
+    assert folder.path.stat().st_mode & 0o777 == mode

@@ -471,7 +471,7 @@ def test_what_was_changed_between_two_works_stays_known(
     assert report.notes == (f"changed, added or removed by something else after seal 2: {names}",)
 
 
-@pytest.mark.parametrize("name", ["shots.jsonl", "seals.jsonl", "offloaded.jsonl"])
+@pytest.mark.parametrize("name", ["shots.jsonl", "seals.jsonl", "offloaded.jsonl", "telemetry.tlog"])
 def test_a_file_of_holes_is_judged_before_it_is_read(sealed: FlightFolder, name: str) -> None:
     with (sealed.path / name).open("ab") as file:
         file.truncate(1 << 40)

@@ -7,12 +7,13 @@ import http.server
 import importlib.util
 import io
 import platform
+import re
 import tarfile
 import threading
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 
@@ -79,3 +80,29 @@ def test_what_the_environment_is_made_from_is_the_lock(bootstrap: ModuleType) ->
     assert len(whole) == 64
     assert whole == bootstrap.ingredients("requirements.lock", "pyproject.toml")
     assert whole != bootstrap.ingredients("requirements-peers.lock")
+
+
+def test_uv_is_one_version_by_its_hashes(bootstrap: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[list[str]] = []
+
+    def pip(command: list[str], **_: object) -> SimpleNamespace:
+        asked.append(command)
+        return SimpleNamespace(returncode=1)
+
+    monkeypatch.setattr(bootstrap.subprocess, "run", pip)
+    monkeypatch.setattr(bootstrap, "debian_pip", lambda _: None)
+    monkeypatch.setenv("DAPPLED_UV_RELEASES", "http://127.0.0.1:9")
+    with pytest.raises(SystemExit):
+        bootstrap.fetch_uv()
+    assert asked[0][-3:] == ["--require-hashes", "-r", str(bootstrap.UV_LOCK)]
+    assert re.match(r"uv==[\d.]+ \\\n    --hash=sha256:", bootstrap.UV_LOCK.read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("file", ["tools/deb.py", "tools/install.py", "Containerfile"])
+def test_what_builds_a_package_is_pinned(bootstrap: ModuleType, file: str) -> None:
+    lock = (bootstrap.ROOT / "requirements-build.lock").read_text(encoding="utf-8")
+    assert re.search(r"^hatchling==\S+ \\\n    --hash=sha256:", lock, re.MULTILINE)
+    text = (bootstrap.ROOT / file).read_text(encoding="utf-8")
+    builds = re.findall(r'"build", "-q".*|pip wheel .*', text)
+    assert builds
+    assert all("BUILD_LOCK" in one or "--no-build-isolation" in one for one in builds)

@@ -50,17 +50,18 @@ def read_log(path: Path) -> bytes:
     """Read a file that is only appended to, of any length that its disk bears out: one with holes can claim any. Raises
     OSError, and ClaimError, also for a pipe, which would be waited for."""
     with open(path, "rb", opener=durable.without_waiting) as file:
-        _check_stored(file.fileno())
+        check_stored(file.fileno())
         return file.read()
 
 
 def stored_size(path: Path) -> int:
     """Return the bytes of a plain file that its disk bears out. Raises OSError and ClaimError like `read_log`."""
     with open(path, "rb", opener=durable.without_waiting) as file:
-        return _check_stored(file.fileno())
+        return check_stored(file.fileno())
 
 
-def _check_stored(fd: int) -> int:
+def check_stored(fd: int) -> int:
+    """Return an open file's size, where it is a plain one whose disk bears that out. Raises ClaimError, OSError."""
     found = os.fstat(fd)
     if not stat.S_ISREG(found.st_mode):
         raise ClaimError("it is no plain file: somebody put it there; use another copy")

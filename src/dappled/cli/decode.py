@@ -13,7 +13,7 @@ from tqdm import tqdm
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
-from dappled.errors import DappledError, counted
+from dappled.errors import DappledError, counted, printable
 from dappled.products.exports import light_files
 
 
@@ -54,12 +54,12 @@ def run(arguments: argparse.Namespace) -> int:
                 _refuse_contradicted(frame, made)
             light_files.save(target, made.light_field, overwrite=arguments.overwrite)
             doubted += bool(made.doubts)
-            print(json.dumps(_facts(target, made)) if arguments.json else f"{target}: {summary(made)}")
+            print(json.dumps(_facts(target, made)) if arguments.json else printable(f"{target}: {summary(made)}"))
         except DappledError as error:
             if single:
                 raise
             bad += 1
-            print(f"dappled decode: {error}", file=sys.stderr)
+            print(printable(f"dappled decode: {error}"), file=sys.stderr)
             if arguments.json:
                 print(json.dumps({"frame": str(frame), "error": str(error)}))
     if bad:

@@ -139,7 +139,7 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
     made = FlightFolder(durable.temporary(folder.path))
     try:
         durable.make_folder(root)
-        made.path.mkdir()
+        made.path.mkdir(0o750)  # positions and pictures are not for every user of the machine
         durable.make_folder(made.frames)
         write_facts(made, facts or {})
         made.path.rename(folder.path)

@@ -13,7 +13,7 @@ from typing import Any
 
 from dappled import durable
 from dappled.bounds.claims import ClaimError
-from dappled.bounds.parsing import parse_json, read_log
+from dappled.bounds.parsing import check_stored, parse_json, read_log
 from dappled.errors import counted
 from dappled.findings import Code, Finding, Subject, finding, text
 from dappled.flight.errors import FlightError, disk_error
@@ -93,10 +93,12 @@ def read_records(path: Path, report: Callable[[Finding], object]) -> Iterator[tu
     """See `read_telemetry`; `report` gets a finding for each gap."""
     try:
         with open(path, "rb", opener=durable.without_waiting) as file:
-            size = os.fstat(file.fileno()).st_size
+            size = check_stored(file.fileno())
             data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
     except OSError as error:
         raise disk_error("read the telemetry", path, error) from error
+    except ClaimError as error:
+        raise FlightError(f"the telemetry {path} can't be read: {error}") from error
     if data is not None:
         with data:
             for number, (stamp_us, raw) in enumerate(split(data, report, path)):

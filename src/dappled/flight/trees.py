@@ -81,7 +81,7 @@ class Tree:
         with self._saying("open the folder", name):
             if make:
                 with contextlib.suppress(FileExistsError):
-                    os.mkdir(last, dir_fd=parent)
+                    os.mkdir(last, 0o750, dir_fd=parent)
                 os.fsync(parent)  # also where an earlier attempt made it and was cut short
             self._folders[name] = os.open(last, _FOLDER, dir_fd=parent)
 

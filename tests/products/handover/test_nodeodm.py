@@ -37,6 +37,7 @@ class FakeNodeOdm(ThreadingHTTPServer):
         self.silent: dict[str, int] = {}
         self.asked: list[str] = []
         self.results = ALL
+        self.version, self.moved = "2.2.3", ""
         self.url = f"http://127.0.0.1:{self.server_port}"
 
 
@@ -66,9 +67,13 @@ class Answers(BaseHTTPRequestHandler):
         self.server.asked.append(self.path)
         if self.lost():
             return
-        if self.path.startswith("/info"):
-            self.say({"version": "2.2.3"})
-        elif self.path.endswith("/info"):
+        if self.server.moved:
+            self.send_response(302)
+            self.send_header("location", self.server.moved + self.path)
+            self.end_headers()
+        elif self.path.startswith("/info"):
+            self.say({"version": self.server.version})
+        elif self.path.partition("?")[0].endswith("/info"):
             state = self.server.states.pop(0)
             self.say({"uuid": "one", "progress": 50, "status": {"code": state, "errorMessage": "out of memory"}})
         else:
@@ -261,3 +266,33 @@ def test_what_can_t_be_handed_over_is_one_sentence(
     said = capsys.readouterr().err
     assert says in said
     assert said.count("\n") == 1
+
+
+def test_the_token_comes_from_a_private_file_or_the_environment(
+    node: FakeNodeOdm, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "token"
+    file.write_text("from-a-file\n")
+    file.chmod(0o644)
+    words = ("odm", node.url, "--task", "one")
+    assert main(["hand-over", *words, "--token-file", str(file)]) == 1
+    assert "can be read by others" in capsys.readouterr().err or "chmod" in capsys.readouterr().err
+    file.chmod(0o600)
+    assert run(*words, "--token-file", str(file)) == 0
+    monkeypatch.setenv("DAPPLED_NODEODM_TOKEN", "from-the-environment")
+    assert run(*words) == 0
+    assert [asked.partition("token=")[2] for asked in node.asked] == 2 * ["from-a-file"] + 2 * ["from-the-environment"]
+
+
+def test_a_redirection_tells_no_token_and_a_version_moves_no_cursor(
+    node: FakeNodeOdm, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("DAPPLED_NODEODM_TOKEN", "a-secret")
+    node.version = "2\x1b[2J"
+    assert main(["hand-over", "odm", node.url, "--task", "one"]) == 0
+    assert "\x1b" not in capsys.readouterr().out
+    node.moved = "https://a:secret@elsewhere.example"
+    assert main(["hand-over", "odm", node.url, "--task", "one"]) == 1
+    said = capsys.readouterr().err
+    assert "https://elsewhere.example/info" in said
+    assert "secret" not in said

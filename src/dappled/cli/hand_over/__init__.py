@@ -14,11 +14,14 @@ from typing import ClassVar
 from dappled import durable
 from dappled.cli.arguments import add_overwrite, refuse_existing
 from dappled.cli.georeference import Bar
+from dappled.daemon.stream.curve import read_private
 from dappled.errors import DappledError, counted
 from dappled.flight import disk_error
 from dappled.products.handover import nodeodm
 from dappled.products.handover.nodeodm import NodeOdm, NodeOdmError
 from dappled.products.maps.georeference import Progress
+
+TOKEN_VARIABLE = "DAPPLED_NODEODM_TOKEN"  # noqa: S105  # a name
 
 
 class HandOverCallError(DappledError):
@@ -46,7 +49,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--name", metavar="WORDS", help="the task's name (default: the folder's)")
     parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE",
                         help="an option of OpenDroneMap, such as dsm=true; may be repeated")  # fmt: skip
-    parser.add_argument("--token", default="", help="the server's token, where it wants one")
+    parser.add_argument("--token-file", type=Path, metavar="FILE",
+                        help=f"file with the server's token, where it wants one, for no other user to read (or set "
+                             f"{TOKEN_VARIABLE}); the command line is for every user to read")  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print the task as JSON")
 
 
@@ -66,7 +71,7 @@ def run(
     if arguments.output is not None:
         refuse_existing(arguments, arguments.output)
         _check_writable(arguments.output)
-    server = NodeOdm(arguments.url, arguments.token, wait=wait, now_s=now_s)
+    server = NodeOdm(arguments.url, _token(arguments.token_file), wait=wait, now_s=now_s)
     files = [] if arguments.pictures is None else nodeodm.pictures(arguments.pictures)
     version = server.version()
     with Bar() as progress:
@@ -115,6 +120,13 @@ def _check_writable(path: Path) -> None:
         part.unlink()
     except OSError as error:
         raise disk_error("write", path, error) from None
+
+
+def _token(file: Path | None) -> str:
+    """The server's token, "" for none. Raises KeyFileError for a file that others can read."""
+    if file is None:
+        return os.environ.get(TOKEN_VARIABLE, "")
+    return read_private(file.expanduser(), "the server's token").strip()
 
 
 def _option(word: str) -> tuple[str, str]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from dappled import durable
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import check_stored
 from dappled.flight.chain import ChainLink
-from dappled.flight.errors import disk_error
+from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.tables import TELEMETRY
 
 
@@ -21,7 +22,7 @@ def compare(path: Path, links: Mapping[int, ChainLink] | None) -> Iterator[str]:
         return
     try:
         with open(path, "rb", opener=durable.without_waiting) as file:
-            size = os.fstat(file.fileno()).st_size
+            size = check_stored(file.fileno())
             for link in blocks:
                 start, end = _range(link.key)
                 file.seek(min(start, size))
@@ -31,6 +32,8 @@ def compare(path: Path, links: Mapping[int, ChainLink] | None) -> Iterator[str]:
         yield f"{path.name} is missing, and the chain covers {len(blocks)} blocks of it"
     except OSError as error:
         raise disk_error("read the telemetry", path, error) from error
+    except ClaimError as error:
+        raise FlightError(f"the telemetry {path} can't be read: {error}") from error
 
 
 def _range(key: str) -> tuple[int, int]:

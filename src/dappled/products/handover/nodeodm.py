@@ -118,13 +118,13 @@ class NodeOdm:
 
     def version(self) -> str:
         """The server's version. Raises NodeOdmError."""
-        return str(self._asked("/info").get("version", "unknown"))
+        return printable(str(self._asked("/info").get("version", "unknown")))
 
     def begin(self, name: str, options: Mapping[str, str]) -> str:
         """Begin a task, which waits for its pictures; returns its identity. Raises NodeOdmError."""
         wanted = json.dumps([{"name": key, "value": value} for key, value in options.items()])
         begun = self._asked("/task/new/init", _form({"name": name, "options": wanted}))
-        task = str(begun.get("uuid", ""))
+        task = printable(str(begun.get("uuid", "")))
         if not task:
             raise NodeOdmError(f"{self._url} began no task: is it a NodeODM server?")
         return task
@@ -158,7 +158,7 @@ class NodeOdm:
         code, done = status.get("code"), said.get("progress", 0)
         if not isinstance(code, int) or not isinstance(done, int | float):
             raise NodeOdmError(f"{self._url} does not say how task {task} is: is it a NodeODM server?")
-        return OdmTask(code, float(done), str(status.get("errorMessage") or "it gave no reason"))
+        return OdmTask(code, float(done), printable(str(status.get("errorMessage") or "it gave no reason")))
 
     def results(self, task: str, path: Path, progress: Progress) -> None:
         """Wait for a task's end and put all of its results under `path`, whole or not at all. A server that does not
@@ -257,9 +257,9 @@ class NodeOdm:
         try:
             return _OPENER.open(request, timeout=timeout_s)
         except urllib.error.HTTPError as error:
-            hint = "; give its --token" if error.code in (401, 403) else ""
+            hint = "; give its token: see --token-file" if error.code in (401, 403) else ""
             elsewhere = error.headers.get("location", "") if error.code in _MOVED else ""
-            hint = f": name the address that it redirects to, {printable(elsewhere)}" if elsewhere else hint
+            hint = f": name the address that it redirects to, {_public(elsewhere)}" if elsewhere else hint
             kind = NoAnswerError if error.code >= _BUSY else NodeOdmError
             raise kind(f"{self._url} answers {where} with {error.code} {error.reason}{hint}") from None
         except (urllib.error.URLError, HTTPException, OSError) as error:
@@ -267,6 +267,12 @@ class NodeOdm:
             raise NoAnswerError(
                 f"no NodeODM server answers at {self._url} ({reason}): start it, or check the address"
             ) from None
+
+
+def _public(address: str) -> str:
+    """An address without what may be secret in it: names, passwords and questions, which hold the token."""
+    parts = urllib.parse.urlsplit(address)
+    return printable(urllib.parse.urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", "")))
 
 
 class _NoDetours(urllib.request.HTTPRedirectHandler):
