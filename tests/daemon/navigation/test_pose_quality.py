@@ -85,6 +85,24 @@ def test_the_receivers_word_is_carried_along() -> None:
     assert math.sqrt(ee) == pytest.approx(0.82 / math.sqrt(2), abs=0.01)
 
 
+@pytest.mark.parametrize("speed", [(32_000, 0, 0), (0, 0, -32_768)])
+def test_a_position_with_a_speed_that_can_t_be_true_is_none(speed: tuple[int, int, int]) -> None:
+    """The same judge as for an autopilot's own log."""
+    link = Link()
+    for step in range(STEPS):
+        link.vehicle(step / 10)
+    before = link.pose(2.04)
+    other = Link()
+    for step in range(STEPS):
+        other.vehicle(step / 10)
+        if step == 20:
+            wrong = mavlink.MAVLink_global_position_int_message(round(2.02e3), 10**7, 10**7, 0, 0, *speed, 0)
+            other.send(2.02, wrong)
+    after = other.pose(2.04)
+    assert (after.latitude_rad, after.longitude_rad) == (before.latitude_rad, before.longitude_rad)
+    assert other.telemetry.statistics().impossible == 1
+
+
 @pytest.mark.parametrize(("first", "second", "counts"), [(1, 6, 6), (2, 6, 6), (3, 6, 3), (1, 2, 1)])
 def test_the_second_receiver_counts_while_the_first_has_no_fix(first: int, second: int, counts: int) -> None:
     link = Link()

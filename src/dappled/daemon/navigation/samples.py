@@ -14,6 +14,7 @@ from typing import Protocol, TypeVar
 
 from dappled.decode.geometry import Gnss, Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.drivers.mavlink.limits import FASTEST_M_S, HIGHEST_M
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: the middle is used
 GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot reports for a gimbal without MAVLink
@@ -23,7 +24,7 @@ _LOCK = mavlink.GIMBAL_DEVICE_FLAGS_YAW_LOCK
 EPOCH_US = 10**15  # 2001: a time above is UTC, one below counts since boot
 WRAP_US = 2**32  # ArduPilot counts the microseconds of its feedback pin in 32 bits
 NEAREST_NS = 10 * 10**9
-_HIGHEST_MM = 10**8
+_HIGHEST_MM = HIGHEST_M * 1000
 _ONE_JUMP_NS = 10**9
 _ARRIVED_NS, _ARRIVED_FEW, _ARRIVED_MOST = 5 * 10**9, 10, 1024
 _SOONER_NS, _SOONER_SHARE = 60_000_000, 5.0
@@ -254,12 +255,14 @@ def boot_ns(message: MavlinkMessage) -> int:
     return int(message.time_boot_ms) * 10**6 + HALF_MS_NS
 
 
-def is_impossible(message: MavlinkMessage) -> bool:
+def is_impossible(message: MavlinkMessage, rules: int = 7) -> bool:
     """Whether a position or an attitude can't be true: off the globe (as MAVLink's 2147483647 for unknown), higher or
-    lower than 100 km, or not finite."""
+    lower than 100 km, faster than 300 m/s, or not finite. By the flight's `TAGGING_RULES`."""
     kind = message.get_type()
     if kind == "GLOBAL_POSITION_INT":
         heights = abs(message.alt), abs(message.relative_alt)
+        if rules > 6 and max(abs(message.vx), abs(message.vy), abs(message.vz)) > 100 * FASTEST_M_S:
+            return True
         return bool(abs(message.lat) > 90 * 10**7 or abs(message.lon) > 180 * 10**7 or max(heights) > _HIGHEST_MM)
     if kind == "ATTITUDE":
         values: Iterable[float] = (message.roll, message.pitch, message.yaw)

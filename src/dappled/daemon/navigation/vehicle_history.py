@@ -438,7 +438,7 @@ class VehicleHistory:
 
     def _refuses(self, stamp_ns: int, message: MavlinkMessage) -> bool:
         """Whether it can't be true. Our own vehicle's are counted."""
-        if self._rules < 4 or not telemetry_samples.is_impossible(message):
+        if self._rules < 4 or not telemetry_samples.is_impossible(message, self._rules):
             return False
         if message.get_srcComponent() == 1 and message.get_srcSystem() == self.system_id:
             self.counts.refuse(stamp_ns)

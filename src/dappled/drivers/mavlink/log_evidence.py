@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 from dappled.clock import TimeOfDayClock
 from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import log_packets
+from dappled.drivers.mavlink.limits import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
 from dappled.drivers.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
 from dappled.findings import Code, Finding, Subject, finding
 
 BOOT_MAX_US = 2**32 * 1000  # MAVLink's milliseconds since boot
-HIGHEST_M = 100_000.0
-FASTEST_M_S = 300.0
 _HIGHEST_DOP = 600.0
 _EXTRAPOLATED = 8  # of PX4; MAVLink's 8 is another
 _GAP_US = 1_000_000  # a velocity further away is not that of a position

@@ -19,10 +19,9 @@ import numpy as np
 from dappled.decode.array_types import Floats
 from dappled.drivers import reader_process
 from dappled.drivers.mavlink import log_evidence, log_packets
+from dappled.drivers.mavlink.limits import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.mavlink.log_evidence import (
     BOOT_MAX_US,
-    FASTEST_M_S,
-    HIGHEST_M,
     Chosen,
     LoggedPlaces,
     Missing,
