@@ -12,11 +12,10 @@ from typing import Any
 from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import Frame, LedgerEvent, Result, ShotRow, Stray, Tag
+from dappled.flight.records import DOUBT, LATER_DOUBT, Frame, LedgerEvent, Result, ShotRow, Stray, Tag
 from dappled.refusals import OTHERS, LostTriggers, Refusals
 
 LOST = "lost trigger"
-_DOUBT = "doubt"
 _CARD = ("card.", "picture.")  # what a driver said of the camera's card: codes of `findings`
 
 
@@ -134,7 +133,9 @@ def balance(path: Path) -> Balance:
             judged=_by_verdict(judged, len(frames)),
             bad=_reasons("bad", judged, frames),
             unknown=_reasons("unknown", judged, frames),
-            doubts=tuple(f"frame {event.index}: {event.text}" for event in events if event.kind == _DOUBT),
+            doubts=tuple(
+                f"frame {event.index}: {event.text}" for event in events if event.kind in (DOUBT, LATER_DOUBT)
+            ),
             card=tuple(event.text for event in events if event.kind.startswith(_CARD)),
         )
 

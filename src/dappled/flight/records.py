@@ -13,6 +13,9 @@ from typing import Any, Literal
 from dappled.decode.geometry import Pose
 
 ShotState = Literal["wished", "fired", "safe", "failed"]
+DOUBT, LATER_DOUBT = "doubt", "later doubt"
+"""Kinds of events: a frame may be another shot's. The first kind came with its file and is in its tag; the second was
+found after that."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,12 +15,12 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
-from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, Noticed, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
-from dappled.findings import told
+from dappled.findings import Code, Subject, finding, told
 from dappled.flight import Cause, FlightError, Shot
-from tests.daemon.fakes import FakeCamera, FakeDecoder, failed, fired, good, rig
+from tests.daemon.fakes import FakeCamera, FakeDecoder, eventually, failed, fired, good, rig
 from tests.simulated.finepix import picture
 
 
@@ -94,11 +94,13 @@ def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> N
     def untold(shot: int) -> list[CameraEvent | Exception]:
         (_, arrival) = good(shot)
         assert isinstance(arrival, Arrival)
-        return [dataclasses.replace(arrival, facts={"doubt": "it came late"})]
+        rival = finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2")
+        return [dataclasses.replace(arrival, facts={"doubt": "it came late"}), Noticed(rival, 5)]
 
     with rig(tmp_path, untold) as one:
         one.request(0)
         one.ended(0)
+        eventually(lambda: any(text.startswith("later doubt: ") for text in one.events()), "the later doubt")
         told = one.flight.ledger.tag(0)
         assert told is not None
         assert told.time_source == "wish + body latency; in doubt: it came late"

@@ -167,7 +167,7 @@ def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> 
     assert point["properties"]["gnss"]["fix_type"] == 6
 
 
-def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "") -> Path:
+def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "", kind: str = "doubt") -> Path:
     """A frame 5 s after the start of two vehicles' telemetry, tagged where the first one was."""
     begun = recording.begin(root / "flights", RecordedClock(START_NS))
     for stamp_us, raw in records(START_NS // 1000, extra=extra):
@@ -176,14 +176,14 @@ def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "") -> Pa
     made = replace(tag(deliver(begun, 0, b"raw")), utc_ns=START_NS + 5 * 10**9)
     begun.ledger.add_tag(replace(made, pose=replace(pose(), latitude_rad=math.radians(10.0))))
     if doubt:
-        begun.ledger.add_event("doubt", doubt, 0)
+        begun.ledger.add_event(kind, doubt, 0)
     begun.close()
     return begun.folder.path
 
 
 def test_a_doubt_that_came_after_the_tag_is_in_the_sidecar_and_decides_the_exit_code(tmp_path: Path) -> None:
     doubt = findings.text(finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2"))
-    flight = flown_by_two(tmp_path, doubt=doubt)
+    flight = flown_by_two(tmp_path, doubt=doubt, kind="later doubt")
     assert main(["geotag", str(flight), "--vehicle", "1"]) == 1
     (sidecar,) = (flight / "frames").glob("*.xmp")
     assert f"in doubt: {doubt}" in sidecar.read_text()

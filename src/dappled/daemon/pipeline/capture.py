@@ -32,6 +32,7 @@ from dappled.drivers.camera import (
 from dappled.errors import report, sentence
 from dappled.findings import Finding
 from dappled.flight import Frame, Shot, Tag
+from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -354,7 +355,7 @@ class Capture:
         log.warning("%s", findings.told(found))
         about = found.subject
         if about.kind == "frame" and isinstance(about.which, int):
-            self._writer.event("doubt", findings.text(found), about.which)
+            self._writer.event(LATER_DOUBT, findings.text(found), about.which)
         else:
             self._writer.event(found.code.value, findings.told(found))
 
@@ -404,7 +405,7 @@ class Capture:
         pending = self._ends.safe(pending, frame, arrival.name)
         if doubt := arrival.facts.get("doubt"):
             pending.doubt = str(doubt)
-            self._ends.note("doubt", pending.doubt, frame.index)
+            self._ends.note(DOUBT, pending.doubt, frame.index)
         if pending.fired:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
         pending.ms["record"] = (time.monotonic_ns() - began) / 1e6

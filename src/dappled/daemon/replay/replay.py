@@ -40,6 +40,7 @@ from dappled.flight import (
     layout,
     log_reading,
 )
+from dappled.flight.records import DOUBT
 
 _DATED = 8  # frames whose own time is asked
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
@@ -103,7 +104,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 frozenset(texts[index]),
             )
         )
-        files.append(_file(flight, row, frame, texts[index].get("doubt")))
+        files.append(_file(flight, row, frame, texts[index].get(DOUBT)))
     if not frames:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None

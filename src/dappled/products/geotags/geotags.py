@@ -16,6 +16,7 @@ from dappled import durable
 from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, layout
+from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.geotags.marks import Marked
@@ -62,7 +63,7 @@ def read(
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags = ledger.tags() if tags is None else tags
         frames, correction_ns = ledger.frames(), ledger.utc_correction_ns()
-        doubted = {event.index: event.text for event in ledger.events() if event.kind == "doubt"}
+        doubted = {event.index: event.text for event in ledger.events() if event.kind == LATER_DOUBT}
     placed = []
     for frame in frames:
         tag = tags.get(frame.index)
@@ -72,8 +73,7 @@ def read(
         if marked is not None and frame.index in marked.marks:
             tag = marked.tag(tag, geoid)
             utc_ns = tag.utc_ns
-        doubt = doubted.get(frame.index, "")
-        if doubt not in tag.time_source:
+        if doubt := doubted.get(frame.index):
             tag = replace(tag, time_source=f"{tag.time_source}; in doubt: {doubt}")
         placed.append(Placed(frame, tag, _camera(tag.pose, mounting, geoid), utc_ns))
     return placed, [frame.name for frame in frames if frame.index not in tags]
@@ -83,7 +83,7 @@ def doubts(flight: Path) -> list[tuple[str, str]]:
     """(name, sentence) of each frame that may be another shot's, as the ledger has it. Raises FlightError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         names = {frame.index: frame.name for frame in ledger.frames()}
-        doubted = [(event.index, event.text) for event in ledger.events() if event.kind == "doubt"]
+        doubted = [(event.index, event.text) for event in ledger.events() if event.kind in (DOUBT, LATER_DOUBT)]
     return [(names[index], text) for index, text in doubted if index in names]
 
 
