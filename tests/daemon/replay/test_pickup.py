@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.daemon.replay import pickup
@@ -100,6 +102,24 @@ def test_a_second_card_that_numbers_from_1_again_is_brought_too(
     for card in (first, second):
         assert flight.pickup(card) == 0
         assert "0 frames brought, 3 already there, 0 missing" in capfd.readouterr().out
+
+
+def test_a_telemetry_that_can_t_be_read_is_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    flight = Landed(tmp_path, [0])
+    card = flight.card("card", {"DSCF0001.RAF": 0.5})
+    (flight.path / "telemetry.tlog").write_bytes(bytes(100))
+    monkeypatch.setattr(durable, "without_waiting", full)
+    assert flight.pickup(card, "--pair", "0=DSCF0001.RAF") == 1
+    assert "telemetry.tlog can't be read: No space left on device" in capfd.readouterr().err
+
+
+def full(path: str, flags: int) -> int:
+    """An opener on a disk that refuses."""
+    if path.endswith(".tlog"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+    return os.open(path, flags)
 
 
 def test_a_renamed_copy_is_there_already_and_no_other_shot_s(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -425,7 +425,13 @@ _OWN_LOGS = {b"\xa3\x95\x80\x80": "dataflash", b"ULog\x01\x12\x35": "ulog"}
 
 
 def own_log(path: Path) -> str | None:
-    """Whose own log a file is, by its first bytes: "dataflash" of ArduPilot, "ulog" of PX4; None for a .tlog."""
-    with open(path, "rb", opener=durable.without_waiting) as file:
-        begins = file.read(7)
+    """Whose own log a file is, by its first bytes: "dataflash" of ArduPilot, "ulog" of PX4; None for a .tlog.
+
+    Raises ReplayError where it can't be read.
+    """
+    try:
+        with open(path, "rb", opener=durable.without_waiting) as file:
+            begins = file.read(7)
+    except OSError as error:
+        raise ReplayError(f"{path} can't be read: {error.strerror}") from error
     return next((name for magic, name in _OWN_LOGS.items() if begins.startswith(magic)), None)
