@@ -261,12 +261,17 @@ def test_forged_replayed_and_unsigned_packets_fire_nothing_on_a_signed_link(tmp_
         assert all(m.get_msgbuf()[2] & 1 for m in gcs.heard), "something went out unsigned"
 
 
+@pytest.mark.parametrize("known", [False, True], ids=["no time here", "time known here"])
 @pytest.mark.parametrize("clock_off_s", [-365 * 86400, -3600, 0, 3600])
-def test_a_station_with_a_wrong_clock_is_taken_once_it_has_heard_the_camera(tmp_path: Path, clock_off_s: int) -> None:
+def test_a_station_with_a_wrong_clock_is_taken_once_it_has_heard_the_camera(
+    tmp_path: Path, clock_off_s: int, known: bool
+) -> None:
     mavlink_signing.make_key(tmp_path / "key")
     key = mavlink_signing.read_key(tmp_path / "key")
     signing = mavlink_signing.open_signing([tmp_path / "key"], tmp_path / "time", SystemClock())
     with Camera(signing=signing) as camera:
+        if known:
+            camera.links.clock_known()
         for system, off_s in ((255, clock_off_s), (254, 0)):  # the second with the right clock, whatever the first had
             with Peer(camera.links.port(0), system) as station:
                 signer = station.packer.signing
