@@ -30,10 +30,12 @@ def test_a_skipped_number_may_be_a_picture_that_was_missed(names: tuple[int, ...
 def test_the_shots_beside_a_file_are_those_next_to_it_by_the_camera_s_count() -> None:
     card = KnownCard(())
     for number, shot in ((9998, 1), (9999, 2), (2, 4)):
-        card.made(named(number), shot)
-    assert card.neighbours(named(1)) == (2, 4)
-    assert card.neighbours(named(3)) == (4, None)
-    assert card.neighbours(CameraFile("/", "capt0001.cr2")) == (None, None)
+        card.made(named(number), shot, 100 + shot)
+    assert card.neighbours(named(1), 103) == (2, 4)
+    assert card.neighbours(named(1), None) == (2, 4)
+    assert card.neighbours(named(3), 105) == (4, None)
+    assert card.neighbours(named(3), 100) == (None, None)  # made before its forerunners: it counts anew
+    assert card.neighbours(CameraFile("/", "capt0001.cr2"), 105) == (None, None)
 
 
 @pytest.mark.parametrize(

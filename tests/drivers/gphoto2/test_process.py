@@ -490,6 +490,13 @@ def test_a_card_that_numbers_from_0001_again_brings_its_files(ready: Harness, cu
     assert noticed(told) == [(Code.CARD_CHANGED, "")]
 
 
+def test_a_camera_that_begins_to_count_anew_loses_no_frame(ready: Harness) -> None:
+    """Its names are new, and older than those of the last frames by their numbers."""
+    for shot, number in ((1, 41), (2, 42), (3, 1), (4, 2)):
+        assert brought(shot_on(ready, shot, body_s(ready), number)) == [(shot, b"%d" % number, False)]
+        ready.turn(4.0)
+
+
 def test_a_card_that_comes_back_brings_nothing_twice(ready: Harness) -> None:
     three_shots(ready)
     first, taken = ready.camera.card, ready.camera.taken

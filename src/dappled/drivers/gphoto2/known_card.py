@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 from dappled.drivers.gphoto2.messages import SeenFile
 from dappled.drivers.gphoto2.protocol import CameraFile, CardContents, FileFacts
@@ -20,6 +21,15 @@ _ZONE_S, _ZONES = 900, 56
 """A body's time may be shown in the zone of a computer, or not: whole quarters of an hour, at most 14 hours."""
 
 Counter = tuple[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class _Frame:
+    """A file whose shot is certain."""
+
+    counter: Counter
+    shot: int
+    taken_s: int | None
 
 
 class KnownCard:
@@ -35,7 +45,7 @@ class KnownCard:
             file = CameraFile(folder, name)
             self.settle(file, (size, taken_s))
             self._newest = _counter(file)
-        self._frames: deque[tuple[Counter, int]] = deque(maxlen=_NEIGHBOURS)  # where the shot is certain
+        self._frames: deque[_Frame] = deque(maxlen=_NEIGHBOURS)
 
     # --- files
 
@@ -109,17 +119,21 @@ class KnownCard:
         counter = _counter(file)
         return counter is not None and self._newest is not None and (_steps(self._newest, counter) or 0) > 0
 
-    def made(self, file: CameraFile, shot: int) -> None:
+    def made(self, file: CameraFile, shot: int, taken_s: int | None) -> None:
         """A shot made this file for certain."""
         if counter := _counter(file):
-            self._frames.append((counter, shot))
+            self._frames.append(_Frame(counter, shot, taken_s))
 
-    def neighbours(self, file: CameraFile) -> tuple[int | None, int | None]:
-        """The shots whose files are next before and behind this one by their names; None where there are none."""
+    def neighbours(self, file: CameraFile, taken_s: int | None) -> tuple[int | None, int | None]:
+        """The shots whose files are next before and behind this one by their names. None where there are none, and
+        where times contradict: the camera has begun to count anew, or its clock was set."""
         counter = _counter(file)
-        steps = [(_steps(one, counter) or 0, shot) for one, shot in self._frames] if counter else []
-        before = max((shot for step, shot in steps if step > 0), default=None)
-        return before, min((shot for step, shot in steps if step < 0), default=None)
+        near = [(one, steps) for one in self._frames if counter and (steps := _steps(one.counter, counter))]
+        for one, steps in near:
+            if taken_s is not None and one.taken_s is not None and (taken_s - one.taken_s) * steps < 0:
+                return None, None
+        before = max((one.shot for one, steps in near if steps > 0), default=None)
+        return before, min((one.shot for one, steps in near if steps < 0), default=None)
 
 
 def _counter(file: CameraFile) -> Counter | None:

@@ -394,7 +394,7 @@ class CameraState:
         """Say which shot made a frame. The current shot ends with its frame."""
         fired_ns = None if self.current is None else self.current.fired_ns
         current = None if self.current is None or fired_ns is None else Claim(self.current.shot, fired_ns)
-        clue = FileClue(taken_s, announced.seen_ns, announced.since_ns, *self._card.neighbours(file))
+        clue = FileClue(taken_s, announced.seen_ns, announced.since_ns, *self._card.neighbours(file, taken_s))
         waiting = [] if current is None else [current]
         found = attribute(clue, self._late, waiting, self._clock)
         self._clock = found.clock
@@ -406,7 +406,7 @@ class CameraState:
             left = []  # files come in order: no older one is expected
         self._late = deque(left, LATE_LIMIT)
         if found.shot is not None and found.doubt is None:
-            self._card.made(file, found.shot)
+            self._card.made(file, found.shot, taken_s)
         facts = {**arrival.facts, **({"doubt": findings.text(found.doubt)} if found.doubt else {})}
         facts["body_offsets_s"] = list(self._clock.offsets_s)
         return Arrival(found.shot, arrival.name, arrival.blob, arrival.monotonic_ns, facts)
