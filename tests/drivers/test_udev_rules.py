@@ -46,4 +46,9 @@ def test_cameras_and_lines_are_given_to_the_group(rules: list[list[tuple[str, st
     given = [rule for rule in rules if ("GROUP", "=", "plugdev") in rule]
     assert all(("MODE", "=", "0660") in rule for rule in given)
     matched = {(key, value) for rule in given for key, operator, value in rule if operator == "=="}
+    assert all(
+        {"ATTR{idProduct}", "ENV{ID_USB_INTERFACES}"} & {key for key, *_ in rule}
+        for rule in given
+        if ("SUBSYSTEM", "==", "gpio") not in rule
+    ), "no maker's devices are given whole"
     assert {("ATTR{idVendor}", "04a9"), ("ATTR{idVendor}", "04cb"), ("SUBSYSTEM", "gpio")} <= matched

@@ -311,3 +311,11 @@ def test_a_light_field_of_half_a_gigabyte_opens(tmp_path: Path, kind: str) -> No
     found = load(tmp_path / f"a{kind}")
     np.testing.assert_array_equal(found.slices, slices)
     np.testing.assert_array_equal(found.views, large.views)
+
+
+@pytest.mark.timeout(20)
+def test_a_pipe_in_place_of_metadata_is_not_waited_for(group: Path) -> None:
+    for file in (group / "slices" / "zarr.json", group / "zarr.json"):
+        file.unlink()
+        os.mkfifo(file)
+        refuses(group, "no plain file|lacks .slices.")
