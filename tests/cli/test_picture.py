@@ -97,13 +97,14 @@ def test_a_mask_whose_shadow_is_not_there_is_a_doubt(
 ) -> None:
     wrong = tmp_path / "wrong.toml"
     wrong.write_text("frequency_per_mm = 9.3\np = 2\n")
-    assert _call(frame, tmp_path / "a.dng", "--json", mask=str(wrong)) == 1
+    assert _call(frame, tmp_path / "a.dng", "--json", "--law", "geometric", mask=str(wrong)) == 1
     out, err = capsys.readouterr()
     assert "no shadow of the mask is seen" in err
     (found,) = json.loads(out)["findings"]
     assert (found["code"], found["level"]) == ("picture.shadow_unseen", "caution")
 
 
+@pytest.mark.slow
 def test_a_jpeg_is_taken_with_a_doubt(frame: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with rawpy.imread(str(frame)) as raw:
         rgb = raw.postprocess(use_camera_wb=True, no_auto_bright=True, user_flip=0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
-from dappled.decode.picture.blocks import MosaicPlane
-from dappled.decode.picture.picture import UnmaskedPicture, picture_of
+from dappled.decode.picture.blocks import EMPTY, MosaicPlane
+from dappled.decode.picture.picture import UnmaskedPicture, interpolated, picture_of
 from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of, shadow_of
 from tests.decode.picture.full_rays import Shot, psnr
 
@@ -109,6 +109,15 @@ def test_each_colour_has_a_shadow_of_its_own() -> None:
     found = _picture(shots[1], MosaicPlane(frame.astype(np.float32), pattern))
     truth = np.choose(index, [one.truth * gain for one, gain in zip(shots, (0.5, 1.0, 0.7), strict=True)])
     assert psnr(found.plane, truth) > 40
+
+
+def test_a_chip_with_staggered_rows_gives_a_picture_in_every_pixel() -> None:
+    shot = Shot(f_number=15.0, exponent=1.8)
+    there = np.add.outer(np.arange(shot.shape[0]), np.arange(shot.shape[1])) % 2 == 0
+    pattern = np.array([[0, EMPTY], [EMPTY, 0]])
+    found = _picture(shot, MosaicPlane(np.where(there, shot.frame, np.float32(0)), pattern))
+    assert psnr(np.where(there, found.plane, shot.truth), shot.truth) > 40
+    assert psnr(interpolated(found), shot.truth) > 38
 
 
 def test_where_the_mask_lets_little_through_the_picture_is_not_trusted() -> None:
