@@ -26,7 +26,7 @@ from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
-from dappled.findings import Finding, Level, told, worst
+from dappled.findings import Finding, Level, first_of_each, in_order, told, worst
 from dappled.flight import LIVE, layout
 from dappled.flight.checks import flight_check
 
@@ -131,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
             pace=_pace(arguments),
             report=found.append,
         )
-    for one in found:
+    for one in in_order(first_of_each(found)):
         print(f"{one.level.word}: {told(one)}", file=sys.stderr)
     doubted = worst([*recording.findings, *found]) > Level.NOTE and not arguments.anyway
     if not arguments.verify:
