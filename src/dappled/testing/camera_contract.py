@@ -20,6 +20,7 @@ from dappled.drivers.camera import (
     Companion,
     Deferred,
     Fired,
+    Noticed,
     SettingsChanged,
     ShotFailed,
     StateChanged,
@@ -98,7 +99,7 @@ def content(arrival: Arrival | Companion) -> bytes:
 
 def of_shots(events: list[CameraEvent], *, deferred: bool = True) -> list[tuple[type[CameraEvent], int | None]]:
     """Return kind and shot of the events that belong to shots."""
-    others = (StateChanged, SettingsChanged) if deferred else (StateChanged, SettingsChanged, Deferred)
+    others = (StateChanged, SettingsChanged, Noticed, *(() if deferred else (Deferred,)))
     return [(type(event), event.shot) for event in events if not isinstance(event, others)]  # type: ignore[union-attr]
 
 
