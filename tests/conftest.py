@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; before NumPy is loaded
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from tests import left_behind
 
 # No test fails for the speed of the machine it runs on.
 settings.register_profile("dappled", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -29,6 +33,45 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.slow)
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_S))
+
+
+_watch = left_behind.Watch()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
+    """What a fixture of a wider scope makes may outlive the test that asked for it first."""
+    if fixturedef.scope == "function":
+        return (yield)
+    with _watch.wider():
+        return (yield)
+
+
+# Where this was seen to hold: a room is added once its tests end what they begin.
+TIDY = tuple(
+    f"tests/{room}"
+    for room in (
+        "daemon/health",
+        "daemon/navigation",
+        "daemon/pipeline",
+        "daemon/replay",
+        "daemon/stream",
+        "daemon/test_",
+        "mocks",
+    )
+)
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_behind(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A test ends its threads and child processes and closes its sockets."""
+    if not request.node.nodeid.startswith(TIDY) or not Path("/proc/self/fd").is_dir():  # there is none on macOS
+        yield
+        return
+    before = left_behind.held()
+    yield
+    if left := _watch.left(before):
+        pytest.fail(f"left behind: {left_behind.named(left)}")
 
 
 @pytest.fixture(scope="session")

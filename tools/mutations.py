@@ -60,7 +60,7 @@ MUTATIONS = (
         "cli/decode.py",
         "doubted += bool(made.doubts)",
         "doubted += 0",
-        ("cli/test_decode.py",),
+        ("cli/test_wrong_input.py",),
     ),
     Mutation(
         "sigma of the clock is halved",
