@@ -133,6 +133,23 @@ def test_a_renamed_copy_is_there_already_and_no_other_shot_s(tmp_path: Path, cap
     assert "its bytes are the frame of shot 0 already" in capfd.readouterr().err
 
 
+def test_a_clock_that_was_set_between_two_cards_is_a_doubt_of_each_frame(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    flight = Landed(tmp_path, [0, 7, 19, 60, 64, 84])
+    first = flight.card("first", {"DSCF0001.RAF": 0.5, "DSCF0002.RAF": 7.5, "DSCF0003.RAF": 19.5})
+    second = flight.card("second", {"DSCF0001.RAF": 3660.5, "DSCF0002.RAF": 3664.5, "DSCF0003.RAF": 3684.5})
+    assert flight.pickup(first) == 1
+    assert flight.events("doubt") == []
+    assert flight.pickup(second) == 1
+    assert "in doubt:    frame 3: by the body's clock it was taken +3600 s away" in capfd.readouterr().out
+    assert [index for index, _ in flight.events("doubt")] == [3, 4, 5]
+    assert flight.frames() == {
+        n: (card / f"DSCF000{k}.RAF").read_bytes()
+        for n, (card, k) in enumerate((card, k) for card in (first, second) for k in (1, 2, 3))
+    }
+
+
 def test_by_order_counts_as_cameras_do_where_files_have_no_time(tmp_path: Path) -> None:
     flight = Landed(tmp_path, [0, 5, 10, 15])
     names = ["IMG_0001.RAF", "IMG_0002.RAF", "IMG_9998.RAF", "IMG_9999.RAF"]

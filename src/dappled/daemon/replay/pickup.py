@@ -25,6 +25,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry, tagging_rules
 from dappled.drivers.camera import CameraError
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
+from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
@@ -33,6 +34,8 @@ from dappled.findings import Code, Finding, Level, Subject, finding, text, told
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
 from dappled.flight.seal_key import SealKey
+
+_ANCHORS = 64  # frames whose times tell the camera's clock
 
 
 class PickupError(DappledError):
@@ -92,7 +95,8 @@ def propose(
         if "closed_utc_ns" not in ledger.facts():
             raise PickupError(f"{flight} is still being recorded, or was never closed: stop the daemon first")
         rows = {row.shot.index: row for row in ledger.shots()}
-        had = ledger.frames() + ledger.companions()
+        frames = ledger.frames()
+        had = frames + ledger.companions()
         files = {row.sha256: (row.size, row if isinstance(row, Frame) else None) for row in reversed(ledger.files())}
     found = groups(source.list())
     same = _same(source, [group.main for group in found], files, progress)
@@ -107,8 +111,8 @@ def propose(
     shots = [shot for shot in waiting if shot.index not in chosen]
     left = [DatedFile(group.main.name, times[group.main.name]) for group in fresh if group.main.name not in taken]
     anchors = [
-        (times[name], _fired(rows[frame.index]))
-        for name, frame in known.items()
+        (_taken_s(folder.file(frame.name)), _fired(rows[frame.index]))
+        for frame in frames[-_ANCHORS:]
         if rows[frame.index].fired_called_monotonic_ns is not None
     ]
     offset_s = choice.offset_s if choice.offset_s is not None else _offset(anchors)
@@ -119,10 +123,12 @@ def propose(
     reasons = {index: "as you said" if index in chosen else reason for index, _ in pairs}
     doubtful = {one.subject.which for one in matched.doubts}
     nobodys = [name for name in matched.files if name not in doubtful]
-    offset_s = matched.offset_s if matched.offset_s is not None else offset_s
+    known_s, offset_s = offset_s, matched.offset_s if matched.offset_s is not None else offset_s
     dated = [DatedFile(name, time_s) for name, time_s in times.items()]
     named = [(index, group.main.name) for index, group in pairs]
-    off = matching.disagreeing(named, [_fired(rows[index]) for index, _ in pairs], dated, offset_s)
+    off = matching.disagreeing(
+        named, [_fired(rows[index]) for index, _ in pairs], dated, known_s if known_s is not None else offset_s
+    )
     changed = _changed_card([group.main for group in found], same, had)
     return Proposal(
         tuple(sorted(pairs, key=lambda pair: pair[0])),
@@ -208,6 +214,15 @@ def _called_utc_ns(row: ShotRow) -> int:
     return clocks.called_utc_ns(row.shot, row.fired_called_monotonic_ns)
 
 
+def _taken_s(path: Path) -> float | None:
+    """When a recorded frame was taken by the body's clock; None where it has no time, or is elsewhere now."""
+    try:
+        with path.open("rb") as file:
+            return matching.seconds(read_exif(file).taken)
+    except OSError:
+        return None
+
+
 def _offset(anchors: list[tuple[float | None, FiredShot]]) -> float | None:
     offsets = [taken_s - shot.fired_s for taken_s, shot in anchors if taken_s is not None]
     return median(offsets) if offsets else None
@@ -283,7 +298,10 @@ def _matched(shots: list[FiredShot], files: list[DatedFile], choice: Choice, off
             )
         return Matching(pairs, (), (), tuple(_against(files)))
     plausible_s = math.inf if choice.any_clock else PLAUSIBLE_S
-    return matching.match(shots, files, offset_s=offset_s, plausible_s=plausible_s)
+    matched = matching.match(shots, files, offset_s=offset_s, plausible_s=plausible_s)
+    if matched.pairs or offset_s is None or choice.offset_s is not None:
+        return matched
+    return matching.match(shots, files, plausible_s=plausible_s)  # the camera's clock may have been set: a doubt
 
 
 def _against(files: list[DatedFile]) -> list[Finding]:
