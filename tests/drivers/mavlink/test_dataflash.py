@@ -116,3 +116,12 @@ def test_the_drift_of_the_autopilots_clock_is_followed() -> None:
     ]
     assert max(errors_us) < 1000
     assert min(errors_us) > -6_000
+
+
+def test_a_log_of_holes_is_judged_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "1.bin"
+    path.write_bytes(b"\xa3\x95\x80\x80")
+    with path.open("ab") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(DataFlashError, match=r"1\.bin.*its content would take"):
+        list(dataflash.packets(path))

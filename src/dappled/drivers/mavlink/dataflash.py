@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink import DFReader
 
+from dappled.bounds.parsing import stored_size
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import from_euler
 from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
@@ -124,6 +125,7 @@ class _Reader(DFReader.DFReader_binary):  # type: ignore[misc]  # it has no type
 def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
     """The messages in use, by name, and whether the log was cut short: then it is read up to there."""
     rows: dict[str, list[Any]] = {name: [] for name in used}
+    stored_size(path)  # a log with holes would be read for hours
     log = _Reader(path)
     try:
         while (message := log.recv_match(type=used)) is not None:
