@@ -56,6 +56,20 @@ MUTATIONS = (
         ("daemon/pipeline/test_shutter.py",),
     ),
     Mutation(
+        "the only shot left gets a picture of another moment",
+        "drivers/attribution.py",
+        "    if abs(clock.off_s(nearest, taken_s)) <= TOLERANCE_S:\n",
+        "    if nearest:\n",
+        ("drivers/test_attribution.py", "drivers/gphoto2/test_process.py"),
+    ),
+    Mutation(
+        "a known name is a known file",
+        "drivers/gphoto2/known_card.py",
+        "    return one[0] == other[0] and apart_s % _ZONE_S == 0 and apart_s <= _ZONES * _ZONE_S\n",
+        "    return apart_s >= 0\n",
+        ("drivers/gphoto2/test_known_card.py", "drivers/gphoto2/test_process.py"),
+    ),
+    Mutation(
         "a doubt is dropped on its way to the exit code",
         "cli/decode.py",
         "doubted += bool(made.doubts)",
