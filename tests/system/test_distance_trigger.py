@@ -49,7 +49,7 @@ def until_settled(daemon: Flying) -> int:
     return len(daemon.shots)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_photographs_by_distance_begin_by_height_and_end_and_change_on_command(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ from dappled.daemon.pipeline import repeats
 from tests.system.documents import ROOT, Stage, commands, stage
 
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+LONG = ("README.md", "decoding.md", "maps.md", "products.md")  # their commands cost a core half a minute or more
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +35,10 @@ def test_commands_are_found(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize(
+    "document",
+    [pytest.param(page, id=page.name, marks=[pytest.mark.long] if page.name in LONG else []) for page in DOCUMENTS],
+)
 def test_the_documents_commands_run(document: Path, on_stage: Stage) -> None:
     failures = on_stage.all_fail(commands(document))
     assert not failures, "\n".join(failures)
