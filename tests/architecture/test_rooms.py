@@ -23,6 +23,7 @@ UNUSED = {
     "__dir__": "Python calls it, for `dir(dappled)`",
     "collect": "prometheus_client calls it",
     "redirect_request": "urllib calls it",
+    "_unsupported_upgrade_warning": "uvicorn calls it",
     "get_reader": "napari calls it, by the manifest napari.json",
     "plot": "of what `dappled.open` returns: notebooks call it",
 }
