@@ -24,7 +24,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
@@ -326,7 +326,29 @@ def test_an_interval_runs_and_stops(chromium: Browser, daemon: Daemon) -> None:
     assert watched.wrong == []
 
 
-@pytest.mark.long
+def test_pictures_leave_connections_to_the_shutter(chromium: Browser, daemon: Daemon) -> None:
+    """A browser has six connections to a host: were pictures to take all of them, Stop would wait behind them."""
+    watched = opened(chromium, daemon, LAPTOP)
+    page = watched.page
+    held: list[Route] = []
+    page.route("**/api/frames/**", lambda route: held.append(route))  # noqa: PLW0108  Playwright marks what it is given
+    pictured = page.locator("#strip [data-frame] img")
+    for count in range(pictured.count() + 1, pictured.count() + 4):
+        until(page, "!document.querySelector('#shoot').disabled")
+        page.evaluate("document.querySelector('#outcome').textContent = ''")
+        page.click("#shoot")
+        until(page, "document.querySelector('#outcome').textContent.startsWith('shot ')")
+        pictured.nth(count - 1).wait_for(state="attached")
+    index = int(page.inner_text("#outcome").split()[1])
+    assert len(held) == 3, "thumbnails, the map's pictures and the views together"
+    page.unroute("**/api/frames/**")
+    for one in held:
+        one.continue_()
+    until(page, f"document.querySelector('#strip [data-frame=\"{index}\"] img').naturalWidth > 0")
+    assert watched.wrong == []
+
+
+@pytest.mark.slow
 def test_photographs_by_distance_are_shown_and_stopped(chromium: Browser, tmp_path: Path, sockets: Path) -> None:
     """They begin by themselves: the page must tell that they do, and end them."""
     by_itself = "[trigger]\ndistance_m = 9\nfrom_height_m = 2\n"

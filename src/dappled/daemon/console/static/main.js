@@ -1,6 +1,7 @@
 // Show the daemon's events on the page. All state is here; the other modules draw.
 import { dash, element, fixed, mark, rows, svg, utc } from "./format.js";
 import { FieldMap } from "./map.js";
+import { image } from "./pictures.js";
 import { Settings } from "./settings.js";
 import { Stage } from "./stage.js";
 
@@ -176,7 +177,7 @@ function showThumb(index, frame) {
     button.setAttribute("aria-label", words);
     button.title = words;
   }
-  if (frame.thumb && !button.querySelector("img")) button.firstChild.replaceWith(element("img", { src: `/api/frames/${index}/thumb.jpg`, alt: "" }));
+  if (frame.thumb && !button.querySelector("img")) button.firstChild.replaceWith(image(`/api/frames/${index}/thumb.jpg`, undefined, { alt: "" }));
 }
 
 function choose(index) {

@@ -1,4 +1,6 @@
 // Draw track, footprints and frames on a canvas, in metres around the first position. No tiles, no network.
+import { image } from "./pictures.js";
+
 const METRES = 111319.49;
 
 export class FieldMap {
@@ -48,9 +50,7 @@ export class FieldMap {
     const frame = this.frames.get(index) ?? { image: null };
     frame.corners = corners.map(([lat, lon]) => [lon, lat]);
     if (hasPicture && !frame.image) {
-      frame.image = new Image();
-      frame.image.onload = () => this.redraw();
-      frame.image.src = `/api/frames/${index}/map.png`;
+      frame.image = image(`/api/frames/${index}/map.png`, () => this.redraw());
     }
     this.frames.set(index, frame);
     if (this.frames.size > 60) this.frames.delete(this.frames.keys().next().value);
@@ -59,9 +59,7 @@ export class FieldMap {
 
   setBackground(bounds) {
     if (!bounds || this.background) return;
-    const image = new Image();
-    image.onload = () => { this.background = { image, bounds }; this.redraw(); };
-    image.src = "/api/map";
+    image("/api/map", (picture) => { this.background = { image: picture, bounds }; this.redraw(); });
   }
 
   setArea(area) {
@@ -73,9 +71,7 @@ export class FieldMap {
   setHoles(version) {
     if (!this.area || this.area.version === version) return;
     this.area.version = version;
-    const image = new Image();
-    image.onload = () => { this.area.holes = image; this.redraw(); };
-    image.src = `/api/holes.png?v=${version}`;
+    image(`/api/holes.png?v=${version}`, (picture) => { this.area.holes = picture; this.redraw(); });
   }
 
   select(index) { this.selected = index; this.redraw(); }

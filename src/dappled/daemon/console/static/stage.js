@@ -1,6 +1,7 @@
 // Show one frame as refocused picture, views, slices, spectrum or depth.
 import { element, fixed, svg } from "./format.js";
 import { Live } from "./live.js";
+import { ask, place } from "./pictures.js";
 import { Refocus, sharpest } from "./refocus.js";
 
 const TABS = ["refocus", "views", "slices", "spectrum", "live", "depth"];
@@ -148,11 +149,14 @@ export class Stage {
   }
 
   async loadViews(base, turn) {
-    const layout = await (await good(fetch(`${base}views.json`))).json();
+    const wanted = () => turn === this.turn;
+    const layout = await ask(`${base}views.json`, { read: (answer) => answer.json(), wanted, first: true });
+    if (!layout) return;
     const drawn = this.refocus && this.refocus.fits(layout);
     let bitmap = null;
     if (drawn) {
-      const blob = await (await good(fetch(`${base}views.jpg`))).blob();
+      const blob = await ask(`${base}views.jpg`, { wanted, first: true });
+      if (!blob) return;
       bitmap = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
     }
     if (turn !== this.turn) return;
@@ -176,8 +180,8 @@ export class Stage {
   }
 
   async loadPicture(url, kind, turn) {
-    const blob = await (await good(fetch(url))).blob();
-    if (turn !== this.turn) return;
+    const blob = await ask(url, { wanted: () => turn === this.turn, first: true });
+    if (!blob || turn !== this.turn) return;
     const picture = $("picture");
     await place(picture, blob);
     if (turn !== this.turn) return;
@@ -302,20 +306,3 @@ function show(one, visible) {
 }
 
 const signed = (n) => (n > 0 ? `+${n}` : n < 0 ? `−${-n}` : "0");
-
-async function good(asked) {
-  const answer = await asked;
-  if (answer.ok) return answer;
-  let text = `the vehicle answered ${answer.status}`;
-  try { text = (await answer.json()).error ?? text; } catch { /* no sentence came */ }
-  throw new Error(text);
-}
-
-function place(picture, blob) {
-  const url = URL.createObjectURL(blob);
-  return new Promise((resolve, reject) => {
-    picture.onload = () => { URL.revokeObjectURL(url); resolve(); };
-    picture.onerror = () => { URL.revokeObjectURL(url); reject(new Error("the picture can't be shown")); };
-    picture.src = url;
-  });
-}
