@@ -217,10 +217,7 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
 
 
 def _read(path: Path, cam_idx: int, bounds: UtcBounds) -> TriggerLog:
-    try:
-        kind = own_log(path)
-    except OSError as error:
-        raise BooksError(f"{path} can't be read: {error.strerror}") from None
+    kind = own_log(path)
     if kind == "ulog":
         from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
 
