@@ -41,6 +41,13 @@ def test_a_time_at_which_no_unknown_picture_can_have_been_made_shows_that_the_cl
     assert (third.shot, third.doubt) == (6, None)
 
 
+def test_a_body_that_took_its_time_to_focus_keeps_its_frame_in_doubt() -> None:
+    found = attribute(clue(4900 + 206, 207.0), [], [claim(4, 200)], KNOWN)
+    assert found.shot == 4
+    assert found.doubt is not None
+    assert found.doubt.facts["off_s"] == pytest.approx(6, abs=0.2)
+
+
 def test_a_clock_that_was_set_back_is_believed_when_files_in_a_row_agree() -> None:
     ends, clock = [], KNOWN
     for shot in range(4, 8):

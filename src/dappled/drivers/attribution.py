@@ -132,8 +132,8 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     By names, a file is of no shot before `clue.after` or behind `clue.before`. By the body's clock it is of a shot that
     it fits. Of several that fit, and where there is no clock, files come in order; a shot given up is a rival. A file
     that fits none is a picture of another moment, a stray, where it can have been made then: not before `since_ns` and
-    not in the future. Else the body's clock was set, and it is the awaited shot's, in doubt; so is the second such file
-    in a row. From then on the new time counts.
+    not after the awaited shot was fired. Else the body was slow or its clock was set, and it is the awaited shot's, in
+    doubt; so is the second such file in a row. From then on the new time counts.
     """
     claims = [one for one in (*late, *waiting) if _possible(one, clue)]
     awaited = next((one for one in waiting if one in claims), None)
@@ -150,7 +150,7 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     rivalling = clock.rivalling([one for one in waiting if one in claims], taken_s)
     likely, apart_s = rivalling[0]
     alone = all(one.before < likely.before or other_s > apart_s + 1.0 for one, other_s in rivalling[1:])
-    agreeing = likely.before + (not _of_another_moment(clue, taken_s, clock))
+    agreeing = likely.before + (not _of_another_moment(clue, awaited, taken_s, clock))
     chosen = likely.claim if likely.before else awaited
     if agreeing > (1 if len(rivalling) == 1 else _FEW) and alone and apart_s <= _LEAST_S:
         return Attribution(chosen.shot, clock.learnt(chosen, taken_s))
@@ -200,12 +200,15 @@ def _is_rather_of(other: Claim, chosen: Claim, arrived_ns: int) -> bool:
     return waited_ns > _SLOW_S * 1e9 and arrived_ns - other.fired_ns < waited_ns / 4
 
 
-def _of_another_moment(clue: FileClue, taken_s: float, clock: BodyClock) -> bool:
-    """Whether a picture can have been made when the file was, by the body's clock as it was known."""
+def _of_another_moment(clue: FileClue, awaited: Claim, taken_s: float, clock: BodyClock) -> bool:
+    """Whether, by the body's clock as it was known, the file can have been made before the awaited shot was fired.
+
+    Later than that it is rather this shot's, by a body that took its time to focus.
+    """
     made_ns = (taken_s - median(clock.offsets_s)) * 1e9
     slack_ns = clock.limit_s * 1e9
     since_ns = made_ns if clue.since_ns is None else clue.since_ns
-    return since_ns - slack_ns <= made_ns <= clue.arrived_ns + slack_ns
+    return since_ns - slack_ns <= made_ns <= min(clue.arrived_ns, awaited.fired_ns) + slack_ns
 
 
 def _disagrees(claim: Claim, taken_s: float, clock: BodyClock) -> Finding:
