@@ -32,6 +32,7 @@ CALLS: dict[str, list[str]] = {
     "trigger": ["--key", "none.key"],
     "mavlink key": ["none/key"],
     "decode": ["none.dng", "--mask", "mask-2", "-o", "f.zarr"],
+    "picture": ["none.cr2", "--mask", "mask-2", "-o", "p.dng"],
     "carriers": ["--shape", "1388", "1844", *MASK, "--focal-length", "50"],
     "calibrate": ["none.dng", "--mask", "mask-2", "-o", "c.toml"],
     "views": ["none.zarr", "-o", "v.png"],
