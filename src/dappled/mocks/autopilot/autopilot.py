@@ -19,6 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
@@ -127,9 +128,9 @@ class Forwarded:
         """System and component of its sender."""
         return self._packet.message.get_srcSystem(), self._packet.message.get_srcComponent()
 
-    def get_msgId(self) -> int:  # noqa: N802 (as pymavlink's messages have it)
-        """Its number."""
-        return int(self._packet.message.get_msgId())
+    def __getattr__(self, name: str) -> Any:
+        """What pymavlink's message of the packet has."""
+        return getattr(self._packet.message, name)
 
     def pack(self, _packer: object, force_mavlink1: bool = False) -> bytes:
         """Its bytes."""
