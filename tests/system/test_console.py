@@ -331,7 +331,8 @@ def test_pictures_leave_connections_to_the_shutter(chromium: Browser, daemon: Da
     watched = opened(chromium, daemon, LAPTOP)
     page = watched.page
     held: list[Route] = []
-    page.route("**/api/frames/**", lambda route: held.append(route))  # noqa: PLW0108  Playwright marks what it is given
+    let_go = False
+    page.route("**/api/frames/**", lambda route: route.continue_() if let_go else held.append(route))
     pictured = page.locator("#strip [data-frame] img")
     for count in range(pictured.count() + 1, pictured.count() + 4):
         until(page, "!document.querySelector('#shoot').disabled")
@@ -341,7 +342,7 @@ def test_pictures_leave_connections_to_the_shutter(chromium: Browser, daemon: Da
         pictured.nth(count - 1).wait_for(state="attached")
     index = int(page.inner_text("#outcome").split()[1])
     assert len(held) == 3, "thumbnails, the map's pictures and the views together"
-    page.unroute("**/api/frames/**")
+    let_go = True
     for one in held:
         one.continue_()
     until(page, f"document.querySelector('#strip [data-frame=\"{index}\"] img').naturalWidth > 0")
