@@ -69,6 +69,7 @@ class Rig:
         self.packer = mavlink.MAVLink(None)
         self.copies = 1
         self.trusted = True
+        self.exposed = False
         self.sent: list[MavlinkMessage] = []
         self.sent_on: list[int | None] = []  # None: on all links
         self.without: list[int | None] = []
@@ -137,7 +138,7 @@ class Rig:
         self.packer.srcSystem, self.packer.srcComponent = sender
         raw = pack(message, self.packer, version_1=False)
         for _ in range(self.copies):
-            self.component.on_packet(Packet(0, 0, link, message, raw, trusted=self.trusted))
+            self.component.on_packet(Packet(0, 0, link, message, raw, trusted=self.trusted, exposed=self.exposed))
 
     def command(self, name: int, *p: float, target: tuple[int, int] = (1, 100), confirmation: int = 0) -> int | None:
         """Its MAV_RESULT, None for no acknowledgement."""
@@ -532,6 +533,16 @@ def test_a_lens_that_can_be_set_zooms_to_the_nearest_focal_length(kind: int, val
     assert rig.of("CAMERA_SETTINGS")[0].zoomLevel == pytest.approx(100 / 3, abs=0.01)
     rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
     assert rig.of("CAMERA_INFORMATION")[0].flags & mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM
+
+
+def test_a_stranger_cannot_zoom_which_changes_how_frames_are_decoded() -> None:
+    rig = Rig()
+    rig.tick(4)
+    rig.exposed = True
+    rig.body.now["focal_length"] = Setting("focal_length", "24", ("18", "24", "35", "55"))
+    assert rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 3, 35.0) == mavlink.MAV_RESULT_DENIED
+    assert rig.body.asked == []
+    assert rig.of("STATUSTEXT")[0].text.startswith("no zoom: CAM_FOCALLEN can't be set")
 
 
 def test_a_repeated_zoom_step_is_one_step_and_another_step_is_another() -> None:

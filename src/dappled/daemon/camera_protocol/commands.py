@@ -11,7 +11,7 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import ZOOM, CameraStatus
-from dappled.daemon.camera_protocol.parameters import Parameters
+from dappled.daemon.camera_protocol.parameters import Parameters, unsigned_refusal
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.daemon.pipeline.shutter import CANNOT_FIRE, ShotDecision, Shutter
 from dappled.daemon.pipeline.spacing import Spacing
@@ -55,7 +55,8 @@ _ZOOM_STEP, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = 0, 2, 3, 4
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """A COMMAND_LONG or COMMAND_INT. Parameters may be NaN. `broadcast`: to all components."""
+    """A COMMAND_LONG or COMMAND_INT. Parameters may be NaN. `broadcast`: to all components; `exposed`: a stranger may
+    have sent it."""
 
     name: int
     parameters: tuple[float, ...]
@@ -64,9 +65,10 @@ class Command:
     component: int
     link: int
     broadcast: bool
+    exposed: bool = False
 
     @classmethod
-    def of(cls, message: MavlinkMessage, link: int) -> Command:
+    def of(cls, message: MavlinkMessage, link: int, *, exposed: bool = False) -> Command:
         """From a COMMAND_LONG or COMMAND_INT."""
         is_long = message.get_type() == "COMMAND_LONG"
         last = (message.param5, message.param6, message.param7) if is_long else (message.x, message.y, message.z)
@@ -78,6 +80,7 @@ class Command:
             message.get_srcComponent(),
             link,
             message.target_component == 0,
+            exposed,
         )
 
     def number(self, place: int, default: float = 0.0) -> float:
@@ -372,6 +375,8 @@ class CameraCommands:
         lengths = self._status.focal_lengths()
         if not lengths:
             return CommandAnswer(DENIED, words="no zoom: this lens is zoomed by hand")
+        if command.exposed and self._parameters.closed_to_strangers(ZOOM):
+            return CommandAnswer(DENIED, words=f"no zoom: {unsigned_refusal(ZOOM)}")
         kind, value = command.integer(1, -1), command.number(2, math.nan)
         step = CaptureRequest(
             command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value)

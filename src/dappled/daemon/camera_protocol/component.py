@@ -242,7 +242,7 @@ class Component:
     def _command(self, packet: Packet) -> None:
         if not self._is_for_us(packet.message):
             return
-        command = Command.of(packet.message, packet.link)
+        command = Command.of(packet.message, packet.link, exposed=packet.exposed)
         if self._is_duplicate(packet):
             self._acknowledge_again(command)
             return

@@ -110,6 +110,11 @@ class Parameters:
         return False
 
 
+def unsigned_refusal(name: str) -> str:
+    """What the pilot is told of a setting that is closed to strangers."""
+    return f"{name} can't be set over an unsigned link: sign it, or set mavlink.unsigned_parameters"
+
+
 @dataclass(frozen=True, slots=True)
 class ParameterReply:
     """Messages for the link that asked, and text for the pilot."""
@@ -186,8 +191,7 @@ class ParameterServer:
         if asked is None and value == parameter.value:
             return ParameterReply((_ack(name, wanted, _ACCEPTED),))
         if exposed and self._parameters.closed_to_strangers(name):
-            words = f"{name} can't be set over an unsigned link: sign it, or set mavlink.unsigned_parameters"
-            return ParameterReply((_ack(name, code(parameter.value), _FAILED),), words)
+            return ParameterReply((_ack(name, code(parameter.value), _FAILED),), unsigned_refusal(name))
         return self._change(parameter, value, _Asked(value, link, now_ns + WAIT_NS))
 
     def _change(self, parameter: Parameter, value: str, asked: _Asked) -> ParameterReply:
