@@ -296,3 +296,8 @@ def test_a_redirection_tells_no_token_and_a_version_moves_no_cursor(
     said = capsys.readouterr().err
     assert "https://elsewhere.example/info" in said
     assert "secret" not in said
+    node.moved = "https://[secret"  # no address at all
+    assert main(["hand-over", "odm", node.url, "--task", "one"]) == 1
+    said = capsys.readouterr().err
+    assert "a redirection to what is no address" in said
+    assert "secret" not in said

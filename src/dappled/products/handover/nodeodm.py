@@ -267,6 +267,8 @@ class NodeOdm:
             raise NoAnswerError(
                 f"no NodeODM server answers at {self._url} ({reason}): start it, or check the address"
             ) from None
+        except ValueError:  # urllib reads the address before `_NoDetours` does
+            raise NodeOdmError(f"{self._url} answers {where} with a redirection to what is no address") from None
 
 
 def _public(address: str) -> str:
