@@ -12,8 +12,10 @@ import pytest
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import MavlinkLinks, Packet, make_key, mavlink, open_signing, pack, read_key
+from dappled.drivers.mavlink.channels import UdpIn
 from dappled.drivers.mavlink.peers import MOST, Peers
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.drivers.mavlink.streams import TcpServer
 from tests.drivers.mavlink.strangers import Strangers
 
 S = 10**9
@@ -161,6 +163,26 @@ def test_a_full_table_refuses_newcomers_until_somebody_has_gone() -> None:
     assert peers.receivers(20, 6 * S) == [("a", 0), ("late", 1)]
 
 
+def test_calls_of_a_script_that_signs_have_a_port_each_and_none_waits_a_minute() -> None:
+    peers = Peers()
+    for number in range(2 * MOST):
+        peers.shown(("script", number), 20, "signed", number * S)
+        peers.shown(("station", 1), 20, "signed", number * S)
+        assert {("script", number), ("station", 1)} <= set(peers.receivers(20, number * S))
+
+
+def test_a_datagram_without_bytes_leaves_nobody_waiting() -> None:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as at,
+    ):
+        at.bind(("127.0.0.1", 0))
+        port = UdpIn(at)
+        for data in (b"a", b"", b"b"):
+            one.sendto(data, at.getsockname())
+        assert [port.read(), port.read(), port.read()] == [b"a", b"b", b""]
+
+
 def test_who_is_only_heard_is_sent_at_most_as_much_as_it_sent() -> None:
     peers = Peers()
     peers.shown(("a", 1), 50, "old", 0)
@@ -250,3 +272,28 @@ def test_a_stranger_on_a_signed_tcp_port_hears_nothing_and_displaces_nobody(tmp_
         port.links.stop()
         for each in (station, *strangers):
             each.socket.close()
+
+
+def test_a_stranger_who_always_sends_keeps_no_client_of_a_signed_tcp_port_waiting() -> None:
+    listening = socket.create_server(("127.0.0.1", 0))
+    listening.setblocking(False)
+    server = TcpServer(listening)
+    server.ask_proof()
+    try:
+        with (
+            socket.create_connection(listening.getsockname(), 20) as station,
+            socket.create_connection(listening.getsockname(), 20) as stranger,
+        ):
+            station.sendall(b"signed")
+            while server.read() != b"signed":
+                pass
+            server.shown("signed")
+            stranger.sendall(bytes(50_000))
+            while not server.read():
+                pass
+            station.sendall(b"command")
+            read = [server.read() for _ in range(3)]
+            assert b"command" in read
+            assert {len(one or b"") for one in read} == {len(b"command"), 1024}
+    finally:
+        server.close()

@@ -295,8 +295,8 @@ class UdpIn(_Udp):
         elif self._strange:
             self._last = self._strange.popleft()
             self._waiting[self._last[1]] -= 1
-            if not self._strange:
-                self._waiting.clear()
+            if not self._waiting[self._last[1]]:  # strangers can have any number of addresses
+                del self._waiting[self._last[1]]
         else:
             self._last = None
         return b"" if self._last is None else self._last[0]
@@ -316,6 +316,8 @@ class UdpIn(_Udp):
             received = self._receive()
             if received is None:
                 return
+            if not received[0]:  # it would end the reading of those that wait
+                continue
             source = received[1]
             if self._peers.is_proven(source, now_ns) and not self._waiting[source]:
                 self._known.append(received)

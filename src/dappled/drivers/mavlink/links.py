@@ -382,7 +382,7 @@ class MavlinkLinks:
                 if not self._wait(channel):
                     continue
                 while (data := channel.read()) and not self._stop.is_set():
-                    framer = framers.setdefault(channel.origin, Framer())
+                    framer = framers[channel.origin] = framers.pop(channel.origin, Framer())
                     if len(framers) > _FRAMERS:
                         del framers[next(iter(framers))]
                     self._take(link, channel, framer, data, receiver)

@@ -4,8 +4,9 @@ A peer is *unproven* until a packet of it says something, and costs nothing: its
 *heard* when a packet of it is rightly signed, but is no new one (a clock that is behind, a copy that another link
 brought first): it is sent at most as many bytes as it sent, so that a station whose clock is behind learns the time.
 It is *proven* by a new packet that is obeyed, and is sent everything: for a minute where the packet was signed, else
-for 5 s. At most 16 peers of a port are proven; one that still is is never displaced. Over a serial line
-the one at the other end can't be another one; a TCP server with a key serves who has proven itself (`TcpServer`).
+for 5 s. At most 16 peers of a port are proven; one that was heard in the last 5 s is never displaced, and a silent one
+only by who signs: a script's calls have a port each. Over a serial line the one at the other end can't be another one;
+a TCP server with a key serves who has proven itself (`TcpServer`).
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ Shown = Literal["signed", "sound", "old"]
 
 MOST = 16
 _PROVEN_NS: dict[Shown, int] = {"signed": 60 * 10**9, "sound": 5 * 10**9}
-_HEARD_NS = 5 * 10**9
+_HEARD_NS = _LIVING_NS = 5 * 10**9
 CREDIT_BYTES = 280  # one packet
 
 
@@ -29,6 +30,7 @@ class Peer:
 
     until_ns: int
     credit: int = 0
+    heard_ns: int = 0
 
 
 class Peers:
@@ -51,12 +53,16 @@ class Peers:
         until_ns = now_ns + _PROVEN_NS[evidence]
         peer = self._proven.get(source)
         if peer is not None:
-            peer.until_ns = max(peer.until_ns, until_ns)
+            peer.until_ns, peer.heard_ns = max(peer.until_ns, until_ns), now_ns
             return
         if len(self._proven) >= MOST:
             _forget_gone(self._proven, now_ns)
+        if len(self._proven) >= MOST and evidence == "signed":
+            longest = min(self._proven, key=lambda one: self._proven[one].heard_ns)
+            if now_ns - self._proven[longest].heard_ns > _LIVING_NS:
+                del self._proven[longest]
         if len(self._proven) < MOST:
-            self._proven[source] = Peer(until_ns)
+            self._proven[source] = Peer(until_ns, heard_ns=now_ns)
             self._heard.pop(source, None)
 
     def receivers(self, size: int, now_ns: int) -> list[Source]:

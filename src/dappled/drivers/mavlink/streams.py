@@ -14,6 +14,7 @@ from dappled.drivers.mavlink.peers import CREDIT_BYTES, Shown
 
 _CHUNK = 65536
 _CANDIDATES = 4
+_CANDIDATE_CHUNK = 1024  # a client waits no longer than for so many bytes of theirs
 _OUTBOX_LIMIT = 65536
 _GONE_S = 5
 _NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO, errno.ENETDOWN, errno.ENETUNREACH,
@@ -40,9 +41,9 @@ class ByteStream:
     def descriptors(self) -> Sequence[int]:
         return (self._fd,)
 
-    def read(self) -> bytes | None:
+    def read(self, most: int = _CHUNK) -> bytes | None:
         try:
-            return os.read(self._fd, _CHUNK) or None
+            return os.read(self._fd, most) or None
         except BlockingIOError:
             return b""
 
@@ -137,11 +138,15 @@ class TcpServer:
         if newcomer is not None:
             self._welcome(newcomer)
             return b""
+        self._last = None
+        if self._client is not None:  # before strangers, who may always have sent something
+            data = _read(self._client)
+            if data is None:
+                self._replace_client()
+            elif data:
+                return data
         for one in list(self._candidates):
-            try:
-                data = one.stream.read()
-            except OSError:
-                data = None
+            data = _read(one.stream, _CANDIDATE_CHUNK)
             if data is None:
                 self._drop(one)
             elif data:
@@ -149,17 +154,7 @@ class TcpServer:
                 self._candidates.append(one)
                 self._last, self._last_size = one, len(data)
                 return data
-        self._last = None
-        if self._client is None:
-            return b""
-        try:
-            data = self._client.read()
-        except OSError:
-            data = None
-        if data is None:
-            self._replace_client()
-            return b""
-        return data
+        return b""
 
     def shown(self, evidence: Shown) -> None:
         one = self._last
@@ -244,3 +239,11 @@ class TcpServer:
             client, self._client = self._client, newcomer
             if client:
                 client.close()
+
+
+def _read(stream: ByteStream, most: int = _CHUNK) -> bytes | None:
+    """What has come; None where the other side is gone."""
+    try:
+        return stream.read(most)
+    except OSError:
+        return None
