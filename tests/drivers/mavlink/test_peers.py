@@ -171,6 +171,23 @@ def test_calls_of_a_script_that_signs_have_a_port_each_and_none_waits_a_minute()
         assert {("script", number), ("station", 1)} <= set(peers.receivers(20, number * S))
 
 
+def test_a_known_peer_that_floods_keeps_no_newcomer_waiting() -> None:
+    known, newcomer, at = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3))
+    with known, newcomer, at:
+        at.bind(("127.0.0.1", 0))
+        port = UdpIn(at)
+        known.sendto(b"k", at.getsockname())
+        assert port.read() == b"k"
+        port.shown("sound")
+        known.sendto(b"k", at.getsockname())
+        newcomer.sendto(b"n", at.getsockname())
+        read = list[bytes | None]()
+        for _ in range(100):
+            read.append(port.read())
+            known.sendto(b"k", at.getsockname())
+        assert read.count(b"n") == 1
+
+
 def test_a_datagram_without_bytes_leaves_nobody_waiting() -> None:
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one,

@@ -45,6 +45,7 @@ _SCHEMES: dict[str, LinkKind] = {
 }
 _CHUNK = 65536
 _DRAINED = 512  # datagrams at once, so that the kernel's buffer holds those that come meanwhile
+_KNOWN_IN_A_ROW = 32  # then a stranger's turn comes: without a key anybody may be known, and flood
 _KERNEL_BYTES = 4 << 20
 _SO_RCVBUFFORCE = 33  # socket(7)
 _NO_DATAGRAM = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED)  # the last: no program listens there yet
@@ -279,6 +280,7 @@ class UdpIn(_Udp):
         super().__init__(sock)
         self._peers = Peers()
         self._known, self._strange = deque[tuple[bytes, Source]](), deque[tuple[bytes, Source]]()
+        self._in_a_row = 0
         self._waiting = Counter[Source]()  # in `_strange`: a peer that proves itself meanwhile keeps its order
         for option in (_SO_RCVBUFFORCE, socket.SO_RCVBUF):  # the first one passes the kernel's limit, where it may
             try:
@@ -290,9 +292,11 @@ class UdpIn(_Udp):
     def read(self) -> bytes | None:
         if not self._known and len(self._strange) < _DRAINED:
             self._drain()
-        if self._known:
+        if self._known and not (self._strange and self._in_a_row >= _KNOWN_IN_A_ROW):
+            self._in_a_row += 1
             self._last = self._known.popleft()
         elif self._strange:
+            self._in_a_row = 0
             self._last = self._strange.popleft()
             self._waiting[self._last[1]] -= 1
             if not self._waiting[self._last[1]]:  # strangers can have any number of addresses
