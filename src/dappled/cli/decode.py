@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite
+from dappled.cli.each_frame import each_frame
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
-from dappled.errors import DappledError, counted, printable
+from dappled.errors import DappledError, printable
 from dappled.products.exports import light_files
 
 
@@ -45,29 +43,19 @@ def run(arguments: argparse.Namespace) -> int:
     if not single:
         decode_arguments.refuse_same_names(arguments.frames, arguments.output, ".zarr")
         arguments.output.mkdir(parents=True, exist_ok=True)
-    bad = doubted = 0
-    for frame in tqdm(arguments.frames, unit="frame", disable=len(arguments.frames) < 2 or not sys.stderr.isatty()):
+
+    def decoded(frame: Path) -> bool:
         target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
-        try:
-            made = darkroom.decode(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
-            if not arguments.anyway:
-                _refuse_contradicted(frame, made)
-            light_files.save(target, made.light_field, overwrite=arguments.overwrite)
-            doubted += bool(made.doubts)
-            print(json.dumps(_facts(target, made)) if arguments.json else printable(f"{target}: {summary(made)}"))
-        except DappledError as error:
-            if single:
-                raise
-            bad += 1
-            print(printable(f"dappled decode: {error}"), file=sys.stderr)
-            if arguments.json:
-                print(json.dumps({"frame": str(frame), "error": str(error)}))
-    if bad:
-        print(f"{bad} of {counted(len(arguments.frames), 'frame')} could not be decoded", file=sys.stderr)
-    if doubted and not arguments.anyway:
-        which = "" if single else f", {doubted} of {counted(len(arguments.frames), 'frame')}"
-        print(f"dappled decode: written, but in doubt{which}: see above; --anyway accepts that", file=sys.stderr)
-    return 1 if bad or (doubted and not arguments.anyway) else 0
+        made = darkroom.decode(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
+        if not arguments.anyway:
+            _refuse_contradicted(frame, made)
+        light_files.save(target, made.light_field, overwrite=arguments.overwrite)
+        print(json.dumps(_facts(target, made)) if arguments.json else printable(f"{target}: {summary(made)}"))
+        return bool(made.doubts)
+
+    return each_frame(
+        "decode", arguments.frames, arguments, decoded, into_folder=not single, failure="could not be decoded"
+    )
 
 
 def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:

@@ -8,14 +8,13 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from dappled import durable, findings
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import OutputExistsError, add_overwrite
+from dappled.cli.each_frame import each_frame
 from dappled.cli.picture import places
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
-from dappled.errors import DappledError, counted
+from dappled.errors import DappledError, counted, printable
 from dappled.products.handover import picture_files
 
 
@@ -49,24 +48,12 @@ def run(arguments: argparse.Namespace) -> int:
             raise DappledError(f"{counted(len(frames), 'frame')} can't all be {arguments.output}: name a folder")
         decode_arguments.refuse_same_names(frames, arguments.output, f".{arguments.kind}")
         durable.make_folder(arguments.output)
-    bad = doubted = 0
-    for frame in tqdm(frames, unit="frame", disable=len(frames) < 2 or not sys.stderr.isatty()):
+
+    def pictured(frame: Path) -> bool:
         target = arguments.output if single else arguments.output / f"{frame.stem}.{arguments.kind}"
-        try:
-            doubted += _made(maker, frame, target, arguments)
-        except DappledError as error:
-            if single:
-                raise
-            bad += 1
-            print(f"dappled picture: {error}", file=sys.stderr)
-            if arguments.json:
-                print(json.dumps({"frame": str(frame), "error": str(error)}))
-    if bad:
-        print(f"{bad} of {counted(len(frames), 'frame')} gave no picture", file=sys.stderr)
-    if doubted and not arguments.anyway:
-        which = "" if single else f", {doubted} of {counted(len(frames), 'frame')}"
-        print(f"dappled picture: written, but in doubt{which}: see above; --anyway accepts that", file=sys.stderr)
-    return 1 if bad or (doubted and not arguments.anyway) else 0
+        return _made(maker, frame, target, arguments)
+
+    return each_frame("picture", frames, arguments, pictured, into_folder=not single, failure="gave no picture")
 
 
 def _made(maker: PictureMaker, frame: Path, target: Path, arguments: argparse.Namespace) -> bool:
@@ -80,8 +67,8 @@ def _made(maker: PictureMaker, frame: Path, target: Path, arguments: argparse.Na
     if arguments.sigma:
         durable.write_file(beside, picture_files.sigma_file(made))
     for one in findings.in_order(made.findings):
-        print(f"dappled picture: {findings.told(one)}", file=sys.stderr)
-    print(json.dumps(_facts(target, made)) if arguments.json else f"{target}: {summary(made)}")
+        print(printable(f"dappled picture: {findings.told(one)}"), file=sys.stderr)
+    print(json.dumps(_facts(target, made)) if arguments.json else printable(f"{target}: {summary(made)}"))
     return made.in_doubt
 
 
