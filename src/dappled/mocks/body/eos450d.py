@@ -210,9 +210,10 @@ class Eos450d:
 
     def _capture(self, triggered_ns: int, number: int, to_memory: bool) -> None:
         try:
+            opened_s = self._clock.utc_ns() // 10**9
             data, extension = self._expose(triggered_ns, number)
             with self._lock:
-                self._store(data, extension, number, to_memory)
+                self._store(data, extension, number, to_memory, opened_s + self._wrong_s)
         finally:
             self._done()
 
@@ -221,11 +222,10 @@ class Eos450d:
             self._working = False
             self._properties.announce(ptp.eos_status(0))
 
-    def _store(self, data: bytes, extension: str, number: int, to_memory: bool) -> None:
+    def _store(self, data: bytes, extension: str, number: int, to_memory: bool, taken_s: int) -> None:
         stem = f"IMG_{max(number - self._numbered, 1) % 10000:04d}"
         handle, parent = (2 * number, 0) if to_memory else (FOLDER + 2 * number, FOLDER)
         code = Format.JPEG if extension.lower() in ("jpg", "jpeg") else Format.RAW
-        taken_s = self._clock.utc_ns() // 10**9 + self._wrong_s
         made = [StoredObject(handle, parent, f"{stem}.{extension.upper()}", code, data, taken_s)]
         if self._properties.pairs:
             made.append(StoredObject(handle + 1, parent, f"{stem}.JPG", Format.JPEG, thumbnail(number), taken_s))
