@@ -77,6 +77,11 @@ def test_evidence_says_which_vehicle_counts(
     assert round(float(json.loads(shown.out)["tag"]["pose"]["latitude_rad"]) * 57.29577951, 1) == 20.0
 
 
+def test_a_vehicle_can_t_be_chosen_without_telemetry(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(frames), "--vehicle", "2"]) == 1
+    assert "there is no telemetry; leave it out" in capsys.readouterr().err
+
+
 def test_two_moving_vehicles_are_not_told_apart(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = logged(frames.parent, moving=(1, 2))
     assert main(["replay", str(frames), "--telemetry", str(log)]) == 1

@@ -209,6 +209,15 @@ def test_the_vehicle_is_chosen_where_the_flight_never_knew_whose_the_camera_was(
     assert "it holds vehicles 1 and 2" in capsys.readouterr().err
 
 
+def test_a_vehicle_can_t_be_chosen_without_its_telemetry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = flown_by_two(tmp_path)
+    (flight / "telemetry.tlog").unlink()
+    assert main(["geotag", str(flight), "--vehicle", "2"]) == 1
+    assert "no positions of vehicle 2: leave out --vehicle" in capsys.readouterr().err
+    assert not (flight / "geotags").exists()
+    assert main(["geotag", str(flight)]) == 0
+
+
 def test_the_vehicle_that_reports_a_camera_is_taken_and_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,7 +16,7 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import playback, replay
 from dappled.daemon.replay.playback import FlownWith
 from dappled.daemon.replay.replay import RecordedFlight, RecordedTelemetry, ReplayProgress
-from dappled.daemon.replay.vehicle_choice import vehicle_of
+from dappled.daemon.replay.vehicle_choice import VehicleError, vehicle_of
 from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
@@ -79,8 +79,9 @@ def add_missing(flight: Path, clock: Clock, key: SealKey | None, vehicle: int | 
         stack.enter_context(seals.work(folder, clock, "late tags", "tags frames in", key))
         last = max(_untagged(folder), default=-1)  # another process may have tagged them meanwhile
         recording = replay.of_flight(flight)
-        if vehicle is None and not recording.vehicles and recording.telemetry is not None:
-            vehicle, _ = vehicle_of(recording.telemetry, None)
+        followed = {system for _, system in recording.vehicles}
+        if followed != {vehicle} and not (followed and vehicle is None):
+            vehicle, _ = _logged(folder, vehicle)
         if vehicle is not None:
             recording = replace(recording, vehicles=[(0, vehicle)])
         recording = replace(recording, shots=[shot for shot in recording.shots if shot.index <= last])
@@ -101,9 +102,9 @@ def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None,
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as reader:
         followed, tags = {system for _, system in recorded_vehicles(reader)}, reader.tags()
-    if not folder.telemetry.is_file() or followed == {wanted} or (followed and wanted is None):
+    if followed == {wanted} or (followed and wanted is None):
         return None, []
-    system, told = vehicle_of(folder.telemetry, wanted)
+    system, told = _logged(folder, wanted)
     if system is None or (wanted is None and not told):
         return None, []
     facts = layout.read_facts(folder)
@@ -115,6 +116,17 @@ def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None,
         exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)
         made[tag.index] = replace(tag, pose=telemetry.pose(tag.index, exposure)[1])
     return made, told
+
+
+def _logged(folder: FlightFolder, wanted: int | None) -> tuple[int | None, list[Finding]]:
+    """See `vehicle_of`; None without telemetry. Raises VehicleError and FlightError."""
+    if folder.telemetry.is_file():
+        return vehicle_of(folder.telemetry, wanted)
+    if wanted is None:
+        return None, []
+    raise VehicleError(
+        f"{folder.telemetry} is missing, so there are no positions of vehicle {wanted}: leave out --vehicle"
+    )
 
 
 def _untagged(folder: FlightFolder) -> set[int]:

@@ -187,7 +187,8 @@ def _vehicle(telemetry: Path | None, vehicle: int | None) -> tuple[int | None, l
     if telemetry is not None and own_log(telemetry) is None:
         return vehicle_of(telemetry, vehicle)
     if vehicle is not None:
-        raise ReplayError("--vehicle is for a .tlog: there is no other vehicle in an autopilot's own log; leave it out")
+        why = "there is no telemetry" if telemetry is None else "there is no other vehicle in an autopilot's own log"
+        raise ReplayError(f"--vehicle is for a .tlog: {why}; leave it out")
     return None, []
 
 
