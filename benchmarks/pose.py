@@ -24,7 +24,7 @@ from typing import TypeVar
 from limits import show
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, Telemetry, navigation
-from dappled.daemon.navigation.clocks import TAGGING_RULES, exposure_from_camera, mid_exposure
+from dappled.daemon.navigation.clocks import exposure_from_camera, mid_exposure
 from dappled.daemon.navigation.navigation import position_at
 from dappled.daemon.navigation.samples import AttitudeSample, PositionSample, attitude, position
 from dappled.daemon.navigation.vehicle_history import ATTITUDE_GAP_NS, POSITION_GAP_NS
@@ -149,7 +149,7 @@ def _samples(log: File) -> tuple[list[PositionSample], list[AttitudeSample]]:
             continue
         if message.get_type() == "GLOBAL_POSITION_INT" and (place := position(number, stamp_us * 1000, message)):
             positions.append(place)
-        elif message.get_type() == "ATTITUDE" and (turned := attitude(number, stamp_us * 1000, message, TAGGING_RULES)):
+        elif message.get_type() == "ATTITUDE" and (turned := attitude(number, stamp_us * 1000, message)):
             attitudes.append(turned)
     return positions, attitudes
 

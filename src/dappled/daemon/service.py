@@ -40,7 +40,6 @@ from dappled.daemon.health.record import DecodingState
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
-from dappled.daemon.navigation.clocks import TAGGING_RULES
 from dappled.daemon.navigation.machine_clock import utc_known
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShots
@@ -150,7 +149,6 @@ class Service:
             "settings": configuration.to_tables(settings),
             "names": asdict(names),
             "decode_in_flight": recipe is not None,
-            "tagging_rules": TAGGING_RULES,
         }
         directory, key = Path(settings.record.directory), settings.record.seal_key
         self._recording = flights.begin(

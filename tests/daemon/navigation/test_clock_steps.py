@@ -24,8 +24,8 @@ LATENCY = BodyLatency(0.0, 1.0, "latency")
 class Vehicle:
     """Flies north at 10 m/s. Its telemetry comes at 10 Hz after 3 ms; it answers TIMESYNC at 5 Hz after 4 ms."""
 
-    def __init__(self, *, answers: bool = True, rules: int = clocks.TAGGING_RULES) -> None:
-        self.telemetry, self.answers, self.number = Telemetry(rules=rules), answers, 0
+    def __init__(self, *, answers: bool = True) -> None:
+        self.telemetry, self.answers, self.number = Telemetry(), answers, 0
 
     def feed(self, utc_ns: int, message: MavlinkMessage, component: int = 1) -> None:
         message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=component))
@@ -244,22 +244,3 @@ def test_an_absurd_answer_to_timesync_is_none(boot_ns: int) -> None:
     assert vehicle.telemetry.pose_at(START_NS + 10**9, 0.0).source == "none"
     assert vehicle.telemetry.utc_correction() is None
     assert vehicle.telemetry.boot_clock() is None
-
-
-@pytest.mark.parametrize("rules", [1, 2])
-def test_odometry_changes_nothing_in_old_flights(rules: int) -> None:
-    """They were pruned at packets that counted then; a window that reaches back further would lose others."""
-    found = []
-    for kind in (mavlink.MAVLink_odometry_message, None):
-        vehicle = Vehicle(rules=rules)
-        vehicle.fly(BootTime(drift=0.0), 0, 20)
-        vehicle.number = 200  # before the packet at which old samples are forgotten next
-        vehicle.fly(BootTime(drift=0.0), 20, 20.1)
-        vehicle.number = 1000
-        if kind is not None:
-            fixed = (1, 1, 12, 0, 0, 0, [1, 0, 0, 0], 0, 0, 0, 0, 0, 0)
-            vehicle.feed(START_NS + 300 * 10**9, kind(*fixed, [math.nan] * 21, [math.nan] * 21))
-        vehicle.number = 1001
-        found.append(vehicle.telemetry.pose_at(START_NS + 15 * 10**9, 0.0, upto_packet=1000))
-    assert found[0] == found[1]
-    assert found[0].source == "interpolated"

@@ -25,7 +25,7 @@ def mark(vehicle: Vehicle, count: int, at_s: float, sender: tuple[int, int] = (1
 
 def flown(*marks_s: float, sender: tuple[int, int] = (1, 220), pin: bool = False) -> Vehicle:
     """A vehicle whose camera exposes at 10.2 s; these marks are heard 0.1 s after they were."""
-    vehicle = Vehicle(BootTime(drift=0.0), (CameraPort("wire", pin=pin),), "ardupilot", rules=4)
+    vehicle = Vehicle(BootTime(drift=0.0), (CameraPort("wire", pin=pin),), "ardupilot")
     vehicle.fly(0, EXPOSED_S)
     if pin:
         vehicle.expose(EXPOSED_S - 0.06)
@@ -66,7 +66,7 @@ def test_a_contact_that_bounces_is_its_first_mark() -> None:
 @pytest.mark.parametrize("marked", [True, False])
 def test_a_body_that_the_autopilot_fires_by_wire_has_the_time_of_its_mark(personality: str, marked: bool) -> None:
     """Its hot shoe leads to the receiver: the autopilot has the time of its command only, ± the body's latency."""
-    vehicle = Vehicle(BootTime(drift=0.0), (CameraPort("wire"),), personality, rules=4)
+    vehicle = Vehicle(BootTime(drift=0.0), (CameraPort("wire"),), personality)
     vehicle.fly(0, EXPOSED_S)
     vehicle.expose(EXPOSED_S - 0.06)
     if marked:

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.navigation import Telemetry
-from dappled.daemon.navigation.clocks import TAGGING_RULES
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.flight import digest, log_reading
@@ -36,10 +35,9 @@ def telemetry_of(
     rate_hz: float = 10.0,
     seconds: float = 60.0,
     delay_s: Callable[[], float] = lambda: 0.003,
-    rules: int = TAGGING_RULES,
 ) -> Telemetry:
     """What is known of a simulated flight, `changed` (by time and true pose) in its telemetry."""
-    telemetry, at_us = Telemetry(rules=rules), 0
+    telemetry, at_us = Telemetry(), 0
     for number, (t_s, message) in enumerate(messages(path, changed, rate_hz, seconds)):
         at_us = max(at_us, START_NS // 1000 + round((t_s + delay_s()) * 1e6))
         telemetry.feed(number, at_us, message)
@@ -165,15 +163,6 @@ def test_a_jump_is_told_for_a_minute_and_once() -> None:
     assert [problems.among([text]) for text in (told, other)] == [[told], []]
     good = telemetry_of()
     assert (good.doubts(after_ns), good.statistics().jumps) == ((), 0)
-
-
-def test_a_flight_of_older_rules_keeps_its_poses() -> None:
-    old, plain = (telemetry_of(changed=stepped(by_m), rules=4) for by_m in (30.0, 0.0))
-    for t_s in (AT_S - 5, AT_S + 1):
-        assert sigma_m(old, t_s) == pytest.approx(sigma_m(plain, t_s), abs=1e-6)
-        assert sigma_m(old, t_s) < 1
-    assert digest(at(old, AT_S - 5)) == digest(at(plain, AT_S - 5))
-    assert sigma_m(telemetry_of(changed=stepped(30.0)), AT_S + 1) > 29
 
 
 def test_a_replay_that_read_on_past_a_jump_gets_the_pose_from_before_it() -> None:

@@ -6,7 +6,6 @@ import pytest
 
 from dappled.config.settings import CameraSettings, MavlinkSettings
 from dappled.daemon.navigation import BodyLatency, ExposureTime, Telemetry, clocks
-from dappled.daemon.replay import replay
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.flight import Cause, Shot
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
@@ -22,11 +21,9 @@ WIRED = CameraPort("wire", pin=True)
 class Vehicle:
     """A vehicle with a camera on a wire, and what the daemon hears of it. `heard` are (message, when)."""
 
-    def __init__(
-        self, boot: BootTime, cameras: tuple[CameraPort, ...], personality: str, cam_idx: int = 0, rules: int = 2
-    ) -> None:
+    def __init__(self, boot: BootTime, cameras: tuple[CameraPort, ...], personality: str, cam_idx: int = 0) -> None:
         self.boot, self.pose = boot, FlightPath(3).pose(0.0)
-        self.telemetry = Telemetry(cam_idx=cam_idx, rules=rules)
+        self.telemetry = Telemetry(cam_idx=cam_idx)
         self.autopilot = CameraTriggers(personality, cameras)
         self.heard: list[tuple[MavlinkMessage, int]] = []
         self._number = 0
@@ -158,20 +155,3 @@ def test_what_a_trigger_creates_and_the_settings_that_say_so() -> None:
         assert (clocks.owned(exposure, shot, outside).trigger is not None) == kind.startswith("CAMERA")
     assert [MavlinkSettings(component_id=one).cam_idx for one in (100, 101, 105, 42)] == [0, 1, 5, 0]
     assert MavlinkSettings(component_id=101, autopilot_camera=1).cam_idx == 0
-
-
-def test_a_flight_from_before_the_rules_had_a_number_is_tagged_by_the_old_ones() -> None:
-    """Any camera's report within 4 σ + 50 ms was the exposure's, and the attitude's σ that of the interpolation."""
-    found = {}
-    for rules in (1, clocks.TAGGING_RULES):
-        vehicle = Vehicle(BootTime(drift=0.0), (WIRED, WIRED), "ardupilot", rules=rules)
-        vehicle.fly(0, 8)
-        vehicle.expose(8.0, camera=1)
-        vehicle.fly(8.2, 10)
-        called_ns = START_NS + 8 * 10**9 - 75 * MS
-        shot = Shot(0, Cause("mavlink:1/1", "CAMERA_FEEDBACK", 1), called_ns, called_ns)
-        expected = clocks.mid_exposure(called_ns, LATENCY, None)
-        exposure, pose = vehicle.telemetry.locate(clocks.owned(expected, shot, LATENCY))
-        found[rules] = exposure.source.partition(";")[0], pose.attitude_sigma_rad is None
-    assert found == {1: ("hot shoe (CAMERA_FEEDBACK)", False), clocks.TAGGING_RULES: ("wish + body latency", True)}
-    assert [replay.tagging_rules(facts) for facts in ({}, {"tagging_rules": 2}, {"tagging_rules": "x"})] == [1, 2, 1]

@@ -270,9 +270,9 @@ def test_a_gimbal_that_begins_anew_and_one_that_says_nothing() -> None:
 def test_the_clock_is_fitted_once_while_nothing_better_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
     fits: list[int] = []
 
-    def counted(arrivals: list[tuple[int, int]], rules: int) -> object:
+    def counted(arrivals: list[tuple[int, int]]) -> object:
         fits.append(len(arrivals))
-        return from_arrivals(arrivals, rules)
+        return from_arrivals(arrivals)
 
     monkeypatch.setattr("dappled.daemon.navigation.vehicle_history.from_arrivals", counted)
     link = Link()

@@ -375,16 +375,3 @@ def test_an_answer_to_timesync_that_can_t_be_true_is_counted() -> None:
         telemetry.feed(number + 1, now_us + 900, made(mavlink.MAVLink_timesync_message(time_ns, now_us * 1000)))
         now_us, number = now_us + 10_000, number + 2
     assert telemetry.statistics().impossible == 2
-
-
-def test_a_flight_of_older_rules_keeps_the_poses_that_it_was_tagged_with() -> None:
-    packets = recording(FlightPath(3), 4.0)
-    wrong = mavlink.MAVLink_global_position_int_message(BOOT.ns(2.05) // 10**6, FAR, FAR, 0, 0, 0, 0, 0, 0)
-    packets = numbered([*((stamp, one) for _, stamp, one in packets), (START_NS // 1000 + 2_050_600, made(wrong))])
-    places = {}
-    for rules in (3, 4):
-        telemetry = Telemetry(rules=rules)
-        for packet in packets:
-            telemetry.feed(*packet)
-        places[rules] = telemetry.pose_at(START_NS + 2_070_000_000, 0.0).latitude_rad
-    assert places[3] != places[4]

@@ -33,9 +33,7 @@ log = logging.getLogger(__name__)
 CONTACT_SOURCE = "hot shoe"
 LATENCY_SOURCE = "trigger call + body latency"
 REQUEST_SOURCE = "wish + body latency"
-TAGGING_RULES = 7  # recorded with each flight. 1: those of flights that were recorded without a number
 _UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
-_REACH_1_NS = 50_000_000
 CAMERA_SOURCE = "camera clock (EXIF)"
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
@@ -229,7 +227,7 @@ def from_few(answers: Sequence[TimesyncAnswer]) -> BootClock:
     return BootClock("timesync", best.boot_ns, best.offset_ns, 0.0, sigma_ns)
 
 
-def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer, rules: int = TAGGING_RULES) -> int | None:
+def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> int | None:
     """By how much UTC − boot time has changed since the last of `answers`, where a steady clock can't give `new`; else
     None.
 
@@ -239,7 +237,7 @@ def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer, rules: int =
     """
     for old in reversed(answers):
         apart_ns = new.stamp_ns - old.stamp_ns
-        if apart_ns > _STEP_LOOK_NS and (rules < 3 or old is not answers[-1]):
+        if apart_ns > _STEP_LOOK_NS and old is not answers[-1]:
             break
         most_ns = (old.delay_ns + new.delay_ns) / 2 + _STEADY * apart_ns + _STEP_FLOOR_NS
         if abs(new.offset_ns - old.offset_ns) > most_ns:
@@ -255,7 +253,7 @@ def _line(x: Floats, y: Floats, weight: Floats) -> tuple[Floats, Floats, Floats]
     return found, inverse, y - found @ sides
 
 
-def from_arrivals(arrivals: Sequence[tuple[int, int]], rules: int = TAGGING_RULES) -> BootClock | None:
+def from_arrivals(arrivals: Sequence[tuple[int, int]]) -> BootClock | None:
     """Take the least of (arrival − boot time) over `arrivals`, pairs (boot_ns, received_utc_ns); None from none.
 
     It is late by the delay of the quickest packet, which can't be observed: sigma allows 5 ms for it, and a tenth of
@@ -268,19 +266,16 @@ def from_arrivals(arrivals: Sequence[tuple[int, int]], rules: int = TAGGING_RULE
     since_ns = max(received for _, received in arrivals) - _RECENT_NS
     later_ns = min(received - boot for boot, received in arrivals if received >= since_ns) - offsets[0]
     median_excess = offsets[len(offsets) // 2] - offsets[0]
-    parts = (_ARRIVAL_FLOOR_NS, 0.1 * median_excess, later_ns)
-    sigma_ns = math.hypot(*parts) if rules > 1 else math.hypot(*parts[:2])
+    sigma_ns = math.hypot(_ARRIVAL_FLOOR_NS, 0.1 * median_excess, later_ns)
     return BootClock("arrival", arrivals[-1][0], offsets[0], 0.0, sigma_ns)
 
 
-def reach_ns(exposure: ExposureTime, rules: int = TAGGING_RULES) -> int:
+def reach_ns(exposure: ExposureTime) -> int:
     """How far from its expected time an exposure may be."""
-    return _REACH_SIGMAS * exposure.sigma_ns + (_REACH_NS if rules > 1 else _REACH_1_NS)
+    return _REACH_SIGMAS * exposure.sigma_ns + _REACH_NS
 
 
-def choose_feedback(
-    events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock, rules: int = TAGGING_RULES
-) -> Feedback | None:
+def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: BootClock) -> Feedback | None:
     """Choose the contact of this exposure; None where there is none.
 
     It is the one nearest to when the exposure was expected to begin, within 4 σ + 10 ms of that (σ of the body and of
@@ -290,17 +285,16 @@ def choose_feedback(
     Contacts that the clocks can't tell from the trigger call are not chosen, but compete: without them the next shot's
     would be the nearest. By a clock in doubt none is chosen.
     """
-    if exposure.called_utc_ns is None or (rules > 2 and clock.doubt):
+    if exposure.called_utc_ns is None or clock.doubt:
         return None
-    within_ns = reach_ns(exposure, rules) + _REACH_SIGMAS * clock.sigma_ns
+    within_ns = reach_ns(exposure) + _REACH_SIGMAS * clock.sigma_ns
     expected_ns = clock.boot_ns(exposure.utc_ns - exposure.half_ns)
     # command and contact can be told apart no better than the clocks agree
     called_ns = clock.boot_ns(exposure.called_utc_ns)
     earliest_ns = called_ns + max(_AFTER_CALL_NS, 3 * clock.sigma_ns)
-    told = _contacts(events, earliest_ns, expected_ns + within_ns, rules)
-    if rules > 2:
-        since_ns = called_ns + _AFTER_CALL_NS - 3 * clock.sigma_ns
-        told += [one for one in events if one.contact and since_ns <= one.boot_ns < earliest_ns]
+    told = _contacts(events, earliest_ns, expected_ns + within_ns)
+    since_ns = called_ns + _AFTER_CALL_NS - 3 * clock.sigma_ns
+    told += [one for one in events if one.contact and since_ns <= one.boot_ns < earliest_ns]
     near = sorted(
         (abs(event.boot_ns - expected_ns), event.number, event)
         for event in told
@@ -314,18 +308,17 @@ def choose_feedback(
     return near[0][2] if near[0][2].boot_ns >= earliest_ns else None
 
 
-def _contacts(events: Sequence[Feedback], earliest_ns: float, latest_ns: float, rules: int) -> list[Feedback]:
+def _contacts(events: Sequence[Feedback], earliest_ns: float, latest_ns: float) -> list[Feedback]:
     """The contacts between two times since boot. Where one is reported again as it bounces, only its first."""
-    bounce_ns = _BOUNCE_NS if rules > 2 else 0
     near = [one for one in events if one.contact and earliest_ns <= one.boot_ns <= latest_ns]
     return [
         one
         for one in near
-        if not any(one.repeats(other) and 0 < one.boot_ns - other.boot_ns <= bounce_ns for other in near)
+        if not any(one.repeats(other) and 0 < one.boot_ns - other.boot_ns <= _BOUNCE_NS for other in near)
     ]
 
 
-def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage, rules: int = TAGGING_RULES) -> Feedback | None:
+def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage) -> Feedback | None:
     """The message that created a shot, among those of the log; None where it had no time that can be used.
 
     The last time with its number: while ArduPilot waits for a contact, another camera's report repeats the number of
@@ -337,8 +330,6 @@ def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage, rules: int
         if (event.kind, event.image) == (trigger.kind, trigger.number)
         and abs(event.stamp_ns - trigger.heard_utc_ns) < _OWN_NS
     )
-    if rules < 3:
-        return mine[-1][2] if mine else None
     return next((event for boot_ns, _, event in mine if mine[-1][0] - boot_ns <= _BOUNCE_NS), None)
 
 

@@ -17,7 +17,6 @@ from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import (
     CONTACT_SOURCE,
-    TAGGING_RULES,
     BootClock,
     ExposureTime,
     UtcLearner,
@@ -40,7 +39,7 @@ from dappled.daemon.navigation.samples import (
     TelemetryStatistics,
     UtcCorrection,
 )
-from dappled.daemon.navigation.vehicle_history import SINCE_RULES, TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
+from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
     Pose,
@@ -78,8 +77,7 @@ class Telemetry:
 
     `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
     (see AutopilotTime), `cam_idx` our camera's number in CAMERA_FEEDBACK. `attitude_sigma_rad` is how well the
-    autopilot knows its attitude, where it doesn't say; 0 is not known. `rules` are those of the flight
-    (`TAGGING_RULES`). All methods may be called from any thread.
+    autopilot knows its attitude, where it doesn't say; 0 is not known. All methods may be called from any thread.
     """
 
     def __init__(
@@ -89,14 +87,13 @@ class Telemetry:
         component_id: int = 100,
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
-        rules: int = TAGGING_RULES,
     ) -> None:
-        self._turns, self._rules = deque(vehicles), rules
+        self._turns = deque(vehicles)
         self._component_id, self._cam_idx, self._attitude_sigma_rad = component_id, cam_idx, attitude_sigma_rad
         self._lock = threading.Lock()
         self._packets = self._prune_at = 0
         self._counts = Counts()
-        self._history = VehicleHistory(None, component_id, self._counts, cam_idx=cam_idx, rules=rules)
+        self._history = VehicleHistory(None, component_id, self._counts, cam_idx=cam_idx)
 
     def feed(self, number: int, stamp_us: int, message: MavlinkMessage) -> None:
         """Take one packet. Numbers must rise. Messages that are not used only count."""
@@ -104,12 +101,10 @@ class Telemetry:
             while self._turns and self._turns[0][0] <= number:
                 _, system_id = self._turns.popleft()
                 if system_id != self._history.system_id:
-                    self._history = VehicleHistory(
-                        system_id, self._component_id, self._counts, cam_idx=self._cam_idx, rules=self._rules
-                    )
+                    self._history = VehicleHistory(system_id, self._component_id, self._counts, cam_idx=self._cam_idx)
             self._packets = number + 1
             kind = message.get_type()
-            if kind not in USED_MESSAGES or self._rules < SINCE_RULES.get(kind, 1):
+            if kind not in USED_MESSAGES:
                 return
             self._history.feed(number, stamp_us * 1000, message)
             if number >= self._prune_at:  # by packets that the flight used as well
@@ -153,7 +148,7 @@ class Telemetry:
         Samples from after it have arrived, and everything that an autopilot which reports the hot shoe, or a receiver
         that sends marks, could report about this exposure.
         """
-        later_ns = reach_ns(exposure, self._rules) if self._counts.feedbacks else 0
+        later_ns = reach_ns(exposure) if self._counts.feedbacks else 0
         here = not self._counts.marks or self.locate(exposure)[0].source.startswith(CONTACT_SOURCE)
         return self.bracketed(exposure.utc_ns + (later_ns if here else max(later_ns, _MARK_COMES_NS)))
 
@@ -169,10 +164,9 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit, exposure.utc_ns)
             events = self._history.feedbacks(limit, exposure.utc_ns)
-        rules, event = self._rules, None
-        trigger = exposure.trigger if rules > 1 else None
+        event, trigger = None, exposure.trigger
         if clock is not None:
-            event = own_feedback(events, trigger, rules) if trigger else choose_feedback(events, exposure, clock, rules)
+            event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock)
         if clock is None or event is None:
             exposure = unseen(exposure) if trigger else exposure
             pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
@@ -182,11 +176,10 @@ class Telemetry:
             better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock, events)
         else:
             better, boot_ns = refine(exposure, event, clock)
-        if rules > 2 and not clock.doubt:  # the better time may be next to a step, where the expected one was not
+        if not clock.doubt:  # the better time may be next to a step, where the expected one was not
             with self._lock:
                 clock = self._history.clock(limit, better.utc_ns) or clock
-        by = clock if rules > 2 else None
-        pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns, clock=by)
+        pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns, clock=clock)
         return in_doubt(better, clock), pose
 
     def pose_at(
@@ -215,9 +208,9 @@ class Telemetry:
             if boot_ns is None:
                 boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
             else:  # where the clock stepped, the samples around that time may not be those of the exposure
-                sigma_ns = math.hypot(utc_sigma_ns, clock.sigma_ns if clock.doubt and self._rules > 2 else 0.0)
+                sigma_ns = math.hypot(utc_sigma_ns, clock.sigma_ns if clock.doubt else 0.0)
             at = self._history.around(utc_ns, boot_ns, sigma_ns, limit, placed=not clock.doubt)
-        return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad, rules=self._rules)
+        return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
 
     def rates(self, pose: Pose) -> Vector3 | None:
         """The body's turn rates at a pose, rad/s about its own axes, from the packets that the pose was made from; None
@@ -331,7 +324,7 @@ def recorded_vehicles(ledger: LedgerReader) -> list[tuple[int, int]]:
     return [(packet, system_id) for packet, system_id in ledger.facts().get(_VEHICLES, [])]
 
 
-def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, rules: int = TAGGING_RULES) -> Pose:
+def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
     """The pose at an instant, from `packets` packets.
 
     Position: cubic Hermite with the reported velocities. Attitude and gimbal: slerp. With one sample only, that one,
@@ -341,7 +334,7 @@ def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0, ru
     (without either the attitude's are None).
     """
     sigma_s = math.hypot(at.sigma_ns, HALF_MS_NS / math.sqrt(3)) / 1e9
-    attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad, rules)
+    attitude, attitude_sigma, attitude_covariance = _attitude(at, sigma_s, attitude_sigma_rad)
     gimbal, gimbal_source = _gimbal(at, attitude)
     made = replace(
         Pose.unknown(at.utc_ns, packets),
@@ -444,18 +437,15 @@ def attitude_at(samples: Sequence[AttitudeSample], boot_ns: int) -> tuple[Quater
     return slerp(a.attitude, b.attitude, share), doubt
 
 
-def _attitude(
-    at: Around, sigma_s: float, own_rad: float, rules: int
-) -> tuple[Quaternion | None, float | None, Symmetric | None]:
+def _attitude(at: Around, sigma_s: float, own_rad: float) -> tuple[Quaternion | None, float | None, Symmetric | None]:
     """Attitude, σ of the whole rotation, and the covariance where the body's rates are known."""
     samples = at.attitudes
     if not samples:
         return None, None, None
     found, doubt = attitude_at(samples, at.boot_ns)
-    reported_rad = max((sample.sigma_rad for sample in samples if sample.sigma_rad is not None), default=own_rad)
-    if rules > 2:  # a filter doesn't know of its compass's error, the user may
-        reported_rad = max(reported_rad, own_rad)
-    if reported_rad <= 0 and rules > 1:
+    # a filter doesn't know of its compass's error, the user may
+    reported_rad = max(own_rad, *(sample.sigma_rad or 0.0 for sample in samples))
+    if reported_rad <= 0:
         return found, None, None  # the error of the interpolation alone says nothing about the autopilot's own
     rates = max((s.rates_rad_s for s in samples if s.rates_rad_s is not None), key=norm, default=None)
     if len(samples) == 1:

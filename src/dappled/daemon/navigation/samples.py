@@ -255,13 +255,13 @@ def boot_ns(message: MavlinkMessage) -> int:
     return int(message.time_boot_ms) * 10**6 + HALF_MS_NS
 
 
-def is_impossible(message: MavlinkMessage, rules: int = 7) -> bool:
+def is_impossible(message: MavlinkMessage) -> bool:
     """Whether a position or an attitude can't be true: off the globe (as MAVLink's 2147483647 for unknown), higher or
-    lower than 100 km, faster than 300 m/s, or not finite. By the flight's `TAGGING_RULES`."""
+    lower than 100 km, faster than 300 m/s, or not finite."""
     kind = message.get_type()
     if kind == "GLOBAL_POSITION_INT":
         heights = abs(message.alt), abs(message.relative_alt)
-        if rules > 6 and max(abs(message.vx), abs(message.vy), abs(message.vz)) > 100 * FASTEST_M_S:
+        if max(abs(message.vx), abs(message.vy), abs(message.vz)) > 100 * FASTEST_M_S:
             return True
         return bool(abs(message.lat) > 90 * 10**7 or abs(message.lon) > 180 * 10**7 or max(heights) > _HIGHEST_MM)
     if kind == "ATTITUDE":
@@ -297,8 +297,8 @@ def first_position_utc_ns(packets: Iterable[tuple[int, int, MavlinkMessage]]) ->
     return None
 
 
-def attitude(number: int, stamp_ns: int, message: MavlinkMessage, rules: int) -> AttitudeSample | None:
-    """An attitude message, by the flight's `TAGGING_RULES`; None while the autopilot has no attitude (NaN or zeros)."""
+def attitude(number: int, stamp_ns: int, message: MavlinkMessage) -> AttitudeSample | None:
+    """An attitude message; None while the autopilot has no attitude (NaN or zeros)."""
     kind, sigma_rad = message.get_type(), None
     if kind == "ATTITUDE":
         turned = from_euler(message.roll, message.pitch, message.yaw)
@@ -306,10 +306,7 @@ def attitude(number: int, stamp_ns: int, message: MavlinkMessage, rules: int) ->
         turned = (message.q1, message.q2, message.q3, message.q4)
     else:
         turned = tuple(message.q)
-        variances = [message.covariance[place] for place in (0, 4, 8)]
-        sigma_rad = _whole_sigma(variances)
-        if rules < 3:
-            sigma_rad = math.sqrt(sum(variances)) if sum(variances) > 0 else None  # NaN: not known
+        sigma_rad = _whole_sigma([message.covariance[place] for place in (0, 4, 8)])
     try:
         turned = normalised(*turned)
     except ValueError:
@@ -389,9 +386,7 @@ def _scaled(value: int, unknown: int, parts: int) -> float | None:
     return value / parts if 0 < value < unknown else None
 
 
-def feedback_boot_ns(
-    message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int, *, unwrap: bool = True
-) -> int | None:
+def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int) -> int | None:
     """The message's time since boot. None for 0, which is no time, and for a GPS time before SYSTEM_TIME has given the
     offset.
 
@@ -403,7 +398,7 @@ def feedback_boot_ns(
         return None
     if time_us >= EPOCH_US:
         return None if unix_minus_boot_ns is None else time_us * 1000 - unix_minus_boot_ns
-    if unwrap and message.get_type() == "CAMERA_FEEDBACK" and time_us < WRAP_US:
+    if message.get_type() == "CAMERA_FEEDBACK" and time_us < WRAP_US:
         time_us += max(0, round((now_boot_ns // 1000 - time_us) / WRAP_US)) * WRAP_US
     return time_us * 1000
 
@@ -416,17 +411,16 @@ def feedback(
     unix_minus_boot_ns: int | None,
     *,
     mark: bool,
-    older: bool,
 ) -> Feedback | None:
     """The message as a Feedback; None where its time is unknown or further from now than `NEAREST_NS`. `mark`: see
-    `is_mark`; `older`: by the first tagging rules."""
+    `is_mark`."""
     if now_boot_ns is None:
         return None
-    boot_ns = feedback_boot_ns(message, unix_minus_boot_ns, now_boot_ns, unwrap=not older)
+    boot_ns = feedback_boot_ns(message, unix_minus_boot_ns, now_boot_ns)
     if boot_ns is None or abs(boot_ns - now_boot_ns) > NEAREST_NS:
         return None
     by_pin, time_us = message.get_type() == "CAMERA_FEEDBACK", int(message.time_usec)
-    contact = older or mark or (by_pin and time_us < EPOCH_US)
+    contact = mark or (by_pin and time_us < EPOCH_US)
     image = message.img_idx if by_pin else message.seq
     return Feedback(number, stamp_ns, boot_ns, MARK if mark else message.get_type(), image, contact, time_us)
 

@@ -14,7 +14,6 @@ from typing import Any
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.autopilot_utc import AutopilotUtc
 from dappled.daemon.navigation.clocks import (
-    TAGGING_RULES,
     BootClock,
     TimesyncAnswer,
     from_arrivals,
@@ -69,8 +68,8 @@ class AutopilotTime:
     better observation has arrived.
     """
 
-    def __init__(self, component_id: int, rules: int = TAGGING_RULES) -> None:
-        self._component_id, self._rules = component_id, rules
+    def __init__(self, component_id: int) -> None:
+        self._component_id = component_id
         self._answers: list[TimesyncAnswer] = []
         self._requests: dict[int, int] = {}
         self._epochs = [Epoch(0, 0, 0)]
@@ -102,7 +101,7 @@ class AutopilotTime:
             self.now_boot_ns = boot_ns
         self._back_since_ns = None
         self.now_boot_ns = boot_ns if self.now_boot_ns is None else max(self.now_boot_ns, boot_ns)
-        if self._rules > 3 and not (self._answers and stamp_ns - self._answers[-1].stamp_ns < _SILENT_NS):
+        if not (self._answers and stamp_ns - self._answers[-1].stamp_ns < _SILENT_NS):
             before_ns = self._arrivals.last_ns
             by_ns = self._arrivals.sooner_ns(stamp_ns, boot_ns)
             if by_ns is not None:
@@ -143,8 +142,6 @@ class AutopilotTime:
         """Which epoch: the last one below `limit`, or that of an instant; between two, where either may be right, the
         later one."""
         at = max(0, bisect_left(self._epochs, limit, key=lambda one: one.number) - 1)
-        if self._rules < 2:
-            return at
         while utc_ns is not None and at > 0 and utc_ns <= self._epochs[at].before_ns:
             at -= 1
         return at
@@ -176,14 +173,13 @@ class AutopilotTime:
         if message.ts1 not in self._requests or not from_autopilot:
             return False
         answer = TimesyncAnswer(number, message.ts1, stamp_ns, message.tc1)
-        least = 0 if self._rules > 2 else -_MOST_BOOT_NS
-        if answer.delay_ns < 0 or not least < message.tc1 < _MOST_BOOT_NS:
+        if answer.delay_ns < 0 or not 0 < message.tc1 < _MOST_BOOT_NS:
             return True
         if self.now_boot_ns is not None and message.tc1 < self.now_boot_ns - REBOOT_BACK_NS:
             return False  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
         known = between(self._answers[-_LOOKED_AT:], self._epochs[-1].number, number)
-        by_ns = step_ns(known, answer, self._rules) if self._rules > 1 else None
+        by_ns = step_ns(known, answer)
         if by_ns is not None:
             self._epochs.append(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns))
         self._answers.append(answer)
@@ -224,9 +220,7 @@ class AutopilotTime:
                 return clock
         tails = [latest(between(one, first, limit), ARRIVAL_WINDOW_NS) for one in histories]
         key: _FitKey = ("arrival", first, *(tail[-1].number for tail in tails if tail))
-        return self._fit(
-            key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail], self._rules)
-        )
+        return self._fit(key, lambda: from_arrivals([(one.boot_ns, one.stamp_ns) for tail in tails for one in tail]))
 
     def _fit(self, key: _FitKey, make: Callable[[], BootClock | None]) -> BootClock | None:
         if self._fitted[0] != key:
@@ -247,8 +241,7 @@ class AutopilotTime:
 class Gimbals:
     """Attitudes of the first gimbal heard."""
 
-    def __init__(self, rules: int = TAGGING_RULES) -> None:
-        self._rules = rules
+    def __init__(self) -> None:
         self._samples: list[GimbalSample] = []
         self.seen = 0
 
@@ -273,7 +266,7 @@ class Gimbals:
         samples = [sample for sample in known if sample.epoch == known[-1].epoch]
         if samples and samples[0].component != _AUTOPILOT:
             arrivals = [(one.boot_ns, one.stamp_ns) for one in latest(samples, ARRIVAL_WINDOW_NS)]
-            clock = from_arrivals(arrivals, self._rules)
+            clock = from_arrivals(arrivals)
             assert clock is not None
             boot_ns = clock.boot_ns(utc_ns)
         return around_instant(samples, boot_ns, gap_ns=GIMBAL_GAP_NS), boot_ns
@@ -297,11 +290,10 @@ class VehicleHistory:
         counts: Counts,
         *,
         cam_idx: int = 0,
-        rules: int = TAGGING_RULES,
     ) -> None:
-        self.system_id, self.counts, self._cam_idx, self._rules = system_id, counts, cam_idx, rules
-        self.time = AutopilotTime(component_id, rules)
-        self.gimbals = Gimbals(rules)
+        self.system_id, self.counts, self._cam_idx = system_id, counts, cam_idx
+        self.time = AutopilotTime(component_id)
+        self.gimbals = Gimbals()
         self._positions: list[PositionSample] = []
         self._finder, self._jumps = JumpFinder(), list[Jump]()
         self._attitudes: list[AttitudeSample] = []
@@ -376,7 +368,7 @@ class VehicleHistory:
         if sample is not None and self._believed(sample, message, self._positions):
             self.counts.positions += 1
             keep(self._positions, sample)
-            jump = self._finder.jump(sample, self.time.first(number + 1)) if self._rules > 4 else None
+            jump = self._finder.jump(sample, self.time.first(number + 1))
             if jump is not None:
                 self.counts.jumped(stamp_ns, norm(jump.by_m))
                 keep(self._jumps, jump)
@@ -384,7 +376,7 @@ class VehicleHistory:
     def _attitude(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._refuses(stamp_ns, message):
             return
-        sample = telemetry_samples.attitude(number, stamp_ns, message, self._rules)
+        sample = telemetry_samples.attitude(number, stamp_ns, message)
         told_rad, told_ns = self._attitude_sigma
         if sample is not None and sample.sigma_rad is None and stamp_ns - told_ns <= _ALIVE_NS:
             sample = replace(sample, sigma_rad=told_rad)
@@ -419,18 +411,18 @@ class VehicleHistory:
 
     def _feedback(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         """ArduPilot reports every camera at each trigger of one: only our camera's message counts."""
-        by_pin, older = message.get_type() == "CAMERA_FEEDBACK", self._rules < 2
+        by_pin = message.get_type() == "CAMERA_FEEDBACK"
         mark = telemetry_samples.is_mark(message, self.system_id)
-        if not (mark or self._ours(message)) or (by_pin and message.cam_idx != self._cam_idx and not older):
+        if not (mark or self._ours(message)) or (by_pin and message.cam_idx != self._cam_idx):
             return
         clock = self.time
         found = telemetry_samples.feedback(
-            number, stamp_ns, message, clock.now_boot_ns, clock.unix_minus_boot_ns, mark=mark, older=older
+            number, stamp_ns, message, clock.now_boot_ns, clock.unix_minus_boot_ns, mark=mark
         )
         if found is None:
             return
         told = self._feedbacks[-_REPEATS:]
-        if not older and any(one.time_us == found.time_us and one.image != found.image for one in told):
+        if any(one.time_us == found.time_us and one.image != found.image for one in told):
             return  # the report of another camera repeats this one's last time, with the number of a trigger to come
         self.counts.feedbacks += 1
         self.counts.marks += mark
@@ -438,7 +430,7 @@ class VehicleHistory:
 
     def _refuses(self, stamp_ns: int, message: MavlinkMessage) -> bool:
         """Whether it can't be true. Our own vehicle's are counted."""
-        if self._rules < 4 or not telemetry_samples.is_impossible(message, self._rules):
+        if not telemetry_samples.is_impossible(message):
             return False
         if message.get_srcComponent() == 1 and message.get_srcSystem() == self.system_id:
             self.counts.refuse(stamp_ns)
@@ -489,4 +481,3 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "CAMERA_TRIGGER": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)
-SINCE_RULES = {"ODOMETRY": 3, "DISTANCE_SENSOR": 6, "TERRAIN_REPORT": 6, "GPS2_RAW": 7}  # others: since the first

@@ -21,7 +21,7 @@ from dappled.config import settings as configuration
 from dappled.daemon.navigation import BodyLatency, clocks, recorded_vehicles
 from dappled.daemon.pipeline import tagging
 from dappled.daemon.pipeline.tagging import Zoom
-from dappled.daemon.replay.replay import RecordedTelemetry, tagging_rules
+from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.drivers.camera import CameraError
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
@@ -161,7 +161,7 @@ def bring(
     with LedgerReader.open(folder.ledger) as reader:
         turns = recorded_vehicles(reader)
     log = folder.telemetry if folder.telemetry.is_file() else None
-    telemetry = RecordedTelemetry.flown(settings, log, {}, turns, rules=tagging_rules(facts))
+    telemetry = RecordedTelemetry.flown(settings, log, {}, turns)
     frames: list[Frame] = []
     zooms: list[str] = []
     companions = 0

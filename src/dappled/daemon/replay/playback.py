@@ -68,7 +68,6 @@ def run(
             recording.telemetry,
             recording.horizons,
             recording.vehicles,
-            rules=recording.rules,
             report=report,
             bounds=recording.bounds,
         )

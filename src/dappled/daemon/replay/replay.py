@@ -10,13 +10,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from time import sleep
-from typing import Any, Self
+from typing import Self
 
 from dappled import __version__, confined, durable, picture_order
 from dappled.clock import RecordedClock, TimeOfDayClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
-from dappled.daemon.navigation.clocks import TAGGING_RULES
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.vehicle_choice import vehicle_of
@@ -54,9 +53,8 @@ class ReplayError(DappledError):
 class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
     each. `horizons` says how many telemetry packets a frame's pose was made from; `vehicles` whose they were (see
-    `Telemetry`); `elsewhere` another platform or other versions that it was recorded with; `rules` those it was
-    tagged by; `findings` what was found in a folder of frames;
-    `bounds` which dates of its log can be true."""
+    `Telemetry`); `elsewhere` another platform or other versions that it was recorded with; `findings` what was
+    found in a folder of frames; `bounds` which dates of its log can be true."""
 
     root: Path
     shots: Sequence[Shot]
@@ -66,7 +64,6 @@ class RecordedFlight:
     horizons: dict[int, int]
     vehicles: Sequence[tuple[int, int]] = ()
     elsewhere: str | None = None
-    rules: int = TAGGING_RULES
     findings: tuple[Finding, ...] = ()
     bounds: UtcBounds | None = None
 
@@ -111,8 +108,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
     elsewhere = _elsewhere(made_by.get("software", {}))
     shots = [row.shot for row in rows]
-    rules = tagging_rules(layout.read_facts(flight))
-    return RecordedFlight(folder, shots, files, expected, telemetry, horizons, turns, elsewhere, rules)
+    return RecordedFlight(folder, shots, files, expected, telemetry, horizons, turns, elsewhere)
 
 
 def _elsewhere(recorded: Mapping[str, str]) -> str | None:
@@ -218,12 +214,6 @@ def _only_log(folder: Path) -> Path | None:
     return logs[0] if logs else None
 
 
-def tagging_rules(facts: Mapping[str, Any]) -> int:
-    """The rules that a flight was tagged by, of its flight.toml."""
-    found = facts.get("tagging_rules")
-    return found if isinstance(found, int) and not isinstance(found, bool) else 1
-
-
 class RecordedTelemetry:
     """Poses from a telemetry file, fed packet by packet just as far as each frame's pose was made from."""
 
@@ -237,19 +227,17 @@ class RecordedTelemetry:
         component_id: int = 100,
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
-        rules: int = TAGGING_RULES,
         report: Callable[[Finding], object] = lambda _: None,
         bounds: UtcBounds | None = None,
     ) -> None:
-        """`vehicles`, `component_id`, `cam_idx`, `attitude_sigma_rad` and `rules` are those that the recording daemon
-        had. `report` gets what is to be said of the log."""
+        """`vehicles`, `component_id`, `cam_idx` and `attitude_sigma_rad` are those that the recording daemon had.
+        `report` gets what is to be said of the log."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
         self._telemetry = Telemetry(
             vehicles=vehicles,
             component_id=component_id,
             cam_idx=cam_idx,
             attitude_sigma_rad=attitude_sigma_rad,
-            rules=rules,
         )
         self._path = path
         self._packets = _packets(path, report, bounds) if path else iter(())
@@ -263,7 +251,6 @@ class RecordedTelemetry:
         horizons: dict[int, int],
         vehicles: Sequence[tuple[int, int]],
         *,
-        rules: int,
         report: Callable[[Finding], object] = lambda _: None,
         bounds: UtcBounds | None = None,
     ) -> Self:
@@ -276,7 +263,6 @@ class RecordedTelemetry:
             component_id=settings.mavlink.component_id,
             cam_idx=settings.mavlink.cam_idx,
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
-            rules=rules,
             report=report,
             bounds=bounds,
         )
