@@ -95,7 +95,7 @@ class Outcome:
 
 
 @cache
-def _sampled(step: int) -> TruePose:
+def sampled(step: int) -> TruePose:
     """The truth at the times of telemetry, the same for all cells."""
     return PATH.pose(step * STEP_S)
 
@@ -279,7 +279,7 @@ class World:
     def _sampler(self, step: int) -> Callable[[], None]:
         def sample() -> None:
             t_s = step * STEP_S
-            truth, boot_ns = _sampled(step), self.boot.ns(t_s)
+            truth, boot_ns = sampled(step), self.boot.ns(t_s)
             position, turn = self._slow[max(0, min(int((t_s - WARM_UP_S) // self.burst_s) + 1, self.bursts + 1))]
             x, y, z = (angle / 2 for angle in turn.at(t_s))
             north, east, down = position.at(t_s)

@@ -111,7 +111,7 @@ def _doors(stack: contextlib.ExitStack) -> dict[str, Callable[[Path], object]]:
         "journal": log_reading.read_journal,
         "flight": _flight,
         "index": _index,
-        "telemetry": lambda path: list(replay._packets(path)),
+        "telemetry": lambda path: list(replay.packets(path)),
         "dng": _frame,
         "lfp": _frame,
         "lytro-raw": lambda path: _frame(path / "a.raw"),

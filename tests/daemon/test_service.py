@@ -96,7 +96,7 @@ def test_triggers_lost_in_the_last_seconds_of_a_flight_are_in_its_ledger(
 ) -> None:
     """They wait 2.5 s for a second link; the flight ended before, and the counts agreed."""
     service = started(settings, [])
-    numbers = service._component._autopilot.numbers["CAMERA_FEEDBACK"]
+    numbers = service._autopilot.numbers["CAMERA_FEEDBACK"]
     for number in (10, 14):
         numbers.heard(number, service._clock.monotonic_ns(), lambda: "noticed here")
     service.stop()
@@ -233,7 +233,7 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
     service = started(replace(settings, record=replace(settings.record, utc="system")), [])
     try:
         assert "clock" not in "".join(service.health()["problems"])
-        service._navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
+        service.navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
         assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
     finally:
         service.stop()
@@ -245,14 +245,14 @@ def test_another_component_with_our_ids_is_a_problem(
     """Two daemons of which one forgot its component id: the pilot and the health record name where it sends from."""
     service = started(replace(settings, mavlink=replace(settings.mavlink, url=("udpin:127.0.0.1:0",))), [])
     try:
-        service._component._identity.settled = True  # as after three seconds
+        service._autopilot.identity.settled = True  # as after three seconds
         said = list[str]()
-        monkeypatch.setattr(service._component, "say", lambda text, *_: said.append(text))
-        with Peer(service._links.port(0), 1, settings.mavlink.component_id) as twin:
+        monkeypatch.setattr(service.component, "say", lambda text, *_: said.append(text))
+        with Peer(service.links.port(0), 1, settings.mavlink.component_id) as twin:
             twin.packer.seq = 200
             twin.heartbeat()
             eventually(lambda: "sends as 1/100 too, which is this camera" in problems(service), "the other camera")
-            assert f"127.0.0.1:{twin._socket.getsockname()[1]}" in problems(service)
+            assert f"127.0.0.1:{twin.socket.getsockname()[1]}" in problems(service)
             service._publish_health()
             assert any("sends as 1/100 too" in text for text in said)
     finally:
@@ -268,7 +268,7 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")
         (pending,) = shots
-        component, said = service._component, list[str]()
+        component, said = service.component, list[str]()
         assert pending.tag is not None
         monkeypatch.setattr(component, "say", lambda text, *_: said.append(text))
         for length_mm in (35.0, None, 35.0, 55.0):
@@ -301,7 +301,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     service = Service(settings, observer=CallingObserver(finished=shots.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
-    parameters = service._component._parameters._parameters
+    parameters = service._parameters
     camera.script = lambda _: []
     assert service.request(CaptureRequest("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shot under way"):
@@ -310,15 +310,15 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         assert not isinstance(event, Exception)
         camera.say(event)
     eventually(lambda: shots, "the shot's end")
-    service._shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
+    service.shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
     camera.script = good
     with pytest.raises(CameraError, match="stop the interval first"):
         parameters.change("LF_MASK", "mask-3")
-    service._shutter.stop_interval()
+    service.shutter.stop_interval()
     for event in good(1):
         assert not isinstance(event, Exception)
         camera.say(event)
-    eventually(lambda: service._shutter.statistics().pending == 0, "the interval's shot's end")
+    eventually(lambda: service.shutter.statistics().pending == 0, "the interval's shot's end")
     assert parameters.change("LF_MASK", "mask-3")
     assert "next flight begins" in str(service.request(CaptureRequest("test", "console", 3)).reason)
     service.run()  # ends by itself

@@ -40,7 +40,7 @@ def by_distance(flight: Path) -> tuple[list[str], list[float]]:
 
 def trigger(daemon: Flying, distance: str) -> int:
     """`dappled trigger --distance`, from a ground station of its own."""
-    return main(["trigger", "--url", f"udpout:127.0.0.1:{daemon.service._links.port(2)}", "--distance", distance])
+    return main(["trigger", "--url", f"udpout:127.0.0.1:{daemon.service.links.port(2)}", "--distance", distance])
 
 
 def until_settled(daemon: Flying) -> int:
@@ -95,7 +95,7 @@ def test_settings_without_a_series_refuse_to_begin_one(tmp_path: Path, capsys: p
         settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": "udpin:127.0.0.1:0"})
         with flying(settings) as daemon:
             daemon.until_ready()
-            url = f"udpout:127.0.0.1:{daemon.service._links.port(0)}"
+            url = f"udpout:127.0.0.1:{daemon.service.links.port(0)}"
             assert main(["trigger", "--url", url, "--distance", "settings"]) == 1
             assert "no photos: set trigger.distance_m or overlap" in capsys.readouterr().err
             assert main(["trigger", "--url", url, "--distance", "5"]) == 0

@@ -34,12 +34,11 @@ class Camera:
     flying: Flying
 
     def port(self, link: int) -> int:
-        return self.flying.service._links.port(link)
+        return self.flying.service.links.port(link)
 
     def iso(self) -> str:
         """As the body has it."""
-        settings = self.flying.service._shots._camera.settings()
-        return next(one.value for one in settings if one.name == "iso")
+        return next(str(one["value"]) for one in self.flying.service.health()["settings"] if one["name"] == "CAM_ISO")
 
     def shots(self) -> dict[str, int]:
         counts: dict[str, int] = self.flying.service.health()["shots"]

@@ -120,14 +120,14 @@ class Service:
             private = listener.private if listener else ""
             self._publisher = Publisher.of(settings.publish, private=private, clock=self._clock)
             stack.callback(self._publisher.stop)
-            self._links = configured_links(settings, self._clock)
-            self._links.open()
-            stack.callback(self._links.stop)
+            self.links = configured_links(settings, self._clock)
+            self.links.open()
+            stack.callback(self.links.stop)
             recipe = self._begin_recording(names, recipe, stack)
             self._build(camera, names, recipe)
             if listener:  # before the publisher, so that it ends after it: the pages are told how the flight ended
                 self.console_url = listener.url
-                look, parts = CameraLook(camera, self._shutter, self._clock), (self._shutter, self._parameters)
+                look, parts = CameraLook(camera, self.shutter, self._clock), (self.shutter, self._parameters)
                 requests = ConsoleRequests(*parts, look, self._logbook, series=self._distance, clock=self._clock)
                 self._console = console_process.start(
                     listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
@@ -143,7 +143,7 @@ class Service:
         settings, clock = self._settings.now, self._clock
         self._utc_known = utc_known(settings.record.utc, clock.utc_ns())
         if self._utc_known:
-            self._links.clock_known()
+            self.links.clock_known()
         facts = {
             "software": {"dappled": dappled.__version__, **recipes.versions()},
             "settings": configuration.to_tables(settings),
@@ -156,7 +156,7 @@ class Service:
         )
         stack.callback(self._remove_unused_flight)
         stack.callback(_close, self._recording)
-        stack.callback(self._links.stop)  # before the recording closes: packets are logged there
+        stack.callback(self.links.stop)  # before the recording closes: packets are logged there
         if recipe is None:
             return None
         kept = recipes.keep(recipe, self._recording.folder.path)
@@ -168,21 +168,21 @@ class Service:
         settings, clock, recording = self._settings.now, self._clock, self._recording
         self._shots = shots = PendingShots(camera)
         self._writer = writer = LedgerWriter(recording, clock)
-        self._navigation = Navigation(self._settings, clock, recording, utc_known=self._utc_known)
-        reported, sender = ReportedCamera(settings), self._links.sender
+        self.navigation = Navigation(self._settings, clock, recording, utc_known=self._utc_known)
+        reported, sender = ReportedCamera(settings), self.links.sender
         self._control = FlightControl(
             self._settings,
             clock,
             recording,
             shots=shots,
             writer=writer,
-            navigation=self._navigation,
+            navigation=self.navigation,
             camera=reported,
             sender=sender,
             alarms=self._alarms,
             handover=self._after,
         )
-        self._shutter = Shutter(
+        self.shutter = Shutter(
             self._control,
             clock,
             next_index=recording.next_index,
@@ -192,15 +192,15 @@ class Service:
         self._autopilot = autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
-        survey = LiveSurvey(self._navigation, reported, shots)
-        self._distance = distance_trigger(self._shutter, survey, clock, settings)
-        self._gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, self._navigation, clock), clock)
+        survey = LiveSurvey(self.navigation, reported, shots)
+        self._distance = distance_trigger(self.shutter, survey, clock, settings)
+        self._gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, self.navigation, clock), clock)
         self._body = BodyPlan(settings.body, settings.camera.capture_target, camera, clock)
         self._parameters = self._settable(self._body, names, decodes=recipe is not None)
-        self._component = Component(
+        self.component = Component(
             sender,
             autopilot,
-            self._shutter,
+            self.shutter,
             clock,
             self._parameters,
             model=self._control,
@@ -224,9 +224,9 @@ class Service:
         self._events = ShotEvents(
             recording,
             reported,
-            self._navigation.utc,
-            shutter=self._shutter,
-            component=self._component,
+            self.navigation.utc,
+            shutter=self.shutter,
+            component=self.component,
             logbook=self._logbook,
             depth=self._depth,
             recipe=recipe,
@@ -236,7 +236,7 @@ class Service:
             camera,
             shots,
             writer,
-            self._navigation,
+            self.navigation,
             decoder=self._decoder,
             publisher=self._publisher,
             latency=BodyLatency.of(settings.camera),
@@ -248,13 +248,13 @@ class Service:
         )
         self._answers = Answers(writer, self._decoder, shots)
         driver = tuple(part for part in (camera, self._gnss) if isinstance(part, HasThreads))
-        self._vital: tuple[HasThreads, ...] = (self._pipeline, self._links, self._shutter, self._distance, *driver)
+        self._vital: tuple[HasThreads, ...] = (self._pipeline, self.links, self.shutter, self._distance, *driver)
         self._tasks = self._periodic_tasks()
 
     def _settable(self, body: BodyPlan, names: Names, *, decodes: bool) -> Parameters:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
         decoding = DecodingParameter(self._shots, self._writer, decodes=decodes)
-        recipe = RecipeParameters(names, self._after, self._settings, self._shutter, self._writer)
+        recipe = RecipeParameters(names, self._after, self._settings, self.shutter, self._writer)
         return Parameters(body, (decoding, recipe), unsigned=self._settings.now.mavlink.unsigned_parameters)
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:
@@ -274,11 +274,11 @@ class Service:
             self._depth.start()
         stack.callback(self._pipeline.stop, _STOP_S)
         self._pipeline.start()
-        stack.callback(self._shutter.stop)
-        self._shutter.start()
+        stack.callback(self.shutter.stop)
+        self.shutter.start()
         stack.callback(self._distance.stop)
         self._distance.start()
-        self._links.start(self._navigation, self._component)
+        self.links.start(self.navigation, self.component)
         if self._gnss is not None:
             stack.callback(self._gnss.stop)
             self._gnss.start()
@@ -289,13 +289,13 @@ class Service:
             _remove_empty(self._recording)
 
     def _publish_end(self) -> None:
-        self._component.finish()
-        self._shutter.settle_refusals(all_of_them=True)
+        self.component.finish()
+        self.shutter.settle_refusals(all_of_them=True)
         try:
             self._writer.write_later()
         except DappledError as error:
             report(log, "events", error)
-        now = self._shutter.statistics()
+        now = self.shutter.statistics()
         counts = {"wished": now.shots, "safe": now.succeeded, "failed": now.failed, "open": now.pending}
         self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts})
         self._publisher.stop()  # answers the last questions, for which the decoder is still there
@@ -329,9 +329,9 @@ class Service:
         }
 
     def _look_for_utc(self) -> None:
-        self._navigation.look_for_utc()
-        if (learnt := self._navigation.utc.learnt) is not None:
-            self._links.clock_known(learnt.correction_ns)
+        self.navigation.look_for_utc()
+        if (learnt := self.navigation.utc.learnt) is not None:
+            self.links.clock_known(learnt.correction_ns)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Send heartbeats and health until `ask_to_stop` or `stop` is called, the ground station has set what the next
@@ -349,7 +349,7 @@ class Service:
         return self._after is not None and self._after.next is not None
 
     def _tick(self) -> None:
-        self._component.tick(healthy=self.healthy())
+        self.component.tick(healthy=self.healthy())
 
     def _follow_body(self) -> None:
         """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
@@ -358,13 +358,13 @@ class Service:
                 self._logbook.add(drift, "warning")
 
     def _follow_vehicle(self) -> None:
-        self._navigation.belongs_to(self._component.vehicle)
+        self.navigation.belongs_to(self.component.vehicle)
 
     def _publish_health(self) -> None:
         record = self.health()
         self._publisher.publish("health", record)
-        for text, severity in self._alarms.lines(record["problems"], again=self._component.audience_has_grown()):
-            self._component.say(text, severity)
+        for text, severity in self._alarms.lines(record["problems"], again=self.component.audience_has_grown()):
+            self.component.say(text, severity)
 
     def healthy(self) -> bool:
         """Whether everything runs that photographs are taken and kept with. Viewers' parts don't count."""
@@ -372,19 +372,19 @@ class Service:
 
     def health(self) -> dict[str, Any]:
         """The state of everything, as published."""
-        navigation = self._navigation
+        navigation = self.navigation
         viewers: list[HasThreads] = [
             self._publisher,
             self._answers,
             *(part for part in (self._depth, self._console) if part is not None),
         ]
         doubts = (
-            self._component.doubt(),
-            *(findings.told(one) for one in self._component.findings()),
+            self.component.doubt(),
+            *(findings.told(one) for one in self.component.findings()),
             navigation.utc.doubt(),
             *navigation.telemetry.doubts(self._clock.utc_ns()),
             self._control.shortage,
-            *map(findings.told, self._links.findings()),
+            *map(findings.told, self.links.findings()),
             None if self._gnss is None else self._gnss.problem(),
         )
         return health.record(
@@ -394,9 +394,9 @@ class Service:
             began_monotonic_ns=self._began_monotonic_ns,
             shots=self._shots,
             stages=self._pipeline.statistics(),
-            shutter=self._shutter.statistics(),
+            shutter=self.shutter.statistics(),
             series=self._distance.statistics(),
-            links=self._links.statistics(),
+            links=self.links.statistics(),
             telemetry=navigation.telemetry.statistics(),
             publisher=self._publisher.statistics(),
             folder=self.folder,
@@ -427,11 +427,11 @@ class Service:
     @property
     def requested(self) -> int:
         """Shots so far."""
-        return self._shutter.statistics().shots
+        return self.shutter.statistics().shots
 
     def request(self, request: CaptureRequest) -> ShotDecision:
         """Take a capture request that did not come over a link: from a console, or a test."""
-        return self._shutter.request(request)
+        return self.shutter.request(request)
 
     def reload(self, wanted: Settings) -> list[str]:
         """See LiveSettings.reload."""

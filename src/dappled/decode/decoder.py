@@ -283,7 +283,7 @@ class MaskDecoder:
         longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers([(c.ky, c.kx) for c in predicted])
         reach = max(abs(c.fx) * (1 + turned) + abs(c.fx - far.fx) for c, far in zip(predicted, longer, strict=True))
         width = self.slice_size(self.lattice_at(focal_length_mm))[1]
-        return min(0.5, reach + (max(width / 2, max(self._radii(predicted, focal_length_mm)) + 8) + 2) / wide)
+        return min(0.5, reach + (max(width / 2, max(self.radii(predicted, focal_length_mm)) + 8) + 2) / wide)
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
@@ -297,7 +297,7 @@ class MaskDecoder:
             there = self.at.carriers([(c.ky, c.kx) for c in predicted])
             return self.at, measure(spectrum, there, 1.0, prominence_nats=ALONE_NATS), "measured"
         lattice = self.lattice_at(focal_length_mm)
-        measured = measure(spectrum, predicted, self._radii(predicted, focal_length_mm))
+        measured = measure(spectrum, predicted, self.radii(predicted, focal_length_mm))
         least = STRONGER if self._placed else STRONG
         own = own_lattice(spectrum, predicted, measured, least)
         if own is None and self.calibration is not None:
@@ -315,7 +315,7 @@ class MaskDecoder:
         at_own = measure(spectrum, own.carriers([(c.ky, c.kx) for c in predicted]), 2.0)
         return own, at_own, "measured"
 
-    def _radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
+    def radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
         """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""
         high, wide = padded_shape(self.sensor.shape)
         orders = [(c.ky, c.kx) for c in carriers]

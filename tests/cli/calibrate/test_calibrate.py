@@ -99,7 +99,7 @@ def test_a_frame_in_between_is_predicted_to_a_fraction_of_a_bin_and_searched_no_
     decoder = Darkroom(Recipe(str(profile), MASK, calibration=str(tmp_path / "c.npz"))).mask_decoder((694, 922), "")
     predicted = decoder.predict(62.0)
     coarse = replace(decoder, focal_sigma_mm=0.5)
-    near, far = (one._radii(predicted, 62.0) for one in (decoder, coarse))
+    near, far = (one.radii(predicted, 62.0) for one in (decoder, coarse))
     assert max(near) < 1.6  # a bin and a half, and what a tenth of a millimetre makes of a geometric lattice
     assert max(far) < 2.0
     assert all(b >= a for a, b in zip(near, far, strict=True))

@@ -119,7 +119,7 @@ class Camera:
 
     def received(self) -> int:
         """Packets that came in and were handled, on all links."""
-        with self.links._order:  # the one that was counted last is handled too
+        with self.links.sender.order:  # the one that was counted last is handled too
             return sum(link.packets_in for link in self.links.statistics())
 
     def failures(self) -> int:
@@ -195,10 +195,10 @@ class Peer:
 
     def __init__(self, port: int, system: int = 255, component: int = 190) -> None:
         self.packer = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.connect(("127.0.0.1", port))
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.connect(("127.0.0.1", port))
         self.heard: list[MavlinkMessage] = []
-        self._decode = mavlink.MAVLink(None).decode
+        self.decode = mavlink.MAVLink(None).decode
 
     def __enter__(self) -> Peer:
         return self
@@ -206,13 +206,13 @@ class Peer:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._socket.close()
+        self.socket.close()
 
     def packed(self, message: MavlinkMessage, *, version_1: bool = False) -> bytes:
         return pack(message, self.packer, version_1=version_1)
 
     def raw(self, data: bytes) -> None:
-        self._socket.send(data)
+        self.socket.send(data)
 
     def send(self, message: MavlinkMessage) -> None:
         self.raw(self.packed(message))
@@ -232,9 +232,9 @@ class Peer:
         while True:
             left = deadline - time.monotonic()
             assert left > 0, f"never heard: {what}; heard {[m.get_type() for m in self.heard[-20:]]}"
-            self._socket.settimeout(left)
+            self.socket.settimeout(left)
             try:
-                message = self._decode(bytearray(self._socket.recv(65536)))
+                message = self.decode(bytearray(self.socket.recv(65536)))
             except TimeoutError:
                 continue
             self.heard.append(message)

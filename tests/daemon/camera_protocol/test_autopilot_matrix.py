@@ -13,7 +13,7 @@ from tests.benchmarks import program
 def _a_path_for_all() -> Iterator[None]:
     """The flown path is kept for all cells of a run, and not longer."""
     yield
-    program("autopilot_cell")._sampled.cache_clear()
+    program("autopilot_cell").sampled.cache_clear()
 
 
 @pytest.mark.long

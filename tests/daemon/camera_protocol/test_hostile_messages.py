@@ -280,7 +280,7 @@ def test_a_station_with_a_wrong_clock_is_taken_once_it_has_heard_the_camera(
                 signer.timestamp = round((now + off_s) * mavlink_signing.UNITS_PER_S)
                 listener = mavlink.MAVLink(None)  # as programs have it: one object signs, hears, and learns the time
                 listener.signing = signer
-                station._decode = listener.decode
+                station.decode = listener.decode
                 station.heartbeat()
                 station.one("HEARTBEAT")
                 station.command(2000, 0, 0, 1, 1)

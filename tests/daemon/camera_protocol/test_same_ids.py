@@ -23,7 +23,7 @@ def beat(twin: Peer) -> None:
 
 
 def address(peer: Peer) -> str:
-    return "{}:{}".format(*peer._socket.getsockname())
+    return "{}:{}".format(*peer.socket.getsockname())
 
 
 def test_another_component_with_our_ids_is_named_while_it_is_heard() -> None:
@@ -60,13 +60,13 @@ def test_our_own_packets_that_a_router_returns_are_not_another_component(held_s:
         here.heartbeat()
         there.heartbeat()
         packets: list[bytes] = []
-        here._socket.settimeout(0.05)
+        here.socket.settimeout(0.05)
 
         def heartbeats() -> int:
             clock.advance(0.2)
             here.heartbeat()  # a peer that is silent is sent nothing
             with suppress(TimeoutError):
-                packets.append(here._socket.recv(2048))
+                packets.append(here.socket.recv(2048))
             return sum(raw[7:10] == bytes(3) for raw in packets)
 
         eventually(lambda: heartbeats() >= 3, "three heartbeats")

@@ -19,8 +19,8 @@ def mark(vehicle: Vehicle, count: int, at_s: float, sender: tuple[int, int] = (1
     """The receiver has marked a contact, and says so 0.1 s later."""
     message = recorded.mark_message(TimeMark(count, START_NS + round(at_s * 1e9), 30))
     message.pack(mavlink.MAVLink(None, *sender))
-    vehicle.telemetry.feed(vehicle._number, START_NS // 1000 + round((at_s + 0.1) * 1e6), message)
-    vehicle._number += 1
+    vehicle.telemetry.feed(vehicle.number, START_NS // 1000 + round((at_s + 0.1) * 1e6), message)
+    vehicle.number += 1
 
 
 def flown(*marks_s: float, sender: tuple[int, int] = (1, 220), pin: bool = False) -> Vehicle:

@@ -26,12 +26,12 @@ class Vehicle:
         self.telemetry = Telemetry(cam_idx=cam_idx)
         self.autopilot = CameraTriggers(personality, cameras)
         self.heard: list[tuple[MavlinkMessage, int]] = []
-        self._number = 0
+        self.number = 0
 
     def say(self, message: MavlinkMessage, utc_ns: int) -> None:
         message.pack(mavlink.MAVLink(None, srcSystem=1, srcComponent=1))
-        self.telemetry.feed(self._number, utc_ns // 1000, message)
-        self._number += 1
+        self.telemetry.feed(self.number, utc_ns // 1000, message)
+        self.number += 1
         self.heard.append((message, utc_ns))
 
     def fly(self, start_s: float, stop_s: float) -> None:

@@ -24,15 +24,15 @@ class Rig:
     """A relay with one route; `accept` takes the relay's next connection as the daemon."""
 
     def __init__(self, folder: Path) -> None:
-        self._inner = socket.socket(socket.AF_UNIX)
-        self._inner.bind(str(folder / "inner"))
-        self._inner.listen(64)
-        self._inner.settimeout(5)
+        self.inner = socket.socket(socket.AF_UNIX)
+        self.inner.bind(str(folder / "inner"))
+        self.inner.listen(64)
+        self.inner.settimeout(5)
         listener = socket.create_server(("0.0.0.0", 0), backlog=64)  # noqa: S104  # to be reached by several addresses
         self.port = listener.getsockname()[1]
         self.clock = RecordedClock(10**18)
         self.relay = Relay({listener: str(folder / "inner")}, limits=LIMITS, clock=self.clock)
-        self._sockets = [self._inner, listener]
+        self._sockets = [self.inner, listener]
 
     def viewer(self, says: bytes = b"", source: str = "127.0.0.1") -> socket.socket:
         one = socket.create_connection(("127.0.0.1", self.port), 5, (source, 0))
@@ -42,7 +42,7 @@ class Rig:
         return one
 
     def accept(self) -> socket.socket:
-        one, _ = self._inner.accept()
+        one, _ = self.inner.accept()
         one.settimeout(5)
         self._sockets.append(one)
         return one
@@ -114,7 +114,7 @@ def test_bytes_pass_both_ways_unchanged(rig: Rig) -> None:
 def test_the_silent_and_what_is_not_zeromq_never_reach_the_daemon(rig: Rig) -> None:
     silent = [rig.viewer() for _ in range(3)]
     browser = rig.viewer(b"GET / HTTP/1.1\r\n")
-    rig._inner.settimeout(0.0)
+    rig.inner.settimeout(0.0)
     with pytest.raises(BlockingIOError):
         rig.accept()
     assert closed(browser)

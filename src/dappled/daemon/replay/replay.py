@@ -155,7 +155,7 @@ def of_folder(
             said = datetime.fromtimestamp(start_utc_ns // 10**9, UTC).strftime("%Y-%m-%d %H:%M")
             told.append(finding(Code.LOG_STAMPS_UNSET, Subject("log", str(telemetry)), utc=said))
     elif telemetry is not None and own_log(telemetry):
-        next(_packets(telemetry, bounds=bounds), None)  # one that can't be used is refused before all else
+        next(packets(telemetry, bounds=bounds), None)  # one that can't be used is refused before all else
     shots, files, expected = [], [], []
     for index, path in enumerate(paths):
         utc_ns = start_utc_ns + round(index * interval_s * 1e9)
@@ -240,7 +240,7 @@ class RecordedTelemetry:
             attitude_sigma_rad=attitude_sigma_rad,
         )
         self._path = path
-        self._packets = _packets(path, report, bounds) if path else iter(())
+        self._packets = packets(path, report, bounds) if path else iter(())
         self._fed = 0
 
     @classmethod
@@ -373,7 +373,7 @@ def _recorded(digests: dict[int, tuple[str, str]], index: int) -> str | None:
     return None if found is None else found[0]
 
 
-def _packets(
+def packets(
     path: Path, report: Callable[[Finding], object] = lambda _: None, bounds: UtcBounds | None = None
 ) -> Iterator[tuple[int, int, MavlinkMessage]]:
     """The messages of a .tlog or of an autopilot's own log. Raises FlightError and AutopilotLogError."""
@@ -400,8 +400,8 @@ def _logged(
 
 
 def _first_position_utc_ns(path: Path, bounds: UtcBounds, system: int | None) -> int:
-    packets = _packets(path, bounds=bounds)
-    mine = (one for one in packets if system is None or one[2].get_srcSystem() == system)
+    heard = packets(path, bounds=bounds)
+    mine = (one for one in heard if system is None or one[2].get_srcSystem() == system)
     utc_ns = first_position_utc_ns(mine)
     if utc_ns is None:
         raise ReplayError(f"{path} holds no position: give --start, the time of the first frame")
