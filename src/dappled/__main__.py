@@ -14,6 +14,9 @@ def main() -> int:
     signal.signal(signal.SIGINT, lambda *_: os._exit(INTERRUPTED))  # nothing is there yet to end in order
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices here are small, and work is shared among own threads
     from dappled.cli import main as command  # noqa: PLC0415  # it loads for a second
+    from dappled.shown import guard_output  # noqa: PLC0415  # as above
+
+    guard_output()
 
     try:
         return command(loaded=lambda: signal.signal(signal.SIGINT, signal.default_int_handler))

@@ -41,15 +41,6 @@ def first_line(error: BaseException) -> str:
     return line if len(line) <= 200 else f"{line[:199]}…"
 
 
-def printable(text: str) -> str:
-    """A text on one line, with what a terminal would obey or can't show as escapes: names of files may hold anything.
-
-    >>> print(printable("notes\\r\\udcff.txt was added"))
-    notes\\r\\udcff.txt was added
-    """
-    return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
-
-
 def counted(count: int, noun: str, width: int = 0) -> str:
     """A number with its noun: 1 frame, 2 frames."""
     return f"{count:{width}d} {noun}" + ("" if count == 1 else "s")

@@ -15,7 +15,8 @@ from typing import NoReturn
 
 import dappled
 from dappled.daemon.health import systemd
-from dappled.errors import DappledError, printable
+from dappled.errors import DappledError
+from dappled.shown import printable
 
 # Verb: (module, its line in --help). The module has `configure(parser)` and `run(arguments) -> exit code`.
 VERBS: dict[str, tuple[str, str]] = {

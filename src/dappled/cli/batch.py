@@ -79,7 +79,13 @@ def run(arguments: argparse.Namespace) -> int:
             answers = workers.on_cluster(todo, batch.make, arguments.scheduler)
         else:
             answers = workers.in_processes(todo, batch.make, min(arguments.workers, max(1, len(todo))))
-        bar = tqdm(total=len(jobs), initial=len(jobs) - len(todo), unit="frame", disable=not sys.stderr.isatty())
+        bar = tqdm(
+            total=len(jobs),
+            initial=len(jobs) - len(todo),
+            unit="frame",
+            disable=not sys.stderr.isatty(),
+            file=sys.__stderr__,
+        )
         with bar:
             for done in answers:
                 manifest.add(done)

@@ -11,8 +11,9 @@ from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite
 from dappled.cli.each_frame import each_frame
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
-from dappled.errors import DappledError, printable
+from dappled.errors import DappledError
 from dappled.products.exports import light_files
+from dappled.shown import printable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

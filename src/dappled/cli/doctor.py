@@ -190,7 +190,7 @@ def _shoot(
     frame: Path | None = None
     problem = ""
     with test_shot.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
-        for _ in tqdm(range(count), unit="shot", disable=None, delay=1.0):
+        for _ in tqdm(range(count), unit="shot", disable=None, delay=1.0, file=sys.__stderr__):
             pending = daemon.shoot()
             if pending.frame is None:
                 problem = pending.problem or pending.follows

@@ -10,7 +10,8 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from dappled.errors import DappledError, counted, printable
+from dappled.errors import DappledError, counted
+from dappled.shown import printable
 
 
 def each_frame(
@@ -27,7 +28,7 @@ def each_frame(
     `failure` says what became of the frames that failed. Raises the DappledError of a frame that goes to no folder.
     """
     bad = doubted = 0
-    for frame in tqdm(frames, unit="frame", disable=len(frames) < 2 or not sys.stderr.isatty()):
+    for frame in tqdm(frames, unit="frame", disable=len(frames) < 2 or not sys.stderr.isatty(), file=sys.__stderr__):
         try:
             doubted += make(frame)
         except DappledError as error:

@@ -422,6 +422,8 @@ class Bar:
         """So much of it is done."""
         if self._bar is None or what != self._what:
             self.__exit__()
-            self._bar = tqdm(total=total, desc=what, unit="frame", disable=not sys.stderr.isatty(), leave=False)
+            self._bar = tqdm(
+                total=total, desc=what, unit="frame", disable=not sys.stderr.isatty(), leave=False, file=sys.__stderr__
+            )
             self._what = what
         self._bar.update(done - self._bar.n)

@@ -102,7 +102,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     copies_of = (arguments.flight, arguments.copies, mounting, geoid, marked)
     made = geotags.copies(*copies_of, tags=tags) if arguments.copies else ()
-    found = dict(tqdm(made, unit="frame", disable=None, delay=1.0, leave=False))
+    found = dict(tqdm(made, unit="frame", disable=None, delay=1.0, leave=False, file=sys.__stderr__))
     copied = [str(path) for path in found.values() if isinstance(path, Path)]
     without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}
     doubts += [f"{name}: {text}" for name, text in geotags.doubts(arguments.flight)]

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.errors import counted, printable
+from dappled.errors import counted
 from dappled.flight import layout
 from dappled.flight.chain import Column
 from dappled.flight.errors import FlightError
@@ -21,6 +21,7 @@ from dappled.flight.ledger import Ledger
 from dappled.flight.pruning import Proved
 from dappled.flight.records import Frame, Stray
 from dappled.flight.trees import FileIdentity, Tree
+from dappled.shown import printable
 
 _FOLDERS = ("geotags/", "inputs/")
 

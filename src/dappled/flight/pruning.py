@@ -17,12 +17,13 @@ from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
-from dappled.errors import counted, printable
+from dappled.errors import counted
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.trees import FileIdentity, Tree
+from dappled.shown import printable
 
 RECORD = "offloaded.jsonl"
 EVENT = "offloaded"

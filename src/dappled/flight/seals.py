@@ -18,13 +18,13 @@ from dappled import durable, file_lock
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
-from dappled.errors import printable
 from dappled.flight import layout, pruning
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
+from dappled.shown import printable
 
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
 BY_OWNER = "signed by its owner"  # why a seal was made that `flight seal` adds

@@ -70,7 +70,7 @@ def views_of(
     """What the good frames show, and why the others can't be used. All are of one camera and size."""
     good: list[CalibrationView] = []
     bad: list[tuple[Path, DappledError]] = []
-    for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty()):
+    for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty(), file=sys.__stderr__):
         try:
             one = view_of(darkroom, path, focal_length_mm, f_number, anyway)
             if good and (one.shape, one.model) != (good[0].shape, good[0].model):

@@ -36,7 +36,7 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
     grids: list[NDArray[np.float64]] = []
     model, shape = "", (0, 0)
     length = focal_length_mm
-    for path in tqdm(frames, unit="frame", disable=not sys.stderr.isatty()):
+    for path in tqdm(frames, unit="frame", disable=not sys.stderr.isatty(), file=sys.__stderr__):
         image, grid, raw_shape, raw_model, raw_length = _picture(darkroom, path, focal_length_mm)
         if shape not in ((0, 0), raw_shape):
             raise DarkroomError(

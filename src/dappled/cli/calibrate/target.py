@@ -58,7 +58,8 @@ def from_frames(
     stops: set[float | None] = set()
     lengths: set[float | None] = set()
     lens: Ranging | None = None
-    for path, distance in zip(tqdm(frames, unit="frame", disable=not sys.stderr.isatty()), metres, strict=True):
+    bar = tqdm(frames, unit="frame", disable=not sys.stderr.isatty(), file=sys.__stderr__)
+    for path, distance in zip(bar, metres, strict=True):
         made = darkroom.decode(path, focal_length_mm=focal_length_mm, joint_views=False)  # depth is made from slices
         field = OpenedLightField(made.light_field, path)
         with darkroom.naming(path):

@@ -18,9 +18,10 @@ from dappled.cli.flight import arguments as words
 from dappled.cli.flight import lines as flight_lines
 from dappled.clock import SystemClock
 from dappled.config import settings
-from dappled.errors import counted, printable
+from dappled.errors import counted
 from dappled.flight import FlightError, flight_report, index, layout, offload, owner_seal, seal_key
 from dappled.flight.checks import flight_check
+from dappled.shown import printable
 
 _FLIGHT = "~/flights/20261121T101503Z-0a1b2c3d"
 
@@ -199,7 +200,7 @@ def _report(flight: Path, logs: list[Path], as_json: bool) -> int:
 
 def _offload(flight: Path, arguments: argparse.Namespace) -> int:
     total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
-    with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
+    with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0, file=sys.__stderr__) as bar:
         done = offload.offload(
             flight,
             arguments.destination,

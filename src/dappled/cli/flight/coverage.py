@@ -8,8 +8,9 @@ from pathlib import Path
 
 from dappled.cli.arguments import refuse_existing
 from dappled.decode.geometry import area as areas
-from dappled.errors import DappledError, counted, printable
+from dappled.errors import DappledError, counted
 from dappled.products.maps import coverage, coverage_files, refly
+from dappled.shown import printable
 
 
 class CoverageCallError(DappledError):

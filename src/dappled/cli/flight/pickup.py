@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from tqdm import tqdm
@@ -23,13 +24,13 @@ def run(flight: Path, arguments: argparse.Namespace) -> int:
     source = parse_source(arguments.source, PtpSource)
     choice = Choice(dict(arguments.pair), arguments.offset, arguments.any_clock, arguments.by_order)
     try:
-        with tqdm(unit="B", unit_scale=True, disable=None, delay=1.0, desc="comparing") as bar:
+        with tqdm(unit="B", unit_scale=True, disable=None, delay=1.0, desc="comparing", file=sys.__stderr__) as bar:
             proposal = pickup.propose(flight, source, choice, bar.update)
         picked = None
         if not arguments.dry_run:
             total = sum(group.main.size for _, group in proposal.pairs)
             key = sealing.key_of(arguments.config)
-            with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0) as bar:
+            with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0, file=sys.__stderr__) as bar:
                 picked = pickup.bring(flight, source, proposal, clock=TimeOfDayClock(), key=key, progress=bar.update)
     finally:
         source.close()

@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
         }
     for text in report["warnings"]:
         print(f"dappled mask: warning: {text}", file=sys.stderr)
-    with tqdm(total=chosen.shape[0], unit="row", disable=not sys.stderr.isatty(), delay=1) as bar:
+    with tqdm(total=chosen.shape[0], unit="row", disable=not sys.stderr.isatty(), delay=1, file=sys.__stderr__) as bar:
         mask_files.write(arguments.output, chosen.shape, bits, chosen.px_per_mm, tile, progress=bar.update)
     report = {"file": str(arguments.output), "shape": list(chosen.shape), "px_per_mm": list(chosen.px_per_mm), **report}
     if arguments.json:

@@ -14,8 +14,9 @@ from dappled.cli.arguments import OutputExistsError, add_overwrite
 from dappled.cli.each_frame import each_frame
 from dappled.cli.picture import places
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
-from dappled.errors import DappledError, counted, printable
+from dappled.errors import DappledError, counted
 from dappled.products.handover import picture_files
+from dappled.shown import printable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

@@ -30,6 +30,7 @@ from dappled.decode.geometry import area
 from dappled.drivers.child_process import CONSOLE_GOES, ProcessChannel, goes_first
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
+from dappled.shown import guard_output
 
 NICENESS = 15  # below the decoder's 10
 log = logging.getLogger(__name__)
@@ -38,6 +39,7 @@ log = logging.getLogger(__name__)
 def main() -> int:
     """Serve until the daemon ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
+    guard_output()
     logging.basicConfig(level=logging.WARNING, handlers=[systemd.handler()])
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)

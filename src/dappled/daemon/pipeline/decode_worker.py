@@ -31,6 +31,7 @@ from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError, sentence
+from dappled.shown import guard_output
 
 log = logging.getLogger(__name__)
 DEPTH_NICENESS = 14
@@ -311,6 +312,7 @@ def main() -> None:
     """Arguments: the socket's descriptor, the parent's process id."""
     fd, parent = (int(word) for word in sys.argv[1:])
     end_with_parent(parent)
+    guard_output()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
     os.nice(NICENESS)
     goes_first(DECODER_GOES)

@@ -22,6 +22,7 @@ from dappled.clock import Clock, SystemClock
 from dappled.daemon.stream import admission
 from dappled.daemon.stream.admission import ConnectionLimits, Handshake, OpeningConnection
 from dappled.drivers.child_process import CONSOLE_GOES, ChannelError, ProcessChannel, goes_first
+from dappled.shown import guard_output
 
 NICENESS = 12  # as ZeroMQ's own thread in the daemon
 _CHUNK_BYTES = 1 << 18
@@ -293,6 +294,7 @@ class Relay:
 def main() -> int:
     """Relay until the daemon ends or closes the channel; then let open connections read what they have."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
+    guard_output()
     os.nice(NICENESS)
     goes_first(CONSOLE_GOES)
     near = socket.socket(fileno=int(sys.argv[1]))

@@ -41,6 +41,7 @@ from dappled.drivers.gphoto2.session import open_session
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.gphoto2.state import CameraState
 from dappled.drivers.gphoto2.viewfinder import Viewfinder
+from dappled.shown import guard_output
 
 _POLL_BUSY_S = 0.005
 _POLL_IDLE_S = 0.3
@@ -317,6 +318,7 @@ def main() -> None:
     raise_priority()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the parent ends this process
     _silence_library()
+    guard_output()
     channel = ProcessChannel(socket.socket(fileno=int(fd)))
     loop = CameraLoop(channel, parse_settings(json.loads(settings)), carryover=Carryover.of_json(json.loads(carryover)))
     try:

@@ -27,6 +27,7 @@ from dappled.drivers.child_process import (
 from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
 from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings
 from dappled.drivers.wired.sources import SUFFIXES, FoundFile
+from dappled.shown import guard_output
 
 _ANSWER_S = 60.0
 _SEND_S = 5.0
@@ -157,6 +158,7 @@ def main() -> None:
     """Arguments: the socket's descriptor, the parent's process id, the port."""
     fd, parent, port = sys.argv[1:]
     die_with_parent(int(parent))
+    guard_output()
     with contextlib.suppress(ChannelError):  # the parent is gone, or has closed
         _serve(ProcessChannel(socket.socket(fileno=int(fd))), _Files(port))
 

@@ -21,6 +21,7 @@ from typing import Any
 from dappled.errors import DappledError
 from dappled.products.batch.batch import Done, Job
 from dappled.products.extras import need
+from dappled.shown import guard_output
 
 ATTEMPTS = 3  # a frame that kills this many workers is given up
 _ENVIRONMENT = {
@@ -160,6 +161,7 @@ def _dismiss(worker: _Worker) -> None:
 def _work(channel: Connection, make: Make) -> None:
     """Run in a worker: read a job, send its result, until the pipe is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that hands out the jobs
+    guard_output()
     single_threaded()
     while True:
         try:

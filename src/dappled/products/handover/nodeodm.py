@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import secrets
 import time
 import urllib.error
@@ -23,8 +24,9 @@ from typing import Any, TypeVar
 
 from dappled import durable, picture_order
 from dappled.bounds.parsing import parse_json
-from dappled.errors import DappledError, printable
+from dappled.errors import DappledError
 from dappled.products.maps.georeference import Progress
+from dappled.shown import printable
 
 PICTURES = (".jpg", ".jpeg", ".tif", ".tiff")
 _TIMEOUT_S = 60.0
@@ -33,6 +35,7 @@ _EVERY_S = 5.0  # a task is asked about
 _PATIENCE_S = 600.0  # with a server that doesn't answer meanwhile
 _PAUSES_S = (2.0, 4.0, 8.0, 16.0)  # before a picture is sent again
 _ANSWER_BYTES = 1 << 22
+_SAID = 300  # letters of what a server says
 _PIECE_BYTES = 1 << 20
 _FIELDS = "application/x-www-form-urlencoded"  # the only kind of form that a task is removed by
 _FAILED, _COMPLETED, _CANCELLED = 30, 40, 50
@@ -78,7 +81,7 @@ def _refusal(answer: Path) -> str:
     """What a server says instead of results."""
     try:
         said = parse_json(answer.read_bytes()[:_ANSWER_BYTES], _ANSWER_BYTES)
-        return printable(str(said["error"]))
+        return str(said["error"])[:_SAID]
     except (ValueError, TypeError, KeyError, DappledError):
         return "what came is no archive"
 
@@ -118,14 +121,14 @@ class NodeOdm:
 
     def version(self) -> str:
         """The server's version. Raises NodeOdmError."""
-        return printable(str(self._asked("/info").get("version", "unknown")))
+        return printable(str(self._asked("/info").get("version", "unknown"))[:_SAID])
 
     def begin(self, name: str, options: Mapping[str, str]) -> str:
         """Begin a task, which waits for its pictures; returns its identity. Raises NodeOdmError."""
         wanted = json.dumps([{"name": key, "value": value} for key, value in options.items()])
         begun = self._asked("/task/new/init", _form({"name": name, "options": wanted}))
-        task = printable(str(begun.get("uuid", "")))
-        if not task:
+        task = str(begun.get("uuid", ""))
+        if not re.fullmatch(r"[\w-]{1,100}", task):
             raise NodeOdmError(f"{self._url} began no task: is it a NodeODM server?")
         return task
 
@@ -158,7 +161,7 @@ class NodeOdm:
         code, done = status.get("code"), said.get("progress", 0)
         if not isinstance(code, int) or not isinstance(done, int | float):
             raise NodeOdmError(f"{self._url} does not say how task {task} is: is it a NodeODM server?")
-        return OdmTask(code, float(done), printable(str(status.get("errorMessage") or "it gave no reason")))
+        return OdmTask(code, float(done), str(status.get("errorMessage") or "it gave no reason")[:_SAID])
 
     def results(self, task: str, path: Path, progress: Progress) -> None:
         """Wait for a task's end and put all of its results under `path`, whole or not at all. A server that does not
@@ -246,7 +249,7 @@ class NodeOdm:
         if not isinstance(said, dict):
             raise NodeOdmError(f"{self._url} answers, but not as a NodeODM server does: check the address")
         if said.get("error"):
-            raise NodeOdmError(f"{self._url} refuses: {printable(str(said['error'])[:300])}")
+            raise NodeOdmError(f"{self._url} refuses: {str(said['error'])[:_SAID]}")
         return said
 
     def _opened(self, where: str, form: tuple[str, bytes] | None, timeout_s: float = _TIMEOUT_S) -> Any:
@@ -274,7 +277,7 @@ class NodeOdm:
 def _public(address: str) -> str:
     """An address without what may be secret in it: names, passwords and questions, which hold the token."""
     parts = urllib.parse.urlsplit(address)
-    return printable(urllib.parse.urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", "")))
+    return urllib.parse.urlunsplit((parts.scheme, parts.netloc.rpartition("@")[2], parts.path, "", ""))
 
 
 class _NoDetours(urllib.request.HTTPRedirectHandler):
