@@ -1,14 +1,17 @@
-"""Clocks: read the time, and wait. Each part is given a clock; tests and replays pass their own."""
+"""Clocks: read the time, wait, and run threads. Each part is given a clock; tests and replays pass their own."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
 from typing import Protocol
 
 
 class Clock(Protocol):
-    """Two times that run at the same rate, and waits against them. All times are integer nanoseconds."""
+    """Two times that run at the same rate, waits against them, and the threads that wait. Times are integer
+    nanoseconds. A thread that was started here waits through this clock alone, so that a simulated one may know
+    of every wait."""
 
     def monotonic_ns(self) -> int:
         """Time that never steps, the same in every process of this machine (CLOCK_MONOTONIC)."""
@@ -19,8 +22,36 @@ class Clock(Protocol):
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
         """Until the event is set (True) or this clock has gone on by `timeout_s` (False)."""
 
+    def wait_for(self, changed: threading.Condition, holds: Callable[[], object], timeout_s: float | None) -> bool:
+        """As `changed.wait_for`, whose lock is held: patience with another thread, in the machine's time (None: without
+        end)."""
 
-class SystemClock:
+    def start(self, run: Callable[[], None], name: str) -> threading.Thread:
+        """Start a daemon thread."""
+
+    def join(self, thread: threading.Thread, timeout_s: float) -> None:
+        """Wait for the end of a thread that was started here, in the machine's time."""
+
+
+class _MachineThreads:
+    """Threads that the machine runs."""
+
+    def wait_for(self, changed: threading.Condition, holds: Callable[[], object], timeout_s: float | None) -> bool:
+        """See Clock."""
+        return bool(changed.wait_for(holds, timeout_s))
+
+    def start(self, run: Callable[[], None], name: str) -> threading.Thread:
+        """See Clock."""
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        thread.start()
+        return thread
+
+    def join(self, thread: threading.Thread, timeout_s: float) -> None:
+        """See Clock."""
+        thread.join(timeout_s)
+
+
+class SystemClock(_MachineThreads):
     """The machine's clock. UTC is the monotonic time plus an offset that is read once, at the flight's start.
 
     A step of the system's time of day (NTP, a person) does not reach it, so intervals between stamps are exact.
@@ -52,7 +83,7 @@ class TimeOfDayClock(SystemClock):
         return time.time_ns()
 
 
-class RecordedClock:
+class RecordedClock(_MachineThreads):
     """A clock that stands still until it is advanced: for replays, and for tests.
 
     `advance_to` moves it (never backwards). `close` ends every wait, so that no thread

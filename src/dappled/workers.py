@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Generic, Literal, TypeVar
 
+from dappled.clock import Clock, SystemClock
 from dappled.errors import report
 
 Item = TypeVar("Item")
@@ -35,33 +36,44 @@ class Statistics:
 class Loop:
     """One daemon thread that calls `run` once; `run` returns soon after `stopping` is set.
 
-    Loops that end together may share `stopping`.
+    Loops that end together may share `stopping`. `clock` starts the thread, and knows its waits.
     """
 
-    def __init__(self, name: str, run: Callable[[], None], stopping: threading.Event | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        run: Callable[[], None],
+        stopping: threading.Event | None = None,
+        clock: Clock | None = None,
+    ) -> None:
         self.name = name
         self.stopping = stopping or threading.Event()
-        self._thread = threading.Thread(target=run, name=name, daemon=True)
+        self._clock = clock or SystemClock()
+        self._body = run
+        self._thread: threading.Thread | None = None
 
     @property
     def begun(self) -> bool:
         """Whether it was started; it may have ended since."""
-        return self._thread.ident is not None
+        return self._thread is not None
 
     def start(self) -> None:
         """Start the thread."""
-        self._thread.start()
+        self._thread = self._clock.start(self._body, self.name)
 
     def stop(self, timeout_s: float) -> bool:
         """Set `stopping` and wait for the thread, unless it calls this itself. Whether it has ended, or never began."""
         self.stopping.set()
-        if self._thread.is_alive() and self._thread is not threading.current_thread():
-            self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        thread = self._thread
+        if thread is None:
+            return True
+        if thread.is_alive() and thread is not threading.current_thread():
+            self._clock.join(thread, timeout_s)
+        return not thread.is_alive()
 
     def dead_threads(self) -> list[str]:
         """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        ended = self.begun and not self._thread.is_alive()
+        ended = self._thread is not None and not self._thread.is_alive()
         return [self.name] if ended and not self.stopping.is_set() else []
 
 
@@ -81,8 +93,9 @@ class Worker(Loop, Generic[Item]):
         policy: Policy = "refuse",
         on_drop: Callable[[Item], None] | None = None,
         on_failure: Callable[[Item, Exception], None] | None = None,
+        clock: Clock | None = None,
     ) -> None:
-        super().__init__(name, self._run)
+        super().__init__(name, self._run, clock=clock)
         self._work = work
         self._capacity = capacity
         self._policy = policy
@@ -148,7 +161,7 @@ class Worker(Loop, Generic[Item]):
             with self._changed:
                 self._busy = False
                 self._changed.notify_all()
-                self._changed.wait_for(lambda: self._items or self.stopping.is_set())
+                self._clock.wait_for(self._changed, lambda: self._items or self.stopping.is_set(), None)
                 if not self._items:
                     return
                 item = self._items.popleft()

@@ -45,7 +45,8 @@ UNREAD = {
 
 # What may make a thread besides `workers.Loop`, and why.
 THREADS = {
-    "workers.py": "`Loop` is one, and `share` joins its helpers without a limit of time",
+    "clock.py": "starts those of `Loop`, which is all that calls it",
+    "workers.py": "`share` joins its helpers without a limit of time",
     "daemon/console/__main__.py": "a timer ends the console's own process, whatever its other threads do",
     "daemon/console/app.py": "asyncio waits for the answers of two pools, in the console's own process",
     "daemon/console/offline.py": "asyncio waits for frames that one thread decodes, in the process of `dappled open`",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.config.settings import PoseSettings, Settings
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import ExposureTime, Navigation
@@ -16,10 +17,11 @@ from dappled.flight import recording
 NOW_NS = 1_790_000_000 * 10**9
 
 
-class TurningClock:
+class TurningClock(SystemClock):
     """Goes on only while somebody waits for it."""
 
     def __init__(self) -> None:
+        super().__init__(NOW_NS)
         self.now_ns = NOW_NS
 
     def monotonic_ns(self) -> int:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import errno
 import os
 import stat
-import threading
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.clock import SystemClock
 from dappled.drivers.mavlink import signing
 from dappled.drivers.mavlink.links import Framer, mavlink, pack
 from dappled.drivers.mavlink.signing import SignatureGuard, SigningError, SigningTime, Unsigned, timestamp_of
@@ -20,10 +20,11 @@ KEY = bytes(range(32))
 NOW_NS = 1_800_000_000 * 10**9
 
 
-class Clock:
+class Clock(SystemClock):
     """UTC that a test sets."""
 
     def __init__(self, utc_ns: int = NOW_NS) -> None:
+        super().__init__(0)
         self.ns = utc_ns
 
     def utc_ns(self) -> int:
@@ -31,9 +32,6 @@ class Clock:
 
     def monotonic_ns(self) -> int:
         return self.ns
-
-    def wait(self, event: threading.Event, timeout_s: float) -> bool:
-        raise NotImplementedError
 
 
 class Peer:
