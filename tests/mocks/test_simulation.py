@@ -12,8 +12,9 @@ import rawpy
 from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
+from dappled.errors import DappledError
 from dappled.mocks.scene.masked_camera import eos450d_camera, eos450d_f_number
-from dappled.mocks.simulation import SimulatedCamera, SimulationError, World
+from dappled.mocks.simulation import SimulatedCamera, World
 
 
 def settings(camera: str, mask: str) -> Settings:
@@ -37,7 +38,7 @@ def test_the_camera_is_the_one_of_the_settings(camera: str, mask: str, wanted: S
 
 def test_a_mask_that_cannot_be_simulated_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "coarse.toml").write_text("frequency_per_mm = 0.5\n")
-    with pytest.raises(SimulationError, match=r"^mask\.profile '.*coarse\.toml' can't be simulated: carriers 0\.00"):
+    with pytest.raises(DappledError, match=r"^mask\.profile '.*coarse\.toml' can't be simulated: carriers 0\.00"):
         SimulatedCamera("canon-eos-450d", str(tmp_path / "coarse.toml")).on_a_bench(World())
 
 

@@ -15,8 +15,8 @@ from dappled.cli import main
 from dappled.config import profiles
 from dappled.config.profiles import Lens
 from dappled.decode.optics.carriers import Sensor
+from dappled.errors import DappledError
 from dappled.products import chessboard
-from dappled.products.chessboard import ChessboardError
 from dappled.products.maps import eye
 
 SENSOR = Sensor((694, 922), (0.02, 0.0), (0.0, 0.02))  # half the reference camera's inner half, in every direction
@@ -75,9 +75,9 @@ def test_boards_seen_flat_on_are_refused() -> None:
     seen = [chessboard.corners(drawn((0, 0.0), aside=(0.4 * k - 1, 0.0)), BOARD) for k in range(5)]
     kept = [found for found in seen if found is not None]
     assert len(kept) == 5
-    with pytest.raises(ChessboardError, match="tilt the board"):
+    with pytest.raises(DappledError, match="tilt the board"):
         chessboard.fit(kept, [GRID] * 5, board=BOARD, sensor=SENSOR, focal_length_mm=50.0)
-    with pytest.raises(ChessboardError, match="found in 2 pictures"):
+    with pytest.raises(DappledError, match="found in 2 pictures"):
         chessboard.fit(kept[:2], [GRID] * 2, board=BOARD, sensor=SENSOR, focal_length_mm=50.0)
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from dappled.cli import decode_arguments
 from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.errors import DappledError
 from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
@@ -64,9 +65,9 @@ def _make_room(arguments: argparse.Namespace) -> None:
     if arguments.kind in REPLACED:
         refuse_existing(arguments, arguments.output)
     elif arguments.overwrite:
-        raise exports.ExportError(f"--overwrite goes with --as {', '.join(REPLACED)}: remove what is there yourself")
+        raise DappledError(f"--overwrite goes with --as {', '.join(REPLACED)}: remove what is there yourself")
     elif arguments.kind != "quilt" and arguments.output.exists():
-        raise exports.ExportError(f"{arguments.output} exists already: move it away, or choose another name")
+        raise DappledError(f"{arguments.output} exists already: move it away, or choose another name")
 
 
 def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Namespace) -> Path:
@@ -86,6 +87,6 @@ def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Na
             exports.rerun(path, found.field, found.refocus(), depth, distances)
         case _:
             if path.suffix != f".{kind}":
-                raise exports.ExportError(f"{path}: --as {kind} writes a .{kind} file; give it that ending")
+                raise DappledError(f"{path}: --as {kind} writes a .{kind} file; give it that ending")
             light_files.save(path, found.field, overwrite=arguments.overwrite)
     return path

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from dappled.decode.errors import DecodeError, NoLattice
+from dappled.decode.errors import DecodeError
 
-__all__ = ["DecodeError", "NoLattice"]
+__all__ = ["DecodeError"]

@@ -20,7 +20,3 @@ class NoCarriers(DecodeError):  # noqa: N818  # a finding, not a fault, as below
         self.expected = expected
         self.focal_length_mm = focal_length_mm
         self.f_number = f_number
-
-
-class NoLattice(DecodeError):  # noqa: N818  # a finding, not a fault: the frame is fine, but has no lattice in it
-    """The spectrum of a frame shows no lattice of carriers."""

@@ -57,7 +57,7 @@ class LensletDecoder:
     def with_white(
         cls, white_plane: Source, *, views_per_axis: int | None = None, workers: int = 1, rolloff: float | None = None
     ) -> LensletDecoder:
-        """A decoder with a white frame (float32 (H, W)). Raises NoLattice where that shows no lenslets."""
+        """A decoder with a white frame (float32 (H, W)). Raises DecodeError where that shows no lenslets."""
         shape = (white_plane.shape[0], white_plane.shape[1])
         spectrum = transform(white_plane, workers=workers)
         found = find_lattice(spectrum)
@@ -71,7 +71,7 @@ class LensletDecoder:
     def decode(
         self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
     ) -> LightField:
-        """The light field of a plane float32 (H, W). Raises DecodeError, NoLattice."""
+        """The light field of a plane float32 (H, W). Raises DecodeError, DecodeError."""
         return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
 
     def decode_reported(

@@ -44,14 +44,10 @@ _ROW_OF = {
 _Record = TypeVar("_Record")
 
 
-class IllegalTransitionError(FlightError):
-    """A shot can't go from its state to the one asked for."""
-
-
 def advance(index: int, old: ShotState, new: ShotState) -> ShotState:
-    """`new`, when a shot may go there from `old`. Raises IllegalTransitionError."""
+    """`new`, when a shot may go there from `old`. Raises FlightError."""
     if new not in TRANSITIONS[old]:
-        raise IllegalTransitionError(f"shot {index} is {old}: it can't become {new}")
+        raise FlightError(f"shot {index} is {old}: it can't become {new}")
     return new
 
 

@@ -50,10 +50,6 @@ class World:
     ground_m: float | None = None
 
 
-class SimulationError(DappledError):
-    """What is to be simulated can't be; one sentence."""
-
-
 _ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
 
 
@@ -77,13 +73,13 @@ class SimulatedCamera:
         return f"a Canon EOS 450D with {self.mask}" if self.profile == EOS_450D else "a masked camera"
 
     def on_a_bench(self, world: World) -> MaskedCamera:
-        """The camera before a white card. Raises SimulationError for a mask that can't be simulated."""
+        """The camera before a white card. Raises DappledError for a mask that can't be simulated."""
         if self.profile != EOS_450D:
             return reference_camera(world.seed, scale=world.scale, scene="white", real=world.real)
         try:
             return eos450d_camera(world.seed, profiles.mask(self.mask).mask, scene="white", real=world.real)
         except ValueError as error:
-            raise SimulationError(f"mask.profile {self.mask!r} can't be simulated: {error}") from None
+            raise DappledError(f"mask.profile {self.mask!r} can't be simulated: {error}") from None
 
     def f_number(self, camera: MaskedCamera) -> float:
         """The stop that is flown with: carriers are seen, and the aperture is wide enough for views."""

@@ -23,10 +23,6 @@ _SMALL_PX, _MIDDLE_PX = 480, 800  # longest sides of the reduced pictures
 _UNITS = 1000.0  # micrometres: OpenCV expects numbers of the size of pixels
 
 
-class ChessboardError(DappledError):
-    """The pictures don't calibrate a lens."""
-
-
 @dataclass(frozen=True, slots=True)
 class LensFit:
     """A fitted lens: `residual_um` is rms on the chip, `v_sigma_mm` one standard deviation."""
@@ -86,10 +82,10 @@ def fit(
 ) -> LensFit:
     """Fit the lens to corners (n, 2) in pixels of views, each with its `grid` to the sensor, as in `LightField`.
 
-    Raises ChessboardError where there are too few boards, or they leave the lens' distance uncertain.
+    Raises DappledError where there are too few boards, or they leave the lens' distance uncertain.
     """
     if len(seen) < LEAST_BOARDS:
-        raise ChessboardError(
+        raise DappledError(
             f"the board of {board[0]} × {board[1]} inner corners was found in {len(seen)} pictures, {LEAST_BOARDS} are "
             "needed: count its inner corners for --board, and show it whole and sharp"
         )
@@ -118,7 +114,7 @@ def fit(
     normals = np.array([eye.turn(np.asarray(one, np.float64).ravel())[:, 2] for one in turns])
     spread = math.acos(float(np.clip((normals @ normals.T).min(), -1, 1)))
     if not (math.isfinite(v_mm) and 0 < v_sigma_mm < _WORST_V * v_mm and spread > _LEAST_SPREAD):
-        raise ChessboardError(
+        raise DappledError(
             f"these pictures leave the lens' distance uncertain ({v_mm:.1f} ± {v_sigma_mm:.1f} mm): "
             "tilt the board by 20 to 40° both ways in some of them, and fill the frame"
         )

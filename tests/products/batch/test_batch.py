@@ -24,7 +24,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import Frame, disk_error
 from dappled.products.batch import batch, workers
-from dappled.products.batch.batch import Done, Job, Manifest, ManifestError
+from dappled.products.batch.batch import Done, Job, Manifest
 from dappled.products.exports import light_files
 from dappled.products.geotags import geotags
 from dappled.products.geotags.geotags import Placed
@@ -297,7 +297,7 @@ def test_workers_end_with_the_one_who_asked(tmp_path: Path) -> None:
 
 
 def test_two_batches_cant_share_a_folder(tmp_path: Path) -> None:
-    with Manifest(tmp_path), pytest.raises(ManifestError, match="another batch is writing to"):
+    with Manifest(tmp_path), pytest.raises(DappledError, match="another batch is writing to"):
         Manifest(tmp_path)
     with Manifest(tmp_path) as again:
         assert again.done == {}
@@ -317,13 +317,13 @@ def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
         assert not manifest.holds("c")
     assert len(path.read_text().splitlines()) == 2
     path.write_text("no manifest\n")
-    with pytest.raises(ManifestError, match="line 1"):
+    with pytest.raises(DappledError, match="line 1"):
         Manifest(tmp_path)
 
 
 def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
-    with pytest.raises(workers.ClusterError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
+    with pytest.raises(DappledError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         list(workers.on_cluster([job("1")], answer, "tcp://127.0.0.1:9"))
 
 
@@ -392,7 +392,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
 def test_a_scheduler_without_workers_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed")
     monkeypatch.setattr(workers, "_WORKERS_S", 0.2)
-    with Cluster(tmp_path, crew=0) as alone, pytest.raises(workers.ClusterError, match="has no workers"):
+    with Cluster(tmp_path, crew=0) as alone, pytest.raises(DappledError, match="has no workers"):
         list(workers.on_cluster([job("1")], answer, alone.address()))
 
 

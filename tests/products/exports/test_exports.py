@@ -13,8 +13,8 @@ from scipy import io
 
 from dappled.decode.depth import estimate, evidence
 from dappled.decode.lightfield.light_field import ViewStack
+from dappled.errors import DappledError
 from dappled.products.exports import exports, view_folders
-from dappled.products.exports.exports import ExportError
 from tests.products.fields import DISPARITY, light_field
 
 
@@ -107,20 +107,20 @@ def test_a_quilt_begins_at_the_lower_left_with_the_leftmost_view(
 def test_nothing_is_overwritten_and_misfits_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     field = light_field(n=3)
     exports.mat(tmp_path / "a.mat", field)
-    with pytest.raises(ExportError, match="exists already"):
+    with pytest.raises(DappledError, match="exists already"):
         exports.mat(tmp_path / "a.mat", field)
-    with pytest.raises(ExportError, match="don't fit into lenslets of 2 px"):
+    with pytest.raises(DappledError, match="don't fit into lenslets of 2 px"):
         exports.eslf(tmp_path / "e.png", field, 2)
     monkeypatch.setattr(exports, "_LARGEST_MAT", 10)
-    with pytest.raises(ExportError, match="export as h5"):
+    with pytest.raises(DappledError, match="export as h5"):
         exports.mat(tmp_path / "b.mat", field)
-    with pytest.raises(ExportError, match="can't be written"):
+    with pytest.raises(DappledError, match="can't be written"):
         exports.hci(tmp_path / "gone" / "hci", field)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mat"]
 
 
 def test_an_eslf_picture_leaves_a_text_of_its_name_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("of a day in the field")
-    with pytest.raises(ExportError, match=r"notes\.txt exists already"):
+    with pytest.raises(DappledError, match=r"notes\.txt exists already"):
         exports.eslf(tmp_path / "notes.png", light_field())
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("notes.txt", "of a day in the field")]

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from dappled.drivers.reader_process import Budget
+from dappled.errors import DappledError
 from dappled.products.exports import h5_reader
-from dappled.products.exports.light_files import LightFileError, load, save
+from dappled.products.exports.light_files import load, save
 from tests.products.exports.test_light_files import light_field
 
 
@@ -40,6 +41,6 @@ def test_a_library_that_hangs_or_crashes_is_a_sentence(
     other.chmod(0o755)
     monkeypatch.setattr(sys, "executable", str(other))
     monkeypatch.setattr(h5_reader, "_BUDGET", Budget(20e6, patience_s=0.5))
-    with pytest.raises(LightFileError, match=words) as caught:
+    with pytest.raises(DappledError, match=words) as caught:
         load(h5)
     assert str(h5) in str(caught.value)

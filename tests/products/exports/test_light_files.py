@@ -14,8 +14,9 @@ import xarray
 import zarr
 
 from dappled.decode.lightfield.light_field import LightField
+from dappled.errors import DappledError
 from dappled.products.exports import light_files
-from dappled.products.exports.light_files import LightFileError, load, save
+from dappled.products.exports.light_files import load, save
 
 KINDS = [".zarr", ".npz", ".h5"]
 ATTRIBUTES = {
@@ -74,7 +75,7 @@ def test_nothing_is_overwritten_unasked(tmp_path: Path, kind: str) -> None:
     needs(kind)
     path, first, second = tmp_path / f"a{kind}", light_field(), replace(light_field(), attributes={"n": 2})
     save(path, first)
-    with pytest.raises(LightFileError, match="exists already"):
+    with pytest.raises(DappledError, match="exists already"):
         save(path, second)
     assert load(path).attributes == ATTRIBUTES
     save(path, second, overwrite=True)
@@ -92,7 +93,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, kind: str, mon
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", refuse)
-    with pytest.raises(LightFileError, match=r"cannot write the light field .*No space left"):
+    with pytest.raises(DappledError, match=r"cannot write the light field .*No space left"):
         save(path, replace(light_field(), attributes={}), overwrite=True)
     monkeypatch.undo()
     assert load(path).attributes == ATTRIBUTES
@@ -101,7 +102,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, kind: str, mon
 
 def test_an_npz_that_lacks_an_array_is_refused_by_its_name(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", views=np.zeros(2))
-    with pytest.raises(LightFileError, match=r"a.npz is not a light field: it lacks 'attributes'$"):
+    with pytest.raises(DappledError, match=r"a.npz is not a light field: it lacks 'attributes'$"):
         load(tmp_path / "a.npz")
 
 
@@ -133,20 +134,20 @@ def test_attributes_may_hold_numpy_numbers_and_paths(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("bad", [float("nan"), object()])
 def test_attributes_that_are_no_json_are_told(tmp_path: Path, bad: object) -> None:
-    with pytest.raises(LightFileError, match="don't fit into JSON"):
+    with pytest.raises(DappledError, match="don't fit into JSON"):
         save(tmp_path / "a.npz", replace(light_field(), attributes={"a": bad}))
 
 
 def test_without_hdf5_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    with pytest.raises(LightFileError, match=r"pip install 'dappled\[ground\]'"):
+    with pytest.raises(DappledError, match=r"pip install 'dappled\[ground\]'"):
         save(tmp_path / "a.h5", light_field())
 
 
 def test_doubts_that_are_no_sentences_are_told(tmp_path: Path) -> None:
     for bad in (5, "one", [1]):
         save(tmp_path / "a.npz", replace(light_field(), attributes={"doubts": bad}), overwrite=True)
-        with pytest.raises(LightFileError, match="its attribute doubts is not a list of texts"):
+        with pytest.raises(DappledError, match="its attribute doubts is not a list of texts"):
             load(tmp_path / "a.npz")
 
 
@@ -164,7 +165,7 @@ def test_standard_errors_of_views_are_kept_and_old_files_have_none(tmp_path: Pat
 @pytest.mark.parametrize("name", ["a.tiff", "a"])
 def test_other_extensions_are_told(tmp_path: Path, name: str) -> None:
     for act in (lambda: save(tmp_path / name, light_field()), lambda: load(tmp_path / name)):
-        with pytest.raises(LightFileError, match=r"ends in \.zarr, \.npz or \.h5"):
+        with pytest.raises(DappledError, match=r"ends in \.zarr, \.npz or \.h5"):
             act()
 
 
@@ -174,7 +175,7 @@ def test_shapes_that_contradict_are_told(tmp_path: Path) -> None:
         (replace(light_field(), slices=np.zeros((4, 6), np.complex64)), "slices has 2 dimensions"),
         (replace(light_field(), view_offsets=np.zeros((3, 2, 2))), "view_offsets has the shape"),
     ):
-        with pytest.raises(LightFileError, match=words):
+        with pytest.raises(DappledError, match=words):
             save(tmp_path / "a.npz", field)
     assert os.listdir(tmp_path) == []
 
@@ -183,10 +184,10 @@ def test_shapes_that_contradict_are_told(tmp_path: Path) -> None:
 def test_missing_and_damaged_files_are_told(tmp_path: Path, kind: str) -> None:
     needs(kind)
     path = tmp_path / f"a{kind}"
-    with pytest.raises(LightFileError, match="there is no light field"):
+    with pytest.raises(DappledError, match="there is no light field"):
         load(path)
     path.write_bytes(b"garbage" * 50)
-    with pytest.raises(LightFileError, match="is not a light field"):
+    with pytest.raises(DappledError, match="is not a light field"):
         load(path)
 
 
@@ -199,7 +200,7 @@ def test_a_file_that_lacks_an_array_is_told(tmp_path: Path, kind: str, monkeypat
         patch.setattr(light_files, "_ARRAYS", without)
         patch.setattr(light_files, "_fits", lambda *_: None)
         save(path, light_field())
-    with pytest.raises(LightFileError, match=r"not a light field.*grid"):
+    with pytest.raises(DappledError, match=r"not a light field.*grid"):
         load(path)
 
 

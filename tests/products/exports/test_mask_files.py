@@ -13,6 +13,7 @@ import pytest
 from dappled.decode.optics import laser_bench
 from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.film import MaskImage, film_of
+from dappled.errors import DappledError
 from dappled.products.exports import mask_files
 from tests.decode.optics.equations import spots
 
@@ -57,12 +58,12 @@ def test_a_16k_mask_takes_less_than_200_mb(tmp_path: Path, name: str) -> None:
 
 def test_a_wrong_file_is_answered(tmp_path: Path) -> None:
     tile = MaskImage(Mask(11.38, 2), film_of(50, 50, 113.8), (10, 10)).levels
-    with pytest.raises(mask_files.MaskFileError, match=r"must end in .png or .tif"):
+    with pytest.raises(DappledError, match=r"must end in .png or .tif"):
         mask_files.write(tmp_path / "mask.jpg", (50, 50), 8, (113.8, 113.8), tile)
-    with pytest.raises(mask_files.MaskFileError, match="can't be written"):
+    with pytest.raises(DappledError, match="can't be written"):
         mask_files.write(tmp_path / "nowhere" / "mask.png", (50, 50), 8, (113.8, 113.8), tile)
     (tmp_path / "text.png").write_text("no image")
-    with pytest.raises(mask_files.MaskFileError, match="can't be read as an image"):
+    with pytest.raises(DappledError, match="can't be read as an image"):
         mask_files.read(tmp_path / "text.png")
 
 
@@ -76,7 +77,7 @@ def test_a_wrong_file_is_answered(tmp_path: Path) -> None:
 )
 def test_a_wrong_csv_is_answered(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "spots.csv").write_text(text)
-    with pytest.raises(mask_files.MaskFileError, match=said):
+    with pytest.raises(DappledError, match=said):
         mask_files.read_spots(tmp_path / "spots.csv")
 
 
@@ -86,5 +87,5 @@ def test_csv_of_people(tmp_path: Path) -> None:
     (tmp_path / "curve.csv").write_text("level,density\n255,0.1\n0,2.1\n128,0.9\n")
     assert mask_files.read_density_curve(tmp_path / "curve.csv").range == pytest.approx((10**-2.1, 10**-0.1))
     (tmp_path / "bad.csv").write_text("level,density\n255,0.1\n0,2.1\n128,5.9\n")
-    with pytest.raises(mask_files.MaskFileError, match=r"bad.csv: the density reverses"):
+    with pytest.raises(DappledError, match=r"bad.csv: the density reverses"):
         mask_files.read_density_curve(tmp_path / "bad.csv")

@@ -20,7 +20,8 @@ import zarr
 import zarr.codecs
 from numcodecs import Blosc, GZip, Zstd
 
-from dappled.products.exports.light_files import LightFileError, load, save
+from dappled.errors import DappledError
+from dappled.products.exports.light_files import load, save
 from tests.products.exports.test_light_files import light_field
 
 NAMES = ("slices", "carriers", "views", "view_offsets", "grid")
@@ -49,7 +50,7 @@ def edit(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 
 def refuses(path: Path, words: str) -> None:
-    with pytest.raises(LightFileError, match=words) as caught:
+    with pytest.raises(DappledError, match=words) as caught:
         load(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -125,7 +126,7 @@ def test_metadata_that_is_hostile(group: Path, text: str) -> None:
     for place in (group / "zarr.json", group / "grid" / "zarr.json"):
         kept = place.read_text()
         place.write_text(text, encoding="latin-1")
-        with pytest.raises(LightFileError):
+        with pytest.raises(DappledError):
             load(group)
         place.write_text(kept)
 
@@ -206,7 +207,7 @@ def test_headers_that_are_hostile(tmp_path: Path, data: bytes, words: str) -> No
 def test_attributes_of_npz_that_are_hostile(tmp_path: Path, text: str) -> None:
     descr = f"'<U{len(text)}'"
     path = npz(tmp_path / "a.npz", attributes=claim("()", descr) + text.encode("utf-32-le"))
-    with pytest.raises(LightFileError, match=str(path)):
+    with pytest.raises(DappledError, match=str(path)):
         load(path)
 
 
@@ -255,7 +256,7 @@ def test_a_dataset_that_lies_elsewhere(h5: Path, tmp_path: Path) -> None:
     replaced(h5, lambda file: file.create_dataset("slices", (5, 4, 6), np.complex64, external=zeros))
     refuses(h5, "slices stands in another file")
     replaced(h5, lambda file: file.update({"slices": h5py.ExternalLink(str(tmp_path / "no.h5"), "slices")}))
-    with pytest.raises(LightFileError):
+    with pytest.raises(DappledError):
         load(h5)
 
 
@@ -279,7 +280,7 @@ def test_datasets_that_were_packed_again_come_back(h5: Path) -> None:
 def test_attributes_of_h5_that_are_hostile(h5: Path, value: Any) -> None:
     with h5py.File(h5, "r+") as file:
         file.attrs["attributes"] = value
-    with pytest.raises(LightFileError, match=str(h5)):
+    with pytest.raises(DappledError, match=str(h5)):
         load(h5)
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from dappled.decode.depth.ranging import DistanceMap
 from dappled.decode.geometry import Pose
+from dappled.errors import DappledError
 from dappled.flight import Frame, Tag
 from dappled.products.exports import point_cloud
-from dappled.products.exports.point_cloud import PointCloudError
 from dappled.products.maps import photographs
 from dappled.products.mounting import Mounting
 from tests.products.fields import light_field
@@ -81,11 +81,11 @@ def test_a_las_comes_back(tmp_path: Path) -> None:
 
 def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
     cloud = point_cloud.of(FIELD, PICTURE, distances())
-    with pytest.raises(PointCloudError, match=r"\.ply, \.las or \.laz"):
+    with pytest.raises(DappledError, match=r"\.ply, \.las or \.laz"):
         point_cloud.write(tmp_path / "a.xyz", cloud)
     nothing = point_cloud.of(FIELD, PICTURE, distances(), most_sigma=0.001)
-    with pytest.raises(PointCloudError, match="4000 withheld"):
+    with pytest.raises(DappledError, match="4000 withheld"):
         point_cloud.write(tmp_path / "a.ply", nothing)
-    with pytest.raises(PointCloudError, match="camera and focal length"):
+    with pytest.raises(DappledError, match="camera and focal length"):
         point_cloud.of(light_field(camera=None), PICTURE, distances())
     assert list(tmp_path.iterdir()) == []

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from dappled.errors import DappledError
 from dappled.products.exports import prints
-from dappled.products.exports.prints import PrintError
 
 
 def test_tones_and_colours_keep_order_and_show_the_unknown() -> None:
@@ -31,7 +31,7 @@ def test_a_mosaic_holds_every_picture() -> None:
     sheet = prints.mosaic(pictures, ["a", "b", "c", "d"])
     for k in range(1, 5):
         assert (sheet == 40 * k).all(axis=2).sum() >= 600
-    with pytest.raises(PrintError, match="no picture"):
+    with pytest.raises(DappledError, match="no picture"):
         prints.mosaic([])
 
 
@@ -39,9 +39,9 @@ def test_pictures_are_written_whole_or_not_at_all(tmp_path: Path) -> None:
     prints.save(tmp_path / "a.png", np.zeros((4, 5), np.uint8))
     with Image.open(tmp_path / "a.png") as picture:
         assert picture.size == (5, 4)
-    with pytest.raises(PrintError, match="must end in"):
+    with pytest.raises(DappledError, match="must end in"):
         prints.save(tmp_path / "a.gif", np.zeros((4, 5), np.uint8))
-    with pytest.raises(PrintError, match="can't be written"):
+    with pytest.raises(DappledError, match="can't be written"):
         prints.save(tmp_path / "gone" / "a.png", np.zeros((4, 5), np.uint8))
     assert [p.name for p in tmp_path.iterdir()] == ["a.png"]
     assert prints.white_of([np.full((3, 3), np.nan)]) == 1.0

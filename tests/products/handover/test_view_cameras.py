@@ -14,11 +14,11 @@ import pytest
 
 from dappled import durable
 from dappled.decode.geometry import camera_pose
+from dappled.errors import DappledError
 from dappled.flight import Frame, Tag
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.products.handover import colmap, forms, nerfstudio, stac, view_cameras, view_files
-from dappled.products.handover.stac import StacError
-from dappled.products.handover.view_cameras import FrameCameras, ViewCamera, ViewCameraError
+from dappled.products.handover.view_cameras import FrameCameras, ViewCamera
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.photographs import Photograph, Station
 from tests.products.flown import as_recorded
@@ -74,13 +74,13 @@ def test_a_turned_picture_is_a_turned_camera() -> None:
 @pytest.mark.parametrize("matrix", [[[800, 80, 1], [0, 750, 1], [0, 0, 1]], [[-800, 0, 1], [0, 750, 1], [0, 0, 1]]])
 def test_skewed_and_mirrored_views_are_refused(matrix: list[list[float]]) -> None:
     one, station = photograph(matrix)
-    with pytest.raises(ViewCameraError, match=r"frames/000000.dng are skewed or mirrored"):
+    with pytest.raises(DappledError, match=r"frames/000000.dng are skewed or mirrored"):
         view_cameras.of_photograph(one, ["v0u0", "v0u1"], station, 25.0, None)
 
 
 def test_a_frame_without_views_is_refused(tmp_path: Path) -> None:
     one, station = photograph([[800, 0, 1], [0, 750, 1], [0, 0, 1]])
-    with pytest.raises(ViewCameraError, match="has no views, only slices"):
+    with pytest.raises(DappledError, match="has no views, only slices"):
         view_files.write_frame(tmp_path, replace(one, views=None), (1, 2), station, focus_m=math.inf, utc_ns=None)
     assert not list(tmp_path.iterdir())
 
@@ -106,9 +106,9 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
 def test_a_damaged_record_is_one_sentence(tmp_path: Path, change: dict[str, object] | None) -> None:
     path = view_files.write_record(tmp_path, FRAME)
     path.write_text("[]" if change is None else json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(ViewCameraError, match=r"000000.json is no record of a frame's cameras: remove it"):
+    with pytest.raises(DappledError, match=r"000000.json is no record of a frame's cameras: remove it"):
         view_files.read_frames(tmp_path, ["000000"])
-    with pytest.raises(ViewCameraError, match=r"000001.json can't be read"):
+    with pytest.raises(DappledError, match=r"000001.json can't be read"):
         view_files.read_frames(tmp_path, ["000001"])
 
 
@@ -204,5 +204,5 @@ def test_a_full_disk_leaves_what_was_there(
 
 
 def test_an_item_of_somebody_else_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(StacError, match=r"000000.json is no item of this batch"):
+    with pytest.raises(DappledError, match=r"000000.json is no item of this batch"):
         forms.finish("stac", tmp_path, "flight", ["000000"])

@@ -10,9 +10,10 @@ import rasterio
 import rasterio.shutil
 from numpy.typing import NDArray
 
+from dappled.errors import DappledError
 from dappled.products.maps import ground as grounds
 from dappled.products.maps.earth import Geoid, Projection
-from dappled.products.maps.ground import Flat, GroundError, Raster
+from dappled.products.maps.ground import Flat, Raster
 from dappled.products.maps.references import BaseMap
 from tests.products.maps.test_eye import eye_at
 
@@ -146,10 +147,10 @@ def test_terrain_goes_on_over_the_antimeridian(tmp_path: Path, west: float) -> N
 def test_bad_terrain_is_a_sentence(tmp_path: Path) -> None:
     east, north = eye_at().centre[:2]
     bounds = (east - 20, north - 20, east + 20, north + 20)
-    with pytest.raises(GroundError, match="can't be read"):
+    with pytest.raises(DappledError, match="can't be read"):
         grounds.load(tmp_path / "none.tif", PROJECTION, bounds)
     elsewhere = write(tmp_path / "elsewhere.tif", hill(), "EPSG:32633")
-    with pytest.raises(GroundError, match=r"elsewhere\.tif lies elsewhere"):
+    with pytest.raises(DappledError, match=r"elsewhere\.tif lies elsewhere"):
         grounds.load(elsewhere, PROJECTION, bounds)
     with (
         pytest.warns(rasterio.errors.NotGeoreferencedWarning),
@@ -158,6 +159,6 @@ def test_bad_terrain_is_a_sentence(tmp_path: Path) -> None:
         pass
     with (
         pytest.warns(rasterio.errors.NotGeoreferencedWarning),
-        pytest.raises(GroundError, match="has no coordinates"),
+        pytest.raises(DappledError, match="has no coordinates"),
     ):
         grounds.load(tmp_path / "nowhere.tif", PROJECTION, bounds)

@@ -14,11 +14,11 @@ import tomli_w
 from dappled.cli import main
 from dappled.config import profiles
 from dappled.config.profiles import Lens
+from dappled.errors import DappledError
 from dappled.mocks.simulation import CAMERA, MASK
 from dappled.products.maps import self_calibration
 from dappled.products.maps.ground import Flat
 from dappled.products.maps.photographs import Photograph
-from dappled.products.maps.self_calibration import SelfCalibrationError
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.maps.test_eye import GRID, SHAPE, eye_at
@@ -41,7 +41,7 @@ def photographs(count: int, lenses: tuple[Lens, ...] = (LENS,)) -> list[Photogra
     ],
 )
 def test_frames_that_cannot_tell_a_lens_are_a_sentence(some: list[Photograph], says: str) -> None:
-    with pytest.raises(SelfCalibrationError, match=says):
+    with pytest.raises(DappledError, match=says):
         self_calibration.find(some, Flat(0.0))
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dappled.errors import DappledError
 from dappled.products.survey import stereo_pair
-from dappled.products.survey.stereo_pair import StereoPairError
 from tests.products.survey import seen
 from tests.products.survey.test_flight_sweep import BOX_M, box
 
@@ -40,5 +40,5 @@ def test_the_ground_lies_still_and_a_box_moves_sideways() -> None:
 
 
 def test_frames_that_share_too_little_are_refused() -> None:
-    with pytest.raises(StereoPairError, match="needs frames that overlap"):
+    with pytest.raises(DappledError, match="needs frames that overlap"):
         stereo_pair.pair(seen.flown([(0.0, 0.0), (60.0, 0.0)], gsd_m=0.1))

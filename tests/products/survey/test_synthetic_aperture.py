@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.cli import georeference, main
+from dappled.errors import DappledError
 from dappled.products.maps.ground import Flat
 from dappled.products.survey import synthetic_aperture
-from dappled.products.survey.synthetic_aperture import FlightRefocusError, RefocusedGround
+from dappled.products.survey.synthetic_aperture import RefocusedGround
 from tests.products.survey import seen
 
 LINE = [(0.0, 0.5 * k - 2.0) for k in range(9)]
@@ -90,9 +91,9 @@ def test_the_blur_of_poses_is_told_and_doubted() -> None:
 
 def test_what_has_no_aperture_is_refused() -> None:
     flight = seen.flown(LINE[:2])
-    with pytest.raises(FlightRefocusError, match="a flight of one frame has no aperture"):
+    with pytest.raises(DappledError, match="a flight of one frame has no aperture"):
         synthetic_aperture.refocus(replace(flight, photographs=flight.photographs[:1]), quiet)
-    with pytest.raises(FlightRefocusError, match="was not taken from above a surface 35 m above ground"):
+    with pytest.raises(DappledError, match="was not taken from above a surface 35 m above ground"):
         synthetic_aperture.refocus(flight, quiet, above_m=35.0)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled.decode.errors import NoLattice
+from dappled.decode.errors import DecodeError
 from dappled.decode.optics import Carrier, Lattice, Order
 from dappled.decode.spectrum.peaks import Measured, fit, is_suspect, lattice_from, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum
@@ -65,11 +65,11 @@ class Candidate:
 
 
 def find_lattice(spectrum: Spectrum) -> FoundLattice:
-    """Find the lattice of carriers in a whole spectrum without a prediction. Raises NoLattice where there is none."""
+    """Find the lattice of carriers in a whole spectrum without a prediction. Raises DecodeError where there is none."""
     found = candidates(spectrum)
     strongest = [c for c in found if not _artefact(c, spectrum)][:_CANDIDATES]
     if len(strongest) < 3:
-        raise NoLattice(
+        raise DecodeError(
             f"no carriers: {len(strongest)} peaks stand out of this spectrum, a lattice needs more. "
             "Is this a frame from behind a mask or lenslets?"
         )
@@ -88,13 +88,13 @@ def find_lattice(spectrum: Spectrum) -> FoundLattice:
         verified = [(c, m) for c, m in zip(looked, peaks, strict=True) if m is not None and not m.suspect]
         orders = np.array([(c.ky, c.kx) for c, _ in verified])
         if len(verified) < _SMALLEST_VERIFIED or np.linalg.matrix_rank(orders) < 2:
-            raise NoLattice(
+            raise DecodeError(
                 f"no carriers: of {predicted} points of the likeliest lattice only {len(verified)} show a peak. "
                 "Is this a frame from behind a mask or lenslets?"
             )
         lattice = fit(verified)
     if not _believable(verified, predicted):
-        raise NoLattice(
+        raise DecodeError(
             f"no carriers: the likeliest lattice explains {len(verified)} of its {predicted} points, "
             "no more than chance does. Is this a frame from behind a mask or lenslets?"
         )
@@ -164,7 +164,7 @@ def _vote(points: NDArray[np.float64], weights: NDArray[np.float64], spectrum: S
         if score > best_score:
             best, best_score = basis, score
     if best is None:
-        raise NoLattice("no carriers: the peaks of this spectrum lie on no lattice together")
+        raise DecodeError("no carriers: the peaks of this spectrum lie on no lattice together")
     return reduced(best)
 
 

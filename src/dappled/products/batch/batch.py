@@ -351,15 +351,11 @@ def _settle_memory() -> None:
     mallopt(_MMAP_THRESHOLD, 1 << 25)
 
 
-class ManifestError(DappledError):
-    """A manifest can't be used."""
-
-
 class Manifest:
     """The manifest of an output folder, locked by one batch at a time. Use as a context manager."""
 
     def __init__(self, output: Path) -> None:
-        """Raises ManifestError where another batch is writing to this folder, or the disk refuses."""
+        """Raises DappledError where another batch is writing to this folder, or the disk refuses."""
         self.path = output / MANIFEST
         try:
             durable.make_folder(output)
@@ -368,11 +364,9 @@ class Manifest:
                 file_lock.lock(self._fd)
             except BlockingIOError:
                 os.close(self._fd)
-                raise ManifestError(
-                    f"another batch is writing to {output}: wait for it, or choose another -o"
-                ) from None
+                raise DappledError(f"another batch is writing to {output}: wait for it, or choose another -o") from None
         except OSError as error:
-            raise ManifestError(f"cannot keep a manifest in {output}: {error.strerror}") from None
+            raise DappledError(f"cannot keep a manifest in {output}: {error.strerror}") from None
         self._latest: dict[str, str] = {}  # the SHA-256 of each output as it was last written, by its name
         self.done: dict[str, Done] = {}
         for done in self._read():
@@ -425,7 +419,7 @@ class Manifest:
             try:
                 done = _done(parse_json(line, _LINE_BYTES))
             except (ValueError, TypeError, KeyError):
-                raise ManifestError(
+                raise DappledError(
                     f"{self.path}, line {number} is not a line of a manifest: move the file away, "
                     "and everything will be made again"
                 ) from None

@@ -35,10 +35,6 @@ JOB_S = 900.0  # a frame takes seconds: a worker that has not answered for so lo
 Make = Callable[[Job], Done]
 
 
-class ClusterError(DappledError):
-    """A Dask cluster can't be used."""
-
-
 @dataclass(slots=True)
 class _Worker:
     process: BaseProcess
@@ -92,20 +88,20 @@ def in_processes(
 def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done]:
     """Run jobs on the workers of a Dask scheduler, which must see the same folders under the same names.
 
-    Raises ClusterError where the scheduler does not answer, or has no worker within a minute.
+    Raises DappledError where the scheduler does not answer, or has no worker within a minute.
     """
     distributed = need("distributed")
     try:
         client = distributed.Client(scheduler, timeout=_PATIENCE_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
-        raise ClusterError(
+        raise DappledError(
             f"no Dask scheduler answers at {scheduler} ({error}): start one with dask scheduler"
         ) from None
     with client:
         try:
             client.wait_for_workers(1, timeout=_WORKERS_S)
         except TimeoutError:
-            raise ClusterError(
+            raise DappledError(
                 f"the Dask scheduler at {scheduler} has no workers: start some with dask worker {scheduler}"
             ) from None
         named = {job.key: job for job in jobs}

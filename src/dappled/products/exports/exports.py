@@ -33,10 +33,6 @@ ESLF_LENSLET_PX = 14  # LFToolbox' and LiFF's readers assume this size
 _LARGEST_MAT = 2**31 - 1  # bytes of one variable in a version 5 file
 
 
-class ExportError(DappledError):
-    """A light field can't be exported."""
-
-
 def as_cameras(stack: ViewStack) -> NDArray[np.float32]:
     """The views (V, U, h, w(, 3)) in the order of cameras: rows from the top one, columns from the left one."""
     views = stack.views
@@ -49,7 +45,7 @@ def as_cameras(stack: ViewStack) -> NDArray[np.float32]:
 
 def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
     """Write a folder of HCI's 4D light field benchmark: input_Cam000.png …, parameters.cfg and, with a depth map,
-    disp_estimate.pfm (NaN where unknown). Raises ExportError."""
+    disp_estimate.pfm (NaN where unknown). Raises DappledError."""
     stack = ViewStack.of(field)
     views = as_cameras(stack)
     white = prints.white_of([views])
@@ -72,12 +68,12 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
     """Write an ESLF image: a 16-bit PNG in which each pixel of the views is a lenslet of `lenslet_px`² pixels.
 
     0 takes the number of views per axis; more leave black pixels around them. Size and white are written to a .txt of
-    the same name. Raises ExportError, also where either file exists.
+    the same name. Raises DappledError, also where either file exists.
     """
     views = as_cameras(ViewStack.of(field))
     side = lenslet_px or max(views.shape[:2])
     if side < max(views.shape[:2]):
-        raise ExportError(f"{views.shape[0]} × {views.shape[1]} views don't fit into lenslets of {side} px")
+        raise DappledError(f"{views.shape[0]} × {views.shape[1]} views don't fit into lenslets of {side} px")
     values, white = _sixteen_bits(views)
     count_v, count_u, height, width = values.shape[:4]
     colours = values.shape[4:]
@@ -92,7 +88,7 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
 
     beside = path.with_suffix(".txt")
     if beside.exists():
-        raise ExportError(f"{beside} exists already; choose another name")
+        raise DappledError(f"{beside} exists already; choose another name")
     _whole(path, write)
     note = f"lenslet_px = {side}\nviews = {count_v} x {count_u}\nwhite = {white:.6g}\n"
     _whole(beside, lambda part: part.write_text(note, encoding="utf-8"))
@@ -100,13 +96,13 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
 
 def mat(path: Path, field: LightField) -> None:
     """Write a MATLAB version 5 file as LFToolbox' LFUtilDecodeLytroFolder does: `LF` uint16 [t, s, v, u, c], c red,
-    green, blue and weight. Raises ExportError."""
+    green, blue and weight. Raises DappledError."""
     values, white = _sixteen_bits(as_cameras(ViewStack.of(field)))
     rgb = values if values.ndim == 5 else np.repeat(values[..., None], 3, axis=4)
     weight = np.full((*rgb.shape[:4], 1), 65535, dtype=np.uint16)
     lf = np.concatenate([rgb, weight], axis=4)
     if lf.nbytes > _LARGEST_MAT:
-        raise ExportError(
+        raise DappledError(
             f"{path}: {lf.nbytes / 1e9:.1f} GB don't fit into a version 5 .mat file; export as h5 instead"
         )
     content = {
@@ -125,7 +121,7 @@ def mat(path: Path, field: LightField) -> None:
 
 def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
     """Write a quilt for a light-field display: the middle row's views from left (bottom left) to right, converging on a
-    disparity. Returns the path, whose name ends in `_qs<columns>x<rows>a<aspect>`. Raises ExportError."""
+    disparity. Returns the path, whose name ends in `_qs<columns>x<rows>a<aspect>`. Raises DappledError."""
     stack = ViewStack.of(field)
     middle = int(np.argmin(np.abs(stack.row_steps)))
     order = np.argsort(-stack.column_steps)  # the left camera has the largest step
@@ -216,15 +212,15 @@ def _png16(path: Path, values: NDArray[np.uint16]) -> None:
 
 
 def _whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """`write` under another name, then rename. Raises ExportError where `path` exists, or the disk refuses."""
+    """`write` under another name, then rename. Raises DappledError where `path` exists, or the disk refuses."""
     if path.exists():
-        raise ExportError(f"{path} exists already: move it away, or choose another name")
+        raise DappledError(f"{path} exists already: move it away, or choose another name")
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         write(part)
         part.rename(path)
     except OSError as error:
-        raise ExportError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
     finally:
         if part.is_dir():
             shutil.rmtree(part)
@@ -240,11 +236,11 @@ def rerun(
     distances: DistanceMap | None = None,
 ) -> None:
     """Write a recording (.rrd) for the Rerun viewer: `view/v/u`, `picture`, `disparity`, `sigma`, and `points` where
-    distances are known. Nothing is sent anywhere. Raises ExportError without the extra `rerun`.
+    distances are known. Nothing is sent anywhere. Raises DappledError without the extra `rerun`.
     """
     rr = _rerun()
     if path.suffix != ".rrd":
-        raise ExportError(f"{path}: the name of a Rerun recording must end in .rrd")
+        raise DappledError(f"{path}: the name of a Rerun recording must end in .rrd")
 
     def write(part: Path) -> None:
         recording = rr.RecordingStream("dappled")
@@ -273,5 +269,5 @@ def _rerun() -> Any:
     try:
         import rerun  # noqa: PLC0415  optional: an extra of 764 MB
     except ImportError as error:
-        raise ExportError(f"a Rerun recording needs its library; {install_extra('rerun')}") from error
+        raise DappledError(f"a Rerun recording needs its library; {install_extra('rerun')}") from error
     return rerun

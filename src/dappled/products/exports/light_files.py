@@ -49,14 +49,10 @@ _NUMBERS = ("focal_length_mm", "f_number", "lenslet_pitch_px", "noise_rms")
 _WORDS = ("camera", "mask", "law", "aperture")
 
 
-class LightFileError(DappledError):
-    """A light field can't be written or read."""
-
-
 def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
     """Write a light field as .zarr, .npz or .h5, by the extension; whole and durable under its name, or not at all.
 
-    Raises LightFileError, also when the file exists and `overwrite` is false.
+    Raises DappledError, also when the file exists and `overwrite` is false.
     """
     write = _of(path, {".zarr": _save_zarr, ".npz": _save_npz, ".h5": _save_h5})
     arrays: _Arrays = {
@@ -67,14 +63,14 @@ def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
     _fits(path, arrays)
     attributes = _json(path, field.attributes)
     if path.exists() and not overwrite:
-        raise LightFileError(f"{path} exists already: choose another name, or --overwrite replaces it (overwrite=True)")
+        raise DappledError(f"{path} exists already: choose another name, or --overwrite replaces it (overwrite=True)")
     part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
     try:
         write(part, arrays, attributes)
         _sync(part)
         _put_in_place(part, path)
     except OSError as error:
-        raise LightFileError(f"cannot write the light field {path}: {error.strerror or error}") from error
+        raise DappledError(f"cannot write the light field {path}: {error.strerror or error}") from error
     finally:
         _remove(part)
 
@@ -82,28 +78,28 @@ def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
 def load(path: Path) -> LightField:
     """Read a light field that `save` wrote. What it claims is judged first: a damaged or hostile file takes no memory.
 
-    Raises LightFileError.
+    Raises DappledError.
     """
     read = _of(path, {".zarr": _load_zarr, ".npz": _load_npz, ".h5": _load_h5})
     if not path.exists():
-        raise LightFileError(f"there is no light field {path}; check the path")
+        raise DappledError(f"there is no light field {path}; check the path")
     try:
         arrays, attributes = read(path)
     except DappledError:
         raise
     except ClaimError as error:
-        raise LightFileError(f"{path}: {error}") from error
+        raise DappledError(f"{path}: {error}") from error
     except KeyError as error:
-        raise LightFileError(f"{path} is not a light field: it lacks {error}") from error
+        raise DappledError(f"{path} is not a light field: it lacks {error}") from error
     except MemoryError as error:
-        raise LightFileError(f"{path} needs more memory than is free: close other programs") from error
+        raise DappledError(f"{path} needs more memory than is free: close other programs") from error
     except Exception as error:  # the readers raise anything on damaged bytes
-        raise LightFileError(f"{path} is not a light field, or is damaged: {first_line(error)}") from error
+        raise DappledError(f"{path} is not a light field, or is damaged: {first_line(error)}") from error
     _check_attributes(path, attributes)
     _fits(path, arrays)
     for name, (kind, _) in {**_ARRAYS, **_ADDED}.items():
         if name in arrays and arrays[name].dtype != kind:
-            raise LightFileError(f"{path} is not a light field: {name} is {arrays[name].dtype}, not {np.dtype(kind)}")
+            raise DappledError(f"{path} is not a light field: {name} is {arrays[name].dtype}, not {np.dtype(kind)}")
     return LightField(**arrays, attributes=attributes)
 
 
@@ -126,44 +122,42 @@ def axes(arrays: Mapping[str, NDArray[Any]]) -> dict[str, tuple[str, ...]]:
 
 def _of(path: Path, kinds: Mapping[str, Callable[..., Any]]) -> Callable[..., Any]:
     if path.suffix not in kinds:
-        raise LightFileError(
+        raise DappledError(
             f"{path}: a light field's file ends in .zarr, .npz or .h5, not in {path.suffix or 'nothing'}"
         )
     return kinds[path.suffix]
 
 
 def _fits(path: Path, arrays: _Arrays) -> None:
-    """Check that the arrays' shapes agree with each other, as `LightField` has them. Raises LightFileError."""
+    """Check that the arrays' shapes agree with each other, as `LightField` has them. Raises DappledError."""
     for name, (_, dimensions) in {**_ARRAYS, **_ADDED}.items():
         if name in arrays and arrays[name].ndim != dimensions and not (name == "views" and arrays[name].ndim == 5):
-            raise LightFileError(f"{path}: {name} has {arrays[name].ndim} dimensions, a light field has {dimensions}")
+            raise DappledError(f"{path}: {name} has {arrays[name].ndim} dimensions, a light field has {dimensions}")
     slices, views = arrays["slices"].shape, arrays["views"].shape
     expected = {"carriers": (slices[0], 4), "view_offsets": (*views[:2], 2), "grid": (2, 3)}
     if "view_sigma" in arrays:
         expected["view_sigma"] = (*views[:2], *arrays["view_sigma"].shape[2:])
     for name, shape in expected.items():
         if arrays[name].shape != shape:
-            raise LightFileError(
-                f"{path}: {name} has the shape {arrays[name].shape}, beside the others it needs {shape}"
-            )
+            raise DappledError(f"{path}: {name} has the shape {arrays[name].shape}, beside the others it needs {shape}")
 
 
 def _check_attributes(path: Path, attributes: Any) -> None:
-    """Check what readers calculate with: numbers, words and the frame's shape. Raises LightFileError."""
+    """Check what readers calculate with: numbers, words and the frame's shape. Raises DappledError."""
     if not isinstance(attributes, dict):
-        raise LightFileError(f"{path} is not a light field: its attributes are not a JSON object")
+        raise DappledError(f"{path} is not a light field: its attributes are not a JSON object")
     kinds: dict[str, tuple[type, ...]] = {**dict.fromkeys(_NUMBERS, (int, float)), **dict.fromkeys(_WORDS, (str,))}
     for name, kind in kinds.items():
         value = attributes.get(name)
         if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
             what = "a text" if kind == (str,) else "a number"
-            raise LightFileError(f"{path}: its attribute {name} is not {what}; decode the frame again")
+            raise DappledError(f"{path}: its attribute {name} is not {what}; decode the frame again")
     doubts = attributes.get("doubts") or []
     if not (isinstance(doubts, list) and all(isinstance(one, str) for one in doubts)):
-        raise LightFileError(f"{path}: its attribute doubts is not a list of texts; decode the frame again")
+        raise DappledError(f"{path}: its attribute doubts is not a list of texts; decode the frame again")
     shape = attributes.get("shape", [1, 1])
     if not (isinstance(shape, list) and len(shape) == 2 and all(type(side) is int and side > 0 for side in shape)):
-        raise LightFileError(f"{path}: its attribute shape is not rows and columns; decode the frame again")
+        raise DappledError(f"{path}: its attribute shape is not rows and columns; decode the frame again")
 
 
 def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -177,7 +171,7 @@ def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
     try:
         text = json.dumps(dict(attributes), default=plain, allow_nan=False)
     except (TypeError, ValueError) as error:
-        raise LightFileError(
+        raise DappledError(
             f"cannot write the light field {path}: its attributes don't fit into JSON ({error})"
         ) from error
     value: dict[str, Any] = json.loads(text)
@@ -250,11 +244,11 @@ def _h5py(path: Path) -> Any:
 
 
 def _ground(name: str, path: Path, what: str, instead: str) -> Any:
-    """Import a library that the onboard install leaves out. Raises LightFileError."""
+    """Import a library that the onboard install leaves out. Raises DappledError."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        raise LightFileError(f"{path.name} needs {what}; {install_extra('ground')} (or {instead})") from error
+        raise DappledError(f"{path.name} needs {what}; {install_extra('ground')} (or {instead})") from error
 
 
 def _sync(path: Path) -> None:

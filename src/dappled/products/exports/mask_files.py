@@ -30,10 +30,6 @@ _STRIP = 64  # rows of a PNG at a time
 _MASK_RATIO, _MASK_FREE_PIXELS = 1000, 100_000_000  # a periodic pattern packs as well as deflate can
 
 
-class MaskFileError(DappledError):
-    """A mask file can't be written or read."""
-
-
 @dataclass(frozen=True, slots=True)
 class _Picture:
     """The picture to write: shape, bits, (vertical, horizontal) pixels per mm, and the function of its levels."""
@@ -57,18 +53,18 @@ def write(
     """Write a grey image of `shape` to .png or .tif by asking `tile(rows, columns)` for its levels, strip by strip.
 
     `px_per_mm` (vertical, horizontal) goes into the file (pHYs, or resolution tags). `progress` gets the rows done.
-    Memory stays at a few strips. The file appears whole or not at all. Raises MaskFileError.
+    Memory stays at a few strips. The file appears whole or not at all. Raises DappledError.
     """
     writers = {".png": _write_png, ".tif": _write_tiff, ".tiff": _write_tiff}
     writer = writers.get(path.suffix.lower())
     if writer is None:
-        raise MaskFileError(f"{path}: the name of a mask image must end in .png or .tif")
+        raise DappledError(f"{path}: the name of a mask image must end in .png or .tif")
     part = path.with_name(path.name + ".part")
     try:
         writer(part, _Picture(shape, bits, px_per_mm, tile, progress))
         os.replace(part, path)
     except OSError as error:
-        raise MaskFileError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
     finally:
         part.unlink(missing_ok=True)
 
@@ -124,17 +120,17 @@ def _write_tiff(path: Path, picture: _Picture) -> None:
 def read(path: Path) -> tuple[NDArray[np.float32], tuple[float, float]]:
     """Read a grey mask image: float32 (H, W) from 0 to 1, and its (vertical, horizontal) pixels per mm.
 
-    Raises MaskFileError for a file that is not a grey image, or has no resolution.
+    Raises DappledError for a file that is not a grey image, or has no resolution.
     """
     try:
         with path.open("rb") as file:
             values, density = _read_png(file) if path.suffix.lower() == ".png" else _read_tiff(file)
     except Exception as error:  # the readers raise anything on damaged bytes
-        raise MaskFileError(f"{path} can't be read as an image: {first_line(error)}") from error
+        raise DappledError(f"{path} can't be read as an image: {first_line(error)}") from error
     if density is None:
-        raise MaskFileError(f"{path} does not say its physical resolution: write it with `dappled mask make`")
+        raise DappledError(f"{path} does not say its physical resolution: write it with `dappled mask make`")
     if values.ndim != 2 or (values.dtype.kind != "u" and values.dtype != np.int32):
-        raise MaskFileError(f"{path} is not a grey image of 8 or 16 bits")
+        raise DappledError(f"{path} is not a grey image of 8 or 16 bits")
     top = 255 if values.dtype == np.uint8 else 65535
     return values.astype(np.float32) / np.float32(top), density
 
@@ -154,18 +150,18 @@ def _read_tiff(file: BinaryIO) -> tuple[NDArray[Any], tuple[float, float]]:
 
 
 def read_density_curve(path: Path) -> DensityCurve:
-    """Read a film's curve from CSV: columns `level` (0 to 255) and `density`. Raises MaskFileError."""
+    """Read a film's curve from CSV: columns `level` (0 to 255) and `density`. Raises DappledError."""
     rows = _numbers(path, ("level", "density"))
     try:
         return density_curve([r[0] for r in rows], [r[1] for r in rows])
     except ValueError as error:
-        raise MaskFileError(f"{path}: {error}") from None
+        raise DappledError(f"{path}: {error}") from None
 
 
 def read_spots(path: Path) -> list[tuple[float, float]]:
     """Read measured spots (x, y), in mm from the centre of the pattern, from CSV: columns `x_mm` and `y_mm`.
 
-    Rows with an empty field or a dash are spots that were not seen; they are left out. Raises MaskFileError.
+    Rows with an empty field or a dash are spots that were not seen; they are left out. Raises DappledError.
     """
     return [(r[0], r[1]) for r in _numbers(path, ("x_mm", "y_mm"))]
 
@@ -177,7 +173,7 @@ def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
             names = [name.strip().lower() for name in reader.fieldnames or []]
             missing = [name for name in wanted if name not in names]
             if missing:
-                raise MaskFileError(f"{path} has no column {missing[0]}: its first line must name {', '.join(wanted)}")
+                raise DappledError(f"{path} has no column {missing[0]}: its first line must name {', '.join(wanted)}")
             reader.fieldnames = names
             found = []
             for line in reader:
@@ -186,9 +182,9 @@ def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
                     continue
                 found.append(tuple(float(text) for text in texts))
     except OSError as error:
-        raise MaskFileError(f"{path} can't be read: {error.strerror or error}") from None
+        raise DappledError(f"{path} can't be read: {error.strerror or error}") from None
     except (ClaimError, UnicodeDecodeError, csv.Error) as error:
-        raise MaskFileError(f"{path} can't be read as CSV: {error}") from None
+        raise DappledError(f"{path} can't be read as CSV: {error}") from None
     except ValueError as error:
-        raise MaskFileError(f"{path}, line {reader.line_num}: {first_line(error)}") from None
+        raise DappledError(f"{path}, line {reader.line_num}: {first_line(error)}") from None
     return found

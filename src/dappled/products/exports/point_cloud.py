@@ -25,10 +25,6 @@ from dappled.products.maps.eye import intrinsics
 from dappled.products.maps.photographs import Station, eye_of, lens_of
 
 
-class PointCloudError(DappledError):
-    """A point cloud can't be made or written."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PointCloud:
     """`points` float64 (n, 3) in m, `colours` uint16 (n, 3), `sigma_m` (n,) along the line of sight; `withheld` is the
@@ -63,7 +59,7 @@ def of(
     said = field.attributes
     length, name = said.get("focal_length_mm"), said.get("camera")
     if not (length and name and said.get("shape")):
-        raise PointCloudError("the light field doesn't say its camera and focal length: points need both")
+        raise DappledError("the light field doesn't say its camera and focal length: points need both")
     profile = profiles.camera(str(name))
     if station is None:
         high, wide = said["shape"]
@@ -83,12 +79,12 @@ def of(
 
 
 def write(path: Path, cloud: PointCloud) -> None:
-    """Write .ply (binary) or .las, .laz (needs laspy). Raises PointCloudError."""
+    """Write .ply (binary) or .las, .laz (needs laspy). Raises DappledError."""
     writers: dict[str, Callable[[Path, PointCloud], None]] = {".ply": _ply, ".las": _las, ".laz": _las}
     if path.suffix.lower() not in writers:
-        raise PointCloudError(f"{path}: the name of a file of points must end in .ply, .las or .laz")
+        raise DappledError(f"{path}: the name of a file of points must end in .ply, .las or .laz")
     if len(cloud.points) == 0:
-        raise PointCloudError(
+        raise DappledError(
             f"no point of {path.name} is known well enough ({cloud.withheld} withheld): allow a larger σ"
         )
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
@@ -96,7 +92,7 @@ def write(path: Path, cloud: PointCloud) -> None:
         writers[path.suffix.lower()](part, cloud)
         part.replace(path)
     except OSError as error:
-        raise PointCloudError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
     finally:
         part.unlink(missing_ok=True)
 

@@ -29,10 +29,6 @@ UNKNOWN, HATCH = (205, 205, 205), (110, 110, 110)  # no colours of the scale
 _HATCH_STEP = 6  # px between the lines
 
 
-class PrintError(DappledError):
-    """A picture can't be written."""
-
-
 def white_of(pictures: Sequence[NDArray[np.floating]]) -> float:
     """The brightness that becomes white in all pictures: their 99.5 % quantile."""
     values = np.concatenate([np.ravel(p)[:: max(1, p.size // 200_000)] for p in pictures])
@@ -94,7 +90,7 @@ def mosaic(pictures: Sequence[Bytes], captions: Sequence[str] = (), columns: int
     Captions that are wider than the pictures move these apart.
     """
     if not pictures:
-        raise PrintError("there is no picture to show")
+        raise DappledError("there is no picture to show")
     coloured_ones = [p if p.ndim == 3 else np.repeat(p[..., None], 3, axis=2) for p in pictures]
     height, width = coloured_ones[0].shape[:2]
     across = columns or math.ceil(math.sqrt(len(pictures)))
@@ -117,14 +113,14 @@ def mosaic(pictures: Sequence[Bytes], captions: Sequence[str] = (), columns: int
 
 
 def save(path: Path, picture: Bytes | NDArray[np.uint16]) -> None:
-    """Write a PNG, JPEG or TIFF under its name, whole or not at all. Raises PrintError."""
+    """Write a PNG, JPEG or TIFF under its name, whole or not at all. Raises DappledError."""
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
-        raise PrintError(f"{path}: the name of a picture must end in .png, .jpg or .tif")
+        raise DappledError(f"{path}: the name of a picture must end in .png, .jpg or .tif")
     part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
     try:
         Image.fromarray(np.ascontiguousarray(picture)).save(part)
         part.replace(path)
     except OSError as error:
-        raise PrintError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
     finally:
         part.unlink(missing_ok=True)

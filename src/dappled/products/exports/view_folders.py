@@ -22,30 +22,26 @@ from dappled.errors import DappledError, first_line
 _ENDINGS = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 
 
-class ViewFolderError(DappledError):
-    """A folder doesn't hold n × n views."""
-
-
 def read(folder: Path) -> LightField:
     """All pictures of a folder in the order of their names, row by row from the top left camera. sRGB is made linear.
 
     The light field has no slices, and `cameras` among its attributes. If the folder contains HCI's `input_Cam….png`,
-    other pictures are ignored. Raises ViewFolderError.
+    other pictures are ignored. Raises DappledError.
     """
     files = picture_order.by_name((p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS), Path.as_posix)
     files = [p for p in files if p.name.startswith("input_Cam")] or files
     side = math.isqrt(len(files))
     if side == 0 or side * side != len(files):
-        raise ViewFolderError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one per view")
+        raise DappledError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one per view")
     try:
         # Each value is a float32 of a picture, and another of all views.
         claims.check_size(sum(map(_values, files)) * 8, sum(path.stat().st_size for path in files), "views")
     except ClaimError as error:
-        raise ViewFolderError(f"{folder}: {error}") from None
+        raise DappledError(f"{folder}: {error}") from None
     pictures = [_linear(path) for path in files]
     shapes = {picture.shape for picture in pictures}
     if len(shapes) > 1:
-        raise ViewFolderError(f"the pictures in {folder} differ in size: {', '.join(map(str, sorted(shapes)))}")
+        raise DappledError(f"the pictures in {folder} differ in size: {', '.join(map(str, sorted(shapes)))}")
     shape = pictures[0].shape
     axis = centred(side) / side
     return LightField(
@@ -64,7 +60,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         with path.open("rb") as file:
             yield open_picture(file)
     except Exception as error:  # Pillow raises anything on damaged bytes
-        raise ViewFolderError(f"{path} can't be read as a picture: {first_line(error)}") from error
+        raise DappledError(f"{path} can't be read as a picture: {first_line(error)}") from error
 
 
 def _values(path: Path) -> int:

@@ -99,7 +99,7 @@ def write(
     force: bool = False,
 ) -> Written:
     """Write sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson into `<flight>/geotags/`; or all of
-    them into `output`. Raises FlightError, SidecarError and EarthError."""
+    them into `output`. Raises FlightError, DappledError and EarthError."""
     placed, without_tag = read(flight, mounting, geoid, marked, tags)
     inside = layout.FlightFolder(flight)
     forms: dict[str, Callable[[Sequence[Placed]], str]] = {

@@ -38,10 +38,6 @@ _NAMED = 8
 _FIXES = {1: 6, 2: 5, 3: 4, 4: 4, 5: 3, 6: 8}  # RTKLIB's Q → MAVLink's GPS_FIX_TYPE
 
 
-class MarksError(DappledError):
-    """Marks can't be matched with a flight's shots; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Marked:
     """The marks of a flight's frames by image index, and what was found.
@@ -72,10 +68,10 @@ class Marked:
 
 def find(flight: Path, path: Path, geoid: Geoid | None, arm_m: Vector3 = (0.0, 0.0, 0.0)) -> Marked:
     """Match the marks of a .pos file with the shots of a flight. `arm_m` goes from the autopilot's antenna to the
-    marks' (see `Marked`). Raises MarksError, PosError, FlightError."""
+    marks' (see `Marked`). Raises DappledError, DappledError, FlightError."""
     found = pos_file.read(path)
     if geoid is None and not found.above_geoid:
-        raise MarksError(
+        raise DappledError(
             f"the heights in {path} are above the ellipsoid, and no geoid grid is on this machine: install Debian's "
             "proj-data, or say with --geoid how many metres mean sea level is above the ellipsoid here"
         )
@@ -83,7 +79,7 @@ def find(flight: Path, path: Path, geoid: Geoid | None, arm_m: Vector3 = (0.0, 0
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags, rows, correction_ns = ledger.tags(), ledger.shots(), ledger.utc_correction_ns()
     if not tags:
-        raise MarksError(f"no frame of {flight} is tagged: there is nothing to match with {path}")
+        raise DappledError(f"no frame of {flight} is tagged: there is nothing to match with {path}")
     shots = _shots(rows, tags, correction_ns or 0)
     heard, bounced = _without_bounces(found.marks)
     matched, doubts = _matched(path, heard, shots, utc_known=correction_ns is not None)
@@ -153,17 +149,19 @@ def _without_bounces(marks: Sequence[Mark]) -> tuple[list[Mark], list[str]]:
 def _matched(
     path: Path, marks: Sequence[Mark], shots: Sequence[TimedShot], *, utc_known: bool
 ) -> tuple[MarkPairs, list[str]]:
-    """The pairs by time, count and interval, with doubts. Raises MarksError."""
+    """The pairs by time, count and interval, with doubts. Raises DappledError."""
     times_s = [mark.utc_ns / 1e9 for mark in marks]
     if abs(shots[len(shots) // 2].begins_s - times_s[len(times_s) // 2]) > _PLAUSIBLE_S:
         days = [datetime.fromtimestamp(s, UTC).strftime("%Y-%m-%d") for s in (times_s[0], shots[0].begins_s)]
-        raise MarksError(f"the marks in {path} are of {days[0]}, the flight of {days[1]}: give the file of this flight")
+        raise DappledError(
+            f"the marks in {path} are of {days[0]}, the flight of {days[1]}: give the file of this flight"
+        )
     matched = pair(shots, times_s, utc_known=utc_known, most_s=_PLAUSIBLE_S)
     usual_s = float(median(shot.sigma_s for shot in shots))
     by_time = utc_known and abs(matched.offset_s) <= max(_OFFSET_S, 6 * usual_s)
     enough = max(1 if by_time else _LEAST_PAIRS, _SOME * min(len(shots), len(marks)))
     if not matched.certain or len(matched.pairs) < enough:
-        raise MarksError(
+        raise DappledError(
             f"{counted(len(marks), 'mark')} of {path} and {counted(len(shots), 'shot')}: neither their times nor count "
             "and intervals say which belong together; is it the file of this flight?"
         )
@@ -174,10 +172,10 @@ def _matched(
 
 
 def _not_epochs(path: Path, marks: Sequence[Mark]) -> None:
-    """Raises MarksError for the file of all epochs in place of the events'."""
+    """Raises DappledError for the file of all epochs in place of the events'."""
     on_grid = sum(min(mark.utc_ns % _EPOCH_NS, -mark.utc_ns % _EPOCH_NS) <= 1000 for mark in marks)
     if len(marks) >= _EPOCHS and on_grid > _EPOCH_SHARE * len(marks):
-        raise MarksError(
+        raise DappledError(
             f"{path} holds {len(marks)} positions at a receiver's even times, the whole track and not the camera's "
             "marks: give the file of events that was written beside it (…_events.pos)"
         )
@@ -205,7 +203,7 @@ def _placed(
     path: Path, marks: Mapping[int, Mark], tags: Mapping[int, Tag], geoid: Geoid | None
 ) -> tuple[dict[int, Mark], Vector3 | None, list[str]]:
     """The marks that are where the others and the autopilot are, the medians of marks minus autopilot, and doubts: each
-    mark that lies elsewhere, and heights. Raises MarksError where all are too far away to be of this flight."""
+    mark that lies elsewhere, and heights. Raises DappledError where all are too far away to be of this flight."""
     steps: dict[int, Vector3] = {}
     for index, mark in marks.items():
         pose = tags[index].pose
@@ -219,7 +217,7 @@ def _placed(
         return dict(marks), None, ["no position of the autopilot is known: whether the marks are of this place is not"]
     north_m, east_m, up_m = (float(median(part)) for part in zip(*steps.values(), strict=True))
     if math.hypot(north_m, east_m) > _FAR_M:
-        raise MarksError(
+        raise DappledError(
             f"the marks in {path} lie {math.hypot(north_m, east_m):,.0f} m from where the autopilot was: are they of "
             "this flight, and were the base's coordinates right and in WGS 84?"
         )

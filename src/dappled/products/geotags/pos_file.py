@@ -27,10 +27,6 @@ _GEODETIC = ("latitude", "longitude", "height")
 _ECEF = ("x-ecef", "y-ecef", "z-ecef")
 
 
-class PosError(DappledError):
-    """A .pos file can't be used; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Mark:
     """Where the antenna was when the camera's contact closed. `number` counts the marks of the file from 1.
@@ -65,13 +61,13 @@ class PosFile:
 
 
 def read(path: Path) -> PosFile:
-    """The marks of a .pos file. Raises PosError, and FlightError where the disk refuses."""
+    """The marks of a .pos file. Raises DappledError, and FlightError where the disk refuses."""
     try:
         text = read_bytes(path, _MOST_BYTES).decode("utf-8-sig", "replace")
     except OSError as error:
         raise disk_error("read the marks", path, error) from error
     except ClaimError as error:
-        raise PosError(f"{path} can't be read: {error}; give the file of events, not of all epochs") from None
+        raise DappledError(f"{path} can't be read: {error}; give the file of events, not of all epochs") from None
     lines = text.replace(",", " ").replace(";", " ").splitlines()
     comments = [line for line in lines if line.startswith("%")]
     columns, system = _columns(path, comments)
@@ -85,12 +81,12 @@ def read(path: Path) -> PosFile:
             marks.append(_mark(len(marks) + 1, line.split(), columns, system))
         except (ValueError, IndexError, OverflowError):
             if at != len(lines):
-                raise PosError(
+                raise DappledError(
                     f"{path}, line {at} is not a position under the header's columns: compute the file again"
                 ) from None
             doubts.append(f"the last line of {path} is cut short and was left out: is the file whole?")
     if not marks:
-        raise PosError(
+        raise DappledError(
             f"{path} holds no mark: was the camera's contact wired to the receiver, and the event file kept?"
         )
     marks.sort(key=lambda mark: mark.utc_ns)
@@ -106,7 +102,7 @@ def _columns(path: Path, comments: Sequence[str]) -> tuple[list[str], str]:
         if words and words[0] in ("GPST", "UTC", "JST"):
             break
     else:
-        raise PosError(
+        raise DappledError(
             f"{path} has no header that says GPST or UTC, which differ by 18 s: write it with its header "
             "(RTKLIB: out-outhead=on), and give the file of events"
         )
@@ -115,20 +111,20 @@ def _columns(path: Path, comments: Sequence[str]) -> tuple[list[str], str]:
         name, _, unit = word.partition("(")
         columns += [name, f"{name}'", f"{name}''"] if "'" in unit else [name]
     if tuple(columns[:1]) == ("e-baseline",):
-        raise PosError(f"{path} holds baselines, not positions: write it again as latitude, longitude, height")
+        raise DappledError(f"{path} holds baselines, not positions: write it again as latitude, longitude, height")
     kind = _ECEF if "x-ecef" in columns else _GEODETIC
     if not {*kind, "Q"} <= set(columns):
-        raise PosError(f"{path} is not a .pos file of RTKLIB or Emlid: its header lacks {', '.join((*kind, 'Q'))}")
+        raise DappledError(f"{path} is not a .pos file of RTKLIB or Emlid: its header lacks {', '.join((*kind, 'Q'))}")
     return columns, words[0]
 
 
 def _check_datum(path: Path, comments: Sequence[str], columns: Sequence[str]) -> None:
-    """Raises PosError where the header names another datum than WGS 84."""
+    """Raises DappledError where the header names another datum than WGS 84."""
     for line in comments:
         _, found, rest = line.partition("lat/lon/height=")
         datum = rest.split("/")[0].split()[0] if found and rest.split("/")[0].split() else ""
         if columns[0] == _GEODETIC[0] and datum and datum.upper() not in ("WGS84", "ITRF"):
-            raise PosError(f"{path} is in the datum {datum}, not in WGS 84: compute it again with out-datum=wgs84")
+            raise DappledError(f"{path} is in the datum {datum}, not in WGS 84: compute it again with out-datum=wgs84")
 
 
 def _mark(number: int, fields: list[str], columns: Sequence[str], system: str) -> Mark:

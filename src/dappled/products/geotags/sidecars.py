@@ -24,10 +24,6 @@ _SPACES = {
 _RTK_FLAGS = {3: "16", 4: "16", 5: "34", 6: "50"}  # DJI's codes for a single, differential, float and fixed solution
 
 
-class SidecarError(DappledError):
-    """A sidecar can't be written."""
-
-
 def path_of(frame: Path, *, replace_extension: bool = False) -> Path:
     """The sidecar of a frame: `name.ext.xmp` (darktable, digiKam), or `name.xmp` (Lightroom)."""
     return frame.with_suffix(".xmp") if replace_extension else frame.with_name(frame.name + ".xmp")
@@ -48,11 +44,11 @@ def text(tag: Tag, camera: CameraPose | None, utc_ns: int | None) -> str:
 
 
 def write(path: Path, content: str, *, force: bool = False) -> None:
-    """Write a sidecar, whole or not at all. Raises SidecarError for one that another program wrote (`force` replaces
+    """Write a sidecar, whole or not at all. Raises DappledError for one that another program wrote (`force` replaces
     it), and FlightError when the disk refuses."""
     try:
         if not force and path.exists() and not _ours(path):
-            raise SidecarError(
+            raise DappledError(
                 f"{path} was written by another program, and may have been edited by hand: "
                 "move it away, write elsewhere with --output, or replace it with --force"
             )

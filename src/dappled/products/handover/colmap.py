@@ -17,8 +17,9 @@ from scipy.spatial.transform import Rotation
 
 from dappled import durable
 from dappled.decode.array_types import Floats
+from dappled.errors import DappledError
 from dappled.products.handover import view_cameras, view_files
-from dappled.products.handover.view_cameras import FrameCameras, LocalAxes, ViewCamera, ViewCameraError
+from dappled.products.handover.view_cameras import FrameCameras, LocalAxes, ViewCamera
 
 _RIG_COLUMNS = (
     "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, "
@@ -36,7 +37,7 @@ _Rig = tuple[tuple[int, int], tuple[float, ...], tuple[ViewCamera, ...]]
 def write_model(folder: Path, frames: Sequence[FrameCameras]) -> list[Path]:
     """Write sparse/0: rigs, cameras, frames, images, points3D, priors.csv and origin.json; returns their paths.
 
-    It replaces an earlier model as a whole. Raises ViewCameraError where somebody else put files there, and OSError.
+    It replaces an earlier model as a whole. Raises DappledError where somebody else put files there, and OSError.
     """
     frames = view_cameras.of_one_aperture(frames)
     world = view_cameras.world_of(frames)
@@ -56,7 +57,7 @@ def write_model(folder: Path, frames: Sequence[FrameCameras]) -> list[Path]:
     final = folder / "sparse" / "0"
     theirs = sorted(path.name for path in final.iterdir() if path.name not in texts) if final.is_dir() else []
     if theirs:
-        raise ViewCameraError(f"{final} holds {theirs[0]}, which no batch wrote: move the folder, and run it again")
+        raise DappledError(f"{final} holds {theirs[0]}, which no batch wrote: move the folder, and run it again")
     part = durable.temporary(final)
     shutil.rmtree(part, ignore_errors=True)
     durable.make_folder(part)

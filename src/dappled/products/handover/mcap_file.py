@@ -57,7 +57,7 @@ _FIX, _GPS = 0, 1
 def write_parts(folder: Path, one: Photograph, field: LightField, station: Station, utc_ns: int | None) -> list[Path]:
     """Write what the file will hold of a frame: its picture, slices and camera's record; returns the paths.
 
-    Raises ViewCameraError, LightFileError and OSError."""
+    Raises DappledError, DappledError and OSError."""
     need("mcap_ros2.writer")
     record = view_cameras.of_photograph(one, ["mean"], station, float("inf"), utc_ns)
     picture = folder / view_files.picture("mean", record.name)

@@ -35,18 +35,14 @@ _ITEM_BYTES = 1 << 20
 Json = dict[str, Any]
 
 
-class StacError(DappledError):
-    """A frame can't be a STAC item; one sentence."""
-
-
 def write_item(
     folder: Path, made: Survey, one: Photograph, station: Station, *, gain: float, utc_ns: int | None
 ) -> list[Path]:
     """Write <frame>/<frame>.tif, then the item <frame>/<frame>.json; returns their paths.
 
-    Raises StacError where UTC was never known, MapError and OSError."""
+    Raises DappledError where UTC was never known, MapError and OSError."""
     if utc_ns is None:
-        raise StacError(f"the time of {station.frame.name} in UTC was never known, and a STAC item needs it")
+        raise DappledError(f"the time of {station.frame.name} in UTC was never known, and a STAC item needs it")
     name = station.name
     durable.make_folder(folder / name)
     image = map_files.frame_cog(made, one, folder / name / f"{name}.tif", gain)
@@ -56,7 +52,7 @@ def write_item(
 
 
 def write_collection(folder: Path, flight: str, names: Sequence[str]) -> list[Path]:
-    """Write collection.json, which lists these frames' items; returns its path. Raises StacError and OSError."""
+    """Write collection.json, which lists these frames' items; returns its path. Raises DappledError and OSError."""
     items = [_read(folder / name / f"{name}.json") for name in names]
     boxes, times = [item["bbox"] for item in items], sorted(item["properties"]["datetime"] for item in items)
     crossing = any(box[0] > box[2] for box in boxes)
@@ -170,5 +166,5 @@ def _read(path: Path) -> Json:
         item: Json = parse_json(path.read_bytes(), _ITEM_BYTES)
         _ = item["bbox"][3], item["properties"]["datetime"]
     except (OSError, ValueError, TypeError, KeyError, IndexError):
-        raise StacError(f"{path} is no item of this batch: remove it, and run the batch again") from None
+        raise DappledError(f"{path} is no item of this batch: remove it, and run the batch again") from None
     return item

@@ -26,10 +26,6 @@ _SAME_STOP = 0.02  # relative: apertures that differ by less count as one
 _SKEW = 1e-6  # of the focal length, over a whole picture a thousandth of a pixel
 
 
-class ViewCameraError(DappledError):
-    """The views of a frame can't be given as pinhole cameras; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class ViewCamera:
     """One view: focal lengths and principal point in pixels (x, y), counted from the outer corner of the first pixel
@@ -115,7 +111,7 @@ def of_photograph(
 ) -> FrameCameras:
     """The cameras of a photograph's views, or of its one picture where it has no views.
 
-    Raises ViewCameraError where they are skewed or mirrored."""
+    Raises DappledError where they are skewed or mirrored."""
     apertures = np.zeros((1, 2)) if one.apertures_m is None else one.apertures_m
     lens_axes = replace(one.eye, rotation=np.eye(3), centre=np.zeros(3), scale=1.0)
     straight, turn = upright(one.eye.matrix[:2, :2], station.frame.name)
@@ -157,7 +153,7 @@ def upright(matrix: Floats, name: str) -> tuple[tuple[float, float], Floats]:
     lengths = np.linalg.norm(matrix, axis=1)
     rows = matrix / lengths[:, None]
     if np.linalg.det(rows) < 0 or abs(float(rows[0] @ rows[1])) > _SKEW:
-        raise ViewCameraError(
+        raise DappledError(
             f"the views of {name} are skewed or mirrored against the sensor: other programs' cameras can't be; "
             "resample them first (dappled export)"
         )
@@ -168,7 +164,7 @@ def upright(matrix: Floats, name: str) -> tuple[tuple[float, float], Floats]:
 
 
 def decoded(data: bytes, where: str) -> FrameCameras:
-    """A record that was written. Raises ViewCameraError."""
+    """A record that was written. Raises DappledError."""
     try:
         row: dict[str, Any] = parse_json(data, _RECORD_BYTES)
         views = tuple(
@@ -192,11 +188,9 @@ def decoded(data: bytes, where: str) -> FrameCameras:
             doubts=doubts,
         )
     except (ValueError, TypeError, KeyError, IndexError):
-        raise ViewCameraError(
-            f"{where} is no record of a frame's cameras: remove it, and run the batch again"
-        ) from None
+        raise DappledError(f"{where} is no record of a frame's cameras: remove it, and run the batch again") from None
     if not made.views or len(made.camera_to_ned) != 9 or len(made.distortion) != 5 or not _numbers(made):
-        raise ViewCameraError(f"{where} is no record of a frame's cameras: remove it, and run the batch again")
+        raise DappledError(f"{where} is no record of a frame's cameras: remove it, and run the batch again")
     return made
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
+from dappled.errors import DappledError
 from dappled.products.handover import photo_files, view_cameras
-from dappled.products.handover.view_cameras import FrameCameras, ViewCameraError
+from dappled.products.handover.view_cameras import FrameCameras
 from dappled.products.maps import cog
 from dappled.products.maps.eye import through
 from dappled.products.maps.photographs import Photograph, Station
@@ -25,11 +26,11 @@ def write_frame(
 ) -> list[Path]:
     """Write images/<view>/<frame>.jpg for each view, then frames/<frame>.json; returns their paths.
 
-    `one` has the views, `grid` is how many stand below and beside each other in the aperture. Raises ViewCameraError,
+    `one` has the views, `grid` is how many stand below and beside each other in the aperture. Raises DappledError,
     also for a frame without views, and OSError.
     """
     if one.views is None or one.apertures_m is None:
-        raise ViewCameraError(
+        raise DappledError(
             f"{station.frame.name} has no views, only slices: decode it with a calibration (--calibration)"
         )
     names = [f"v{v}u{u}" for v in range(grid[0]) for u in range(grid[1])]
@@ -59,15 +60,15 @@ def picture(view: str, frame: str) -> str:
 
 
 def read_frames(folder: Path, names: Sequence[str]) -> list[FrameCameras]:
-    """The records of frames, in this order. Raises ViewCameraError."""
+    """The records of frames, in this order. Raises DappledError."""
     frames = []
     for name in names:
         path = folder / RECORDS / f"{name}.json"
         try:
             record = view_cameras.decoded(read_log(path), str(path))
         except (OSError, ClaimError) as error:
-            raise ViewCameraError(f"{path} can't be read ({error}): run the batch again") from None
+            raise DappledError(f"{path} can't be read ({error}): run the batch again") from None
         if record.name != name or not all(_VIEW.fullmatch(view.name) for view in record.views):
-            raise ViewCameraError(f"{path} is the record of another frame: remove it, and run the batch again")
+            raise DappledError(f"{path} is the record of another frame: remove it, and run the batch again")
         frames.append(record)
     return frames

@@ -38,10 +38,6 @@ _ALIKE = 0.05  # sensors whose sides differ by less see the same ground
 _WHOLE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # the grid of a sensor's own pixels
 
 
-class CoverageError(DappledError):
-    """What a flight has seen can't be told; one sentence."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FramesSeen:
     """The frames that count, with their eyes by name, on a map; and (name, sentence) of those that don't. `unjudged` of
@@ -98,7 +94,7 @@ def of_flight(
     or time is in doubt only with `count_doubtful`.
 
     The ground is `terrain`, read below the frames and the `area`, else flat at `ground_m`, else flat at home's height.
-    Raises CoverageError, FlightError, GroundError, ConfigError.
+    Raises DappledError, FlightError, DappledError, ConfigError.
     """
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
@@ -118,7 +114,7 @@ def of_flight(
         keep(doubt_of)
     if not placed:
         why = f": {left[0][1]}" if left else ""
-        raise CoverageError(f"{folder.name} has no frame that can be placed on the ground{why}")
+        raise DappledError(f"{folder.name} has no frame that can be placed on the ground{why}")
     middle = [sorted(side)[len(placed) // 2] for side in zip(*(_where(one) for one in placed), strict=True)]
     projection = Projection(utm(middle[0], middle[1]))
     eyes: dict[str, Eye] = {}
@@ -136,7 +132,7 @@ def of_flight(
         ground = _ground(placed, [*eyes.values()], projection, terrain=terrain, ground_m=ground_m, corners=corners)
         keep(lambda one: _off(one, eyes[one.name], ground, count_doubtful=count_doubtful))
     if not placed:
-        raise CoverageError(f"{folder.name} has no frame that looks at the ground: {left[-1][1]}")
+        raise DappledError(f"{folder.name} has no frame that looks at the ground: {left[-1][1]}")
     return FramesSeen(
         folder.name,
         projection,
@@ -191,7 +187,7 @@ def _ground(
     if ground_m is None:
         homes = [one.ground_m for one in placed if one.ground_m is not None]
         if not homes and terrain is None:
-            raise CoverageError(
+            raise DappledError(
                 "the height of the ground is not known (the telemetry has no height above home): give --ground or "
                 "--terrain"
             )
@@ -253,7 +249,7 @@ def eye_of(station: Station, projection: Projection, sensor: Sensor | None = Non
 
 
 def grid_of(seen: FramesSeen, area: PlannedArea | None, cell_m: float | None = None) -> MapGrid:
-    """A grid over the area, else over what the frames saw. Raises CoverageError, MapError."""
+    """A grid over the area, else over what the frames saw. Raises DappledError, MapError."""
     points: list[Floats] = [] if area is None else area.on_map(seen.projection)
     if area is None:
         for eye in seen.eyes.values():
@@ -262,12 +258,12 @@ def grid_of(seen: FramesSeen, area: PlannedArea | None, cell_m: float | None = N
             except MapError:
                 continue  # beyond the terrain: the other frames say where the map lies
     if not points:
-        raise CoverageError(f"no frame lies on the ground ({seen.ground.name}): give terrain that covers the flight")
+        raise DappledError(f"no frame lies on the ground ({seen.ground.name}): give terrain that covers the flight")
     every = np.concatenate(points)
     step = cell_m or max(float(np.ptp(every, axis=0).max()) / CELLS, 0.01)
     cells = math.prod(float(side) / step + 1 for side in np.ptp(every, axis=0))
     if cells > MOST_CELLS:
-        raise CoverageError(
+        raise DappledError(
             f"the map would have {cells / 1e6:.0f} million cells of {step:.2g} m: give a --cell of "
             f"{step * math.sqrt(cells / MOST_CELLS) * 1.01:.2g} or more"
         )
@@ -275,12 +271,12 @@ def grid_of(seen: FramesSeen, area: PlannedArea | None, cell_m: float | None = N
 
 
 def cover(seen: FramesSeen, grid: MapGrid, area: PlannedArea | None = None) -> Coverage:
-    """Count the frames and directions that saw each cell's middle. Raises CoverageError where the ground's height is
+    """Count the frames and directions that saw each cell's middle. Raises DappledError where the ground's height is
     nowhere known."""
     east, north = grid.places(seen.projection)
     height = seen.ground.heights(east, north)
     if not np.isfinite(height).any():
-        raise CoverageError(f"the terrain {seen.ground.name} has no heights there: give one that covers the area")
+        raise DappledError(f"the terrain {seen.ground.name} has no heights there: give one that covers the area")
     planned = np.ones(grid.shape, bool) if area is None else area.inside(seen.projection, east, north)
     frames, from_where = np.zeros(grid.shape, np.uint16), np.zeros(grid.shape, np.uint16)
     for eye in seen.eyes.values():

@@ -24,10 +24,6 @@ FLAT_SIGMA_M = 1.5  # from grass to roofs, where nothing better is known
 _STEPS = 400  # at most, along a ray through a raster
 
 
-class GroundError(DappledError):
-    """A terrain raster can't be used."""
-
-
 class Ground(Protocol):
     """The surface that an `Eye`'s rays meet."""
 
@@ -147,7 +143,7 @@ def load(
     """Read a terrain raster within `bounds` (west, south, east, north on the map), on the map's grid.
 
     Heights are taken as above sea level (DTED's are); with a `geoid` they are taken as ellipsoidal and converted.
-    Raises GroundError where the file can't be read, is not georeferenced, or does not overlap.
+    Raises DappledError where the file can't be read, is not georeferenced, or does not overlap.
     """
     rasterio = need("rasterio")
     try:
@@ -156,9 +152,9 @@ def load(
     except DappledError:
         raise
     except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
-        raise GroundError(f"the terrain {path} can't be read: {first_line(error)}") from error
+        raise DappledError(f"the terrain {path} can't be read: {first_line(error)}") from error
     if np.isnan(values).all():
-        raise GroundError(f"the terrain {path} has no heights under the flight: give one that covers it")
+        raise DappledError(f"the terrain {path} has no heights under the flight: give one that covers it")
     if geoid is not None:
         latitude, longitude = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
         values -= geoid.undulation_m(float(latitude), float(longitude))
@@ -168,11 +164,11 @@ def load(
 def _posts(
     source: Any, path: Path, projection: Projection, bounds: tuple[float, float, float, float]
 ) -> tuple[Floats, float, float, float]:
-    """The heights under the flight, the west and north of the first post, and the step. Raises GroundError, ClaimError
+    """The heights under the flight, the west and north of the first post, and the step. Raises DappledError, ClaimError
     and what GDAL raises."""
     rasterio, warp = need("rasterio"), need("rasterio.warp")
     if source.crs is None or source.transform.is_identity:
-        raise GroundError(f"the terrain {path} has no coordinates: give one with a coordinate system")
+        raise DappledError(f"the terrain {path} has no coordinates: give one with a coordinate system")
     target = projection.crs.to_wkt()
     step = _step(source, projection, bounds)
     margin = 4 * step
@@ -180,11 +176,11 @@ def _posts(
     columns = math.ceil((bounds[2] + margin - west) / step) + 1
     rows = math.ceil((bounds[3] + margin - south) / step) + 1
     if rows * columns > 100_000_000:
-        raise GroundError(f"the terrain {path} has {rows} × {columns} posts under the flight: give a coarser one")
+        raise DappledError(f"the terrain {path} has {rows} × {columns} posts under the flight: give a coarser one")
     north = south + (rows - 1) * step
     box = warp.transform_bounds(target, source.crs, west, south, west + (columns - 1) * step, north)
     if not touch(box, source.bounds, degrees=source.crs.is_geographic):
-        raise GroundError(
+        raise DappledError(
             f"the terrain {path} lies elsewhere: it covers {_words(source.bounds)}, the flight {_words(box)}"
         )
     claims.check_size(rows * columns * 8, rows * columns * 8, f"{rows} × {columns} posts under the flight")

@@ -141,10 +141,6 @@ class BaseMap:
         return float(min(abs(source.transform.a), abs(source.transform.e)) * source.crs.linear_units_factor[1])
 
 
-class ControlPointError(DappledError):
-    """Control points can't be used; the sentence names file and line."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class ControlPoint:
     """A measured place (east, north, height on the map) and the sensor pixel (column, row) of a frame that shows it."""
@@ -157,43 +153,39 @@ class ControlPoint:
 
 def read_control_points(path: Path, projection: Projection) -> list[ControlPoint]:
     """Control points from CSV with the columns name, frame, column, row, latitude, longitude, altitude: pixels of the
-    frame as the camera made it, degrees, metres above sea level. Raises ControlPointError naming the line."""
+    frame as the camera made it, degrees, metres above sea level. Raises DappledError naming the line."""
     wanted = ("name", "frame", "column", "row", "latitude", "longitude", "altitude")
     try:
         with io.StringIO(read_bytes(path).decode("utf-8-sig"), newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
             missing = [name for name in wanted if name not in (rows.fieldnames or ())]
             if missing:
-                raise ControlPointError(
-                    f"{path} lacks the column {missing[0]}: its first line names {', '.join(wanted)}"
-                )
+                raise DappledError(f"{path} lacks the column {missing[0]}: its first line names {', '.join(wanted)}")
             found = []
             for row in rows:
                 try:
                     column, line, latitude, longitude, altitude = (float(row[name]) for name in wanted[2:])
                 except (TypeError, ValueError):
-                    raise ControlPointError(f"{path}, line {rows.line_num}: a number is missing or invalid") from None
+                    raise DappledError(f"{path}, line {rows.line_num}: a number is missing or invalid") from None
                 if not (abs(latitude) <= 90 and math.isfinite(longitude + altitude + column + line)):
-                    raise ControlPointError(
-                        f"{path}, line {rows.line_num}: {latitude}, {longitude} is not a place on Earth"
-                    )
+                    raise DappledError(f"{path}, line {rows.line_num}: {latitude}, {longitude} is not a place on Earth")
                 east, north = projection.to_map(latitude, longitude)
                 place = (float(east), float(north), altitude)
                 found.append(ControlPoint(row["name"], Path(row["frame"]).stem, (column, line), place))
     except OSError as error:
-        raise ControlPointError(f"the control points {path} can't be read: {error.strerror}") from None
+        raise DappledError(f"the control points {path} can't be read: {error.strerror}") from None
     except UnicodeDecodeError:
-        raise ControlPointError(f"the control points {path} are not text in UTF-8") from None
+        raise DappledError(f"the control points {path} are not text in UTF-8") from None
     except (ClaimError, csv.Error) as error:
-        raise ControlPointError(f"the control points {path} can't be read: {error}") from None
+        raise DappledError(f"the control points {path} can't be read: {error}") from None
     return found
 
 
 def sighted(points: Sequence[ControlPoint], frames: Collection[str]) -> tuple[list[ControlPoint], list[str]]:
-    """The points on these frames, and a sentence for each other point. Raises ControlPointError where none is left."""
+    """The points on these frames, and a sentence for each other point. Raises DappledError where none is left."""
     kept = [point for point in points if point.frame in frames]
     if points and not kept:
-        raise ControlPointError(
+        raise DappledError(
             f"no control point is on a frame that is mapped: the first, {points[0].name}, names frame {points[0].frame}"
         )
     others = [point for point in points if point.frame not in frames]

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dappled.decode.array_types import Floats
+from dappled.errors import DappledError
 from dappled.products.maps import matching
 from dappled.products.maps.adjust import Marks, Solution, Ties, adjust
 from dappled.products.maps.eye import Eye
@@ -20,7 +21,7 @@ from dappled.products.maps.ground import Ground
 from dappled.products.maps.map_grid import between, footprint, sample, smoothed_to
 from dappled.products.maps.matching import Features
 from dappled.products.maps.photographs import Photograph
-from dappled.products.maps.references import BaseMap, ControlPoint, ControlPointError
+from dappled.products.maps.references import BaseMap, ControlPoint
 
 LEAST_INLIERS = 15
 LEAST_SHARE = 0.25  # of the matches
@@ -218,9 +219,7 @@ def _to_control(photographs: Sequence[Photograph], control: Sequence[ControlPoin
     numbers = {one.name: number for number, one in enumerate(photographs)}
     for point in control:
         if point.frame not in numbers:
-            raise ControlPointError(
-                f"control point {point.name} names frame {point.frame}, which is not among those mapped"
-            )
+            raise DappledError(f"control point {point.name} names frame {point.frame}, which is not among those mapped")
     groups: list[Marks | Ties] = []
     for name, number in numbers.items():
         mine = [point for point in control if point.frame == name]

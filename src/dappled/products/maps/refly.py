@@ -31,10 +31,6 @@ _FAR_M, _FAR_SPANS = 5000.0, 5.0  # farther than both, an area is taken for anot
 _CLOSE = 2.0  # holes within so many line distances of each other are flown as one
 
 
-class ReflyError(DappledError):
-    """The holes can't be flown again as asked; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class FlightLine:
     """One line: from and to (latitude, longitude) in degrees. Photographs are taken all along."""
@@ -61,7 +57,7 @@ def plan(
 ) -> Refly | None:
     """Lines that cover the holes at the flight's own height; None where there is no hole.
 
-    The camera looks down with a side of the frame along the line, as `pose.mount` has it. Raises ReflyError where it
+    The camera looks down with a side of the frame along the line, as `pose.mount` has it. Raises DappledError where it
     doesn't, where the flight's height above home isn't known, or the ground anywhere on the way isn't, or rises to
     half of the flight's usual height above it.
     """
@@ -69,7 +65,7 @@ def plan(
     if not holes.any():
         return None
     if least * (1 - overlap) > 1 + 1e-9:
-        raise ReflyError(
+        raise DappledError(
             f"with an overlap of {overlap:g} a place is seen by {1 / (1 - overlap):.1f} frames, and {least} are wanted"
             f": give an --overlap of {1 - 1 / least:.2g} or more"
         )
@@ -77,7 +73,7 @@ def plan(
     heights = [h for one in seen.stations if (h := one.camera.height_above_home_m) is not None]
     home_m = [one.ground_m for one in seen.stations if one.ground_m is not None]
     if not heights or not home_m:
-        raise ReflyError("the flight's height above home is not known, so that no mission can be given a height")
+        raise DappledError("the flight's height above home is not known, so that no mission can be given a height")
     altitude, base = float(np.median(heights)), float(np.median(home_m))
     first = seen.stations[0].camera
     home = np.array(seen.projection.to_map(first.latitude_deg, first.longitude_deg))
@@ -91,7 +87,7 @@ def plan(
         above = base + altitude - _highest(seen, *_way([home, *(end for one in lines for end in one), home], line / 4))
     usual = float(np.median([one.camera.altitude_msl_m for one in seen.stations])) - _below(seen)
     if not above >= _LEAST_SHARE * usual:
-        raise ReflyError(
+        raise DappledError(
             f"the ground on the way rises to {base + altitude - above:.0f} m, {above:.0f} m below the mission's "
             f"{base + altitude:.0f} m; the flight was {usual:.0f} m above it: plan this area by hand"
         )
@@ -106,13 +102,13 @@ def plan(
 
 
 def _check_near(seen: FramesSeen, covered: Coverage, holes: NDArray[np.bool_]) -> None:
-    """Raises ReflyError where a hole is far from all frames: the area is then another field's."""
+    """Raises DappledError where a hole is far from all frames: the area is then another field's."""
     frames = np.array([eye.centre[:2] for eye in seen.eyes.values()])
     east, north = _places(covered, holes)
     span_m = float(np.hypot(*np.ptp(frames, axis=0)))
     away_m = float(np.hypot(east - frames[:, 0].mean(), north - frames[:, 1].mean()).max())
     if away_m > max(_FAR_M, _FAR_SPANS * span_m):
-        raise ReflyError(
+        raise DappledError(
             f"the area reaches {away_m / 1000:.0f} km from the flight, which spans {span_m:.0f} m: is it another "
             "field's, or are its coordinates the wrong way round?"
         )
@@ -136,10 +132,10 @@ def _way(ends: Sequence[Floats], step_m: float) -> tuple[Floats, Floats]:
 
 
 def _highest(seen: FramesSeen, east: Floats, north: Floats) -> float:
-    """The highest ground at places on the map (m). Raises ReflyError where it isn't known everywhere."""
+    """The highest ground at places on the map (m). Raises DappledError where it isn't known everywhere."""
     heights = seen.ground.heights(east, north)
     if not np.isfinite(heights).all():
-        raise ReflyError(
+        raise DappledError(
             f"the height of the ground is not known everywhere on the way ({seen.ground.name}): a mission there may "
             "lead into it; give --terrain that covers the area, the lines' ends and the way home"
         )
@@ -147,21 +143,21 @@ def _highest(seen: FramesSeen, east: Floats, north: Floats) -> float:
 
 
 def _below(seen: FramesSeen) -> float:
-    """The height of the ground below the flight (m), the middle one of its frames. Raises ReflyError."""
+    """The height of the ground below the flight (m), the middle one of its frames. Raises DappledError."""
     at = [seen.projection.to_map(one.camera.latitude_deg, one.camera.longitude_deg) for one in seen.stations]
     heights = seen.ground.heights(*np.array(at, dtype=np.float64).reshape(-1, 2).T)
     if not np.isfinite(heights).any():
-        raise ReflyError(f"the height of the ground below the flight is not known ({seen.ground.name})")
+        raise DappledError(f"the height of the ground below the flight is not known ({seen.ground.name})")
     return float(np.nanmedian(heights))
 
 
 def _footprint(seen: FramesSeen, above_m: float) -> tuple[float, float]:
     """(along the flight, across) metres on the ground of the narrowest frame that looks down from `above_m`.
 
-    Raises ReflyError where the camera looks aside."""
+    Raises DappledError where the camera looks aside."""
     down = float(np.median([one.camera_to_ned[2, 2] for one in seen.stations]))
     if down < math.cos(_MOST_ASIDE_RAD):
-        raise ReflyError(
+        raise DappledError(
             f"the camera looks {math.degrees(math.acos(max(down, -1))):.0f}° off the vertical: a mission over the "
             "holes is for one that looks down"
         )

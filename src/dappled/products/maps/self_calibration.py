@@ -33,10 +33,6 @@ _KNOWN = 0.5  # a value is told by the flight where its sigma is less than this 
 _FARTHEST = 4.0  # sigmas of the lens as given
 
 
-class SelfCalibrationError(DappledError):
-    """A flight's frames don't tell its lens; one sentence."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightLens:
     """The lens of a flight; `told` (7,) says which of `lens_solution.NAMES` the flight told, `doubts` are sentences."""
@@ -93,7 +89,7 @@ def find(
 ) -> FlightLens:
     """The lens that took all photographs. `sigmas` (m, rad) replace those of the recorded poses.
 
-    Raises SelfCalibrationError where the frames are of several focal lengths, show too little in common, or don't tell
+    Raises DappledError where the frames are of several focal lengths, show too little in common, or don't tell
     the lens' distance.
     """
     lens = _one_lens(photographs)
@@ -108,14 +104,14 @@ def find(
     )
     told = solution.sigmas < _KNOWN * lens_sigmas
     if not told[0]:
-        raise SelfCalibrationError(
+        raise DappledError(
             f"the flight doesn't tell the lens' distance (± {solution.sigmas[0]:.2g} mm): it needs control points, "
             "frames from several heights, or tilted ones"
         )
     change = np.abs(_values(solution.lens) - _values(lens)) / lens_sigmas
     if (change > _FARTHEST).any():
         name = NAMES[int(np.argmax(change))]
-        raise SelfCalibrationError(
+        raise DappledError(
             f"the flight's frames and the lens disagree by more than a lens can be wrong ({name}): are mount, "
             "--focal-length and the telemetry's σ right?"
         )
@@ -138,7 +134,7 @@ def sightings(
     control: Sequence[ControlPoint],
     progress: Callable[[str, int, int], None],
 ) -> Sightings:
-    """Features that two or more frames show, and control points. Raises SelfCalibrationError for too few."""
+    """Features that two or more frames show, and control points. Raises DappledError for too few."""
     found = []
     for number, one in enumerate(photographs):
         progress("find features", number, len(photographs))
@@ -167,7 +163,7 @@ def sightings(
         places.append(met)
         place_sigmas.append(np.inf)
     if len(places) < _LEAST_POINTS:
-        raise SelfCalibrationError(
+        raise DappledError(
             f"neighbouring frames have {len(places)} points in common, and a lens needs {_LEAST_POINTS}: fly with more "
             "overlap"
         )
@@ -216,11 +212,11 @@ class _Joined:
 
 def _one_lens(photographs: Sequence[Photograph]) -> Lens:
     if len(photographs) < _LEAST_FRAMES:
-        raise SelfCalibrationError(f"a lens is found from {_LEAST_FRAMES} frames or more, not {len(photographs)}")
+        raise DappledError(f"a lens is found from {_LEAST_FRAMES} frames or more, not {len(photographs)}")
     lenses = {one.lens for one in photographs}
     if len(lenses) != 1 or None in lenses:
         lengths = ", ".join(sorted({f"{one.focal_length_mm:g}" for one in lenses if one is not None}))
-        raise SelfCalibrationError(f"the frames are of several focal lengths ({lengths} mm): choose with --frames")
+        raise DappledError(f"the frames are of several focal lengths ({lengths} mm): choose with --frames")
     lens = lenses.pop()
     assert lens is not None
     return lens

@@ -24,10 +24,6 @@ _PROBES = 12  # places a side, to see what two frames share
 _LARGEST = 4000  # px a side
 
 
-class StereoPairError(DappledError):
-    """A flight has no two frames to look at together."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightPair:
     """The pictures for both eyes on one ground, the frames that they are, their baseline and its share of the distance
@@ -42,7 +38,7 @@ class FlightPair:
 def pair(made: Survey, cell_m: float | None = None) -> FlightPair:
     """The two frames with the longest baseline that can be looked at, much of whose ground is the same.
 
-    Raises StereoPairError where there are none.
+    Raises DappledError where there are none.
     """
     best: tuple[float, Photograph, Photograph] | None = None
     for number, one in enumerate(made.photographs):
@@ -51,7 +47,7 @@ def pair(made: Survey, cell_m: float | None = None) -> FlightPair:
             if score > 0 and (best is None or score > best[0]):
                 best = score, one, two
     if best is None:
-        raise StereoPairError(
+        raise DappledError(
             f"no two frames share {_LEAST_OVERLAP:.0%} of their ground from places far enough apart: a stereo pair "
             "needs frames that overlap"
         )

@@ -28,10 +28,6 @@ _TILE = 6_000_000  # values of all frames that are in memory at a time
 _BLURRED = 3.0  # cells: poses that blur more make no picture of the ground's detail
 
 
-class FlightRefocusError(DappledError):
-    """A flight can't be refocused."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class RefocusedGround:
     """`picture` float32 (rows, columns, c) on a grid, NaN where no frame looks, and how many frames show each cell.
@@ -58,17 +54,17 @@ def refocus(
 ) -> RefocusedGround:
     """Lay all frames over each other on the survey's ground, raised by `above_m`, and take their mean or median.
 
-    A frame weighs less in the mean, the less its pose is known. Raises FlightRefocusError for fewer than two frames,
+    A frame weighs less in the mean, the less its pose is known. Raises DappledError for fewer than two frames,
     and where a camera is not above the surface.
     """
     photos = made.photographs
     if len(photos) < 2:
-        raise FlightRefocusError("a flight of one frame has no aperture of its own: refocus its light field")
+        raise DappledError("a flight of one frame has no aperture of its own: refocus its light field")
     ground = raised(made.ground, above_m)
     levels = [float(ground.meet(one.eye, _middle(one))[0, 2]) for one in photos]
     low = [one.name for one, level in zip(photos, levels, strict=True) if not one.eye.centre[2] - level > 0.1]
     if low:
-        raise FlightRefocusError(
+        raise DappledError(
             f"frame {low[0]} was not taken from above a surface {above_m:g} m above ground: choose a lower one"
         )
     grid = map_grid.grid_of(photos, ground, made.projection, cell_m or made.gsd_m)
@@ -135,7 +131,7 @@ def alike(found: Sequence[RefocusedGround]) -> list[Singles]:
     east, south = min(grid.bounds[2] for grid in grids), max(grid.bounds[1] for grid in grids)
     rows, columns = round((north - south) / step_y), round((east - west) / step_x)
     if rows < 1 or columns < 1:
-        raise FlightRefocusError("the planes show no ground in common: choose heights nearer to each other")
+        raise DappledError("the planes show no ground in common: choose heights nearer to each other")
     cut = []
     for one in found:
         top, left = round((one.grid.north - north) / step_y), round((west - one.grid.west) / step_x)
