@@ -93,6 +93,7 @@ def test_it_ends_when_it_has_its_frames(
     assert flight.balance is not None
     assert flight.balance.balanced
     assert flight.balance.closed
+    assert [one for one in (tmp_path / "flights").rglob("*") if one.stat().st_mode & 0o007] == []
 
 
 def test_frames_that_could_not_be_decoded_are_a_failure_though_all_are_safe(

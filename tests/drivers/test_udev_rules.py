@@ -42,13 +42,17 @@ def test_it_comes_before_logind_gives_access_to_the_seat() -> None:
     assert int(RULES.name[:2]) < 73  # 73-seat-late.rules acts on the tag uaccess
 
 
-def test_cameras_and_lines_are_given_to_the_group(rules: list[list[tuple[str, str, str]]]) -> None:
+def test_cameras_are_given_to_the_group(rules: list[list[tuple[str, str, str]]]) -> None:
     given = [rule for rule in rules if ("GROUP", "=", "plugdev") in rule]
     assert all(("MODE", "=", "0660") in rule for rule in given)
     matched = {(key, value) for rule in given for key, operator, value in rule if operator == "=="}
-    assert all(
-        {"ATTR{idProduct}", "ENV{ID_USB_INTERFACES}"} & {key for key, *_ in rule}
-        for rule in given
-        if ("SUBSYSTEM", "==", "gpio") not in rule
-    ), "no maker's devices are given whole"
-    assert {("ATTR{idVendor}", "04a9"), ("ATTR{idVendor}", "04cb"), ("SUBSYSTEM", "gpio")} <= matched
+    assert all({"ATTR{idProduct}", "ENV{ID_USB_INTERFACES}"} & {key for key, *_ in rule} for rule in given), (
+        "no maker's devices are given whole"
+    )
+    assert {("ATTR{idVendor}", "04a9"), ("ATTR{idVendor}", "04cb")} <= matched
+
+
+def test_no_line_of_the_board_is_given_to_the_group(rules: list[list[tuple[str, str, str]]]) -> None:
+    first = next(rule for rule in rules if ("SUBSYSTEM", "!=", "usb") in rule)
+    assert ("GOTO", "=", "dappled_end") in first
+    assert all(value == "usb" for rule in rules for key, _, value in rule if key == "SUBSYSTEM")

@@ -10,7 +10,8 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import NoReturn
 
 import dappled
@@ -49,6 +50,9 @@ VERBS: dict[str, tuple[str, str]] = {
     "completion": ("completion", "print a completion script for bash, zsh or fish"),
     "profiles": ("config", "list the shipped camera and mask profiles"),
 }
+
+_FLIGHTS = ("run", "replay", "flight", "geotag")
+"""Verbs that write flights, which hold pictures and where they were taken."""
 
 
 def parser(wanted: str | None = None) -> argparse.ArgumentParser:
@@ -99,7 +103,8 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     try:
         if loaded is not None:
             loaded()
-        code: int = parsed.run(parsed)
+        with _own_files(parsed.verb):
+            code: int = parsed.run(parsed)
         sys.stdout.flush()
     except DappledError as error:
         if parsed.debug:
@@ -124,6 +129,17 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
             said = f"not enough memory{wanted}: close other programs, or use a machine with more memory"
         return _failed(parsed, [said], 1)
     return code
+
+
+@contextmanager
+def _own_files(verb: str) -> Iterator[None]:
+    """Context in which a verb that writes flights makes no file that every user may read."""
+    before = os.umask(0o077)
+    os.umask(before | 0o007 if verb in _FLIGHTS else before)
+    try:
+        yield
+    finally:
+        os.umask(before)
 
 
 def _failed(parsed: argparse.Namespace, sentences: Sequence[str], code: int) -> int:

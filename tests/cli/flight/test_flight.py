@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sqlite3
 from contextlib import closing
@@ -180,6 +181,18 @@ def test_counts_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.C
         ledger.commit()
     said = lines(["report", str(closed)], capsys, code=1)
     assert said[-1].startswith("THE COUNTS DO NOT AGREE")
+
+
+def test_no_file_of_a_copied_flight_is_for_every_user_of_the_machine(closed: Path, tmp_path: Path) -> None:
+    before = os.umask(0)
+    try:
+        assert main(["flight", "offload", str(tmp_path / "disk"), str(closed), "--same-device"]) == 0
+    finally:
+        after = os.umask(before)
+    assert after == 0
+    copied = [tmp_path / "disk" / closed.name, *(tmp_path / "disk" / closed.name).rglob("*")]
+    assert len(copied) > 5
+    assert {one for one in copied if one.stat().st_mode & 0o007} == set()
 
 
 def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

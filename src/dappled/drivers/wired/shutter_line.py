@@ -81,7 +81,7 @@ class GpioLine:
             except (OSError, ValueError) as error:
                 raise CameraError(
                     f"the shutter line {self._line} of {self._chip} can't be opened ({error}): "
-                    "check camera.shutter, and that you are in the group that owns the chip"
+                    "check camera.shutter, and that a group of yours owns the chip (docs/drivers.md)"
                 ) from None
 
     def press(self) -> None:
