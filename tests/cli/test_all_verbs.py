@@ -13,7 +13,8 @@ from typing import Any
 
 import pytest
 
-from dappled.cli import VERBS, completion, parser
+from dappled.cli import VERBS, completion
+from dappled.cli.command_line import parser
 
 pytestmark = pytest.mark.slow
 BODY = ["--camera", "canon-eos-450d"]

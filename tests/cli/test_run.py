@@ -16,8 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from dappled.cli import main, parser
+from dappled.cli import main
 from dappled.cli import run as verb
+from dappled.cli.command_line import parser
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 
-from dappled.cli import VERBS, parser
+from dappled.cli.command_line import parser
+from dappled.cli.table import VERBS
 
 Words = Mapping[str, list[str]]  # by the words before it ("", "mask", "mask make"): what may come next
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.cli import decode_arguments
-from dappled.cli.arguments import add_overwrite, refuse_existing
-from dappled.errors import DappledError
+from dappled.cli.field_arguments import FieldArguments, RangingArguments, opened_field, views_words
+from dappled.cli.verb import CallError, Output, OutputExistsError, Overwriting, Report, Verb, flag, option
 from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
@@ -21,72 +18,67 @@ KINDS = {
     "h5": "HDF5: the whole light field", "npz": "NumPy: the whole light field", "zarr": "Zarr: the whole light field",
     "rerun": "Rerun recording (.rrd): views, picture, depth",
 }  # fmt: skip
+_WHOLE = ("h5", "npz", "zarr")
+_REPLACED = (*_WHOLE, "rerun")
 
 
-REPLACED = ("h5", "npz", "zarr", "rerun")
+@dataclass(frozen=True, kw_only=True)
+class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
+    """See table."""
 
+    examples = ("dappled export frame.zarr --as hci -o hci/frame",)
+    notes = "formats:\n" + "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    lines = "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
-    parser.epilog = f"formats:\n{lines}\n\nexample: dappled export frame.zarr --as hci -o hci/frame"
-    decode_arguments.add_field(parser)
-    parser.add_argument("--as", dest="kind", choices=tuple(KINDS), required=True, help="the format")
-    parser.add_argument("--depth", action="store_true", help="hci, rerun: add a depth map (method combined)")
-    parser.add_argument("--lenslet", type=int, default=0, metavar="PX",
-                        help=f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})")  # fmt: skip
-    parser.add_argument(
-        "--disparity",
-        type=float,
-        default=0.0,
-        metavar="D",
-        help="quilt: the disparity that appears in the plane of the screen",
+    kind: str = option("--as", help="the format", choices=tuple(KINDS))
+    depth: bool = flag("--depth", "hci, rerun: add a depth map (method combined)")
+    lenslet: int = option(
+        "--lenslet", help=f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})", default=0, unit="px", low=0
     )
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT", help="file or folder to write")
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    disparity: float = option(
+        "--disparity", help="quilt: the disparity that appears in the plane of the screen", default=0.0, metavar="D"
+    )
+    output: Path = option("-o", "--output", help="file or folder to write", metavar="OUT")
+
+    def check(self) -> None:
+        """See Verb. A quilt's name is known only when it is made."""
+        if self.kind in _WHOLE and self.output.suffix != f".{self.kind}":
+            raise CallError(f"{self.output}: --as {self.kind} writes a .{self.kind} file; give it that ending")
+        if self.kind in _REPLACED:
+            self.refuse_existing(self.output)
+        elif self.overwrite:
+            raise CallError(f"--overwrite goes with --as {', '.join(_REPLACED)}: remove what is there yourself")
+        elif self.kind != "quilt" and self.output.exists():
+            raise OutputExistsError(f"{self.output} exists already: move it away, or choose another name")
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        found = opened_field(self.field, output, self)
+        written = self._write(found)
+        words = views_words(found.field)
+        if words and not self.json:
+            output.remark(words)
+        facts = {"file": str(written), "as": self.kind, "views": words or None, "doubts": found.doubts}
+        return Report(facts, [str(written)], doubted=bool(found.doubts))
+
+    def _write(self, found: OpenedLightField) -> Path:
+        """Write the light field; returns the path. Raises DappledError."""
+        path = self.output
+        match self.kind:
+            case "hci":
+                exports.hci(path, found.field, found.depth() if self.depth else None)
+            case "eslf":
+                exports.eslf(path, found.field, self.lenslet)
+            case "mat":
+                exports.mat(path, found.field)
+            case "quilt":
+                return exports.quilt(path, found.field, disparity=self.disparity)
+            case "rerun":
+                depth = found.depth() if self.depth else None
+                distances = found.distances(depth) if depth is not None and found.ranging is not None else None
+                exports.rerun(path, found.field, found.refocus(), depth, distances)
+            case _:
+                light_files.save(path, found.field, overwrite=self.overwrite)
+        return path
 
 
-def run(arguments: argparse.Namespace) -> int:
-    _make_room(arguments)
-    found = decode_arguments.opened_field(arguments)
-    written = write(found, arguments.kind, arguments.output, arguments)
-    words = decode_arguments.views_words(found.field)
-    if arguments.json:
-        print(json.dumps({"file": str(written), "as": arguments.kind, "views": words or None, "doubts": found.doubts}))
-    else:
-        print(written)
-        if words:
-            print(words, file=sys.stderr)
-    return 0
-
-
-def _make_room(arguments: argparse.Namespace) -> None:
-    """Refuse an output that exists before the work is done. Raises DappledError. A quilt's name is known only then."""
-    if arguments.kind in REPLACED:
-        refuse_existing(arguments, arguments.output)
-    elif arguments.overwrite:
-        raise DappledError(f"--overwrite goes with --as {', '.join(REPLACED)}: remove what is there yourself")
-    elif arguments.kind != "quilt" and arguments.output.exists():
-        raise DappledError(f"{arguments.output} exists already: move it away, or choose another name")
-
-
-def write(found: OpenedLightField, kind: str, path: Path, arguments: argparse.Namespace) -> Path:
-    """Write the light field; returns the path. Raises DappledError."""
-    match kind:
-        case "hci":
-            exports.hci(path, found.field, found.depth() if arguments.depth else None)
-        case "eslf":
-            exports.eslf(path, found.field, arguments.lenslet)
-        case "mat":
-            exports.mat(path, found.field)
-        case "quilt":
-            return exports.quilt(path, found.field, disparity=arguments.disparity)
-        case "rerun":
-            depth = found.depth() if arguments.depth else None
-            distances = found.distances(depth) if depth is not None and found.ranging is not None else None
-            exports.rerun(path, found.field, found.refocus(), depth, distances)
-        case _:
-            if path.suffix != f".{kind}":
-                raise DappledError(f"{path}: --as {kind} writes a .{kind} file; give it that ending")
-            light_files.save(path, found.field, overwrite=arguments.overwrite)
-    return path
+CLASSES = {"export": ExportLightField}

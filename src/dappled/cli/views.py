@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
-import json
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from dappled.cli import decode_arguments
-from dappled.cli.arguments import add_overwrite, refuse_existing
-from dappled.cli.decode_arguments import FieldCallError
+from dappled.cli.field_arguments import FieldArguments, opened_field, views_words
+from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
 from dappled.decode.lightfield import ViewStack
@@ -21,45 +19,53 @@ from dappled.products.opened import OpenedLightField, OpenError
 _LONGEST = 2400  # px
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled views frame.zarr -o views.png\n  dappled views frame.zarr --of slices -o slices.png\n"
-        "  dappled views frame.zarr --of shifts -o shifts.png"
+@dataclass(frozen=True, kw_only=True)
+class DrawViews(Overwriting, FieldArguments, Verb):
+    """See table."""
+
+    examples = (
+        "dappled views frame.zarr -o views.png",
+        "dappled views frame.zarr --of slices -o slices.png",
+        "dappled views frame.zarr --of shifts -o shifts.png",
     )
-    decode_arguments.add_field(parser, ranged=False)
-    parser.add_argument("--of", choices=("views", "slices", "shifts", "slice-shifts", "epi"), default="views",
-                        help="views (default), slices at their carriers, or shifts: how far each view has\n"
-                        "moved from the middle; slice-shifts: the same for slices, as the thesis tried;\n"
-                        "epi: a row and a column of the picture in each view (Fig 54)")  # fmt: skip
-    parser.add_argument("--row", type=int, metavar="N", help="of epi: row of the picture (default: the middle one)")
-    parser.add_argument("--column", type=int, metavar="N", help="of epi: column of the picture")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="picture to write")
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
+
+    of: str = option(
+        "--of", default="views", choices=("views", "slices", "shifts", "slice-shifts", "epi"),
+        help="views, slices at their carriers, or shifts: how far each view has moved from the middle; slice-shifts: "
+        "the same for slices, as the thesis tried; epi: a row and a column of the picture in each view (Fig 54)",
+    )  # fmt: skip
+    row: int | None = option("--row", help="of epi: row of the picture", default=None, otherwise="the middle one")
+    column: int | None = option("--column", help="of epi: column of the picture", default=None)
+    output: Path = option("-o", "--output", help="picture to write")
+
+    def check(self) -> None:
+        """See Verb."""
+        if self.of != "epi" and (self.row, self.column) != (None, None):
+            raise CallError(f"--row and --column are of --of epi: leave them out of {self.of}")
+        self.refuse_existing(self.output)
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        found = opened_field(self.field, output)
+        if self.of == "epi":
+            made, note = epi.drawn(found.stack, self.row, self.column), ""
+        else:
+            draw = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[self.of]
+            made, note = draw(found)
+            made = _small(made)
+        prints.save(self.output, made)
+        count_v, count_u, height, width = found.views.shape[:4]
+        note = "; ".join(words for words in (note, views_words(found.field)) if words)
+        facts = {"file": str(self.output), "of": self.of, "views": list(found.views.shape[:4])}
+        said = f"{count_v} × {count_u} views of {width} × {height} px; {self.output}"
+        return Report(
+            {**facts, "doubts": found.doubts, **({"note": note} if note else {})},
+            [*([note] if note else []), said],
+            doubted=bool(found.doubts),
+        )
 
 
-def run(arguments: argparse.Namespace) -> int:
-    refuse_existing(arguments, arguments.output)
-    if arguments.of != "epi" and (arguments.row, arguments.column) != (None, None):
-        raise FieldCallError(f"--row and --column are of --of epi: leave them out of {arguments.of}")
-    found = decode_arguments.opened_field(arguments)
-    if arguments.of == "epi":
-        made, note = epi.drawn(found.stack, arguments.row, arguments.column), ""
-    else:
-        draw = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[arguments.of]
-        made, note = draw(found)
-        made = _small(made)
-    prints.save(arguments.output, made)
-    count_v, count_u = found.views.shape[:2]
-    note = "; ".join(words for words in (note, decode_arguments.views_words(found.field)) if words)
-    if arguments.json:
-        facts = {"file": str(arguments.output), "of": arguments.of, "views": list(found.views.shape[:4])}
-        print(json.dumps({**facts, "doubts": found.doubts, **({"note": note} if note else {})}))
-        return 0
-    if note:
-        print(note)
-    print(f"{count_v} × {count_u} views of {found.views.shape[3]} × {found.views.shape[2]} px; {arguments.output}")
-    return 0
+CLASSES = {"views": DrawViews}
 
 
 def _views(found: OpenedLightField) -> tuple[prints.Bytes, str]:

@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 
-from dappled.cli import hand_over, main, parser
+from dappled.cli import hand_over, main
+from dappled.cli.command_line import parser
 from dappled.products.handover.nodeodm import NodeOdmError
 
 

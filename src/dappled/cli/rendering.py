@@ -1,0 +1,127 @@
+"""Print what verbs tell: results as text or JSON, findings, errors, bars; and give the exit code."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from dappled import findings
+from dappled.cli.verb import Report, Verb
+from dappled.findings import Level
+from dappled.shown import printable
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
+
+Item = TypeVar("Item")
+DONE, FAILED, INTERRUPTED = 0, 1, 130
+_AFTER_S = 1.0  # of work, a bar is drawn
+
+
+class TerminalOutput:
+    """The `Output` of a verb that was called by these words."""
+
+    def __init__(self, path: str, *, as_json: bool) -> None:
+        self._path, self._as_json = path, as_json
+        self._bar: tqdm[Any] | None = None
+        self._what = ""
+
+    def row(self, values: Mapping[str, Any], *lines: str) -> None:
+        """See Output."""
+        self._print([json.dumps(values)] if self._as_json else lines)
+
+    def remark(self, text: str) -> None:
+        """See Output."""
+        self._print([text], error=True)
+
+    def warn(self, text: str) -> None:
+        """See Output."""
+        self.remark(f"dappled {self._path}: {text}")
+
+    def each(self, items: Sequence[Item], unit: str = "frame") -> Iterator[Item]:
+        """See Output."""
+        with self.bar(len(items), unit) as add:
+            for item in items:
+                yield item
+                add(1)
+
+    @contextmanager
+    def bar(self, total: int | None, unit: str, what: str = "") -> Iterator[Callable[[int], object]]:
+        """See Output."""
+        if not sys.stderr.isatty():
+            yield lambda _: None
+            return
+        with self._begun(total, unit, what) as bar:
+            yield bar.update
+        self._bar = None
+
+    def show(self, what: str, done: int, total: int) -> None:
+        """See Output."""
+        if not sys.stderr.isatty():
+            return
+        if self._bar is None or what != self._what:
+            self.close()
+            self._bar, self._what = self._begun(total, "frame", what), what
+        self._bar.update(done - self._bar.n)
+
+    def close(self) -> None:
+        """Take the bar off the terminal."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def _begun(self, total: int | None, unit: str, what: str) -> tqdm[Any]:
+        from tqdm import tqdm  # noqa: PLC0415  # no bar, no wait for it
+
+        scaled = unit == "B"
+        self._bar = tqdm(
+            total=total,
+            unit=unit,
+            desc=what or None,
+            delay=_AFTER_S,
+            leave=False,
+            unit_scale=scaled,
+            file=sys.__stderr__,
+        )
+        return self._bar
+
+    def _print(self, lines: Sequence[str], *, error: bool = False) -> None:
+        if self._bar is not None:
+            self._bar.clear()
+        for line in lines:
+            print(printable(line), file=sys.stderr if error else sys.stdout, flush=True)
+
+
+def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
+    """Print a report; returns the exit code."""
+    output.close()
+    if verb.json:
+        if report.values is not None:
+            print(json.dumps(_with_findings(report), indent=2))
+    else:
+        for line in report.lines:
+            print(printable(line))
+    for one in findings.in_order(report.findings):
+        output.remark(f"{'in doubt' if one.level > Level.NOTE else one.level.word}: {findings.told(one)}")
+    doubted = report.doubted or findings.worst(report.findings) > Level.NOTE
+    return FAILED if report.failed or (doubted and not getattr(verb, "anyway", False)) else DONE
+
+
+def _with_findings(report: Report) -> Any:
+    if not report.findings or not isinstance(report.values, dict):
+        return report.values
+    return {**report.values, "findings": [one.to_json() for one in findings.in_order(report.findings)]}
+
+
+def failed(path: str, sentences: Sequence[str], *, as_json: bool, usage: str = "") -> None:
+    """Say what went wrong, a line for each sentence: a person on standard error, and with --json a program too, as
+    {"error": …}; a wrong call with the verb's usage."""
+    if usage:
+        print(usage, file=sys.stderr)
+    shown = "\n".join(map(printable, sentences))
+    print(f"dappled {path}: {shown}", file=sys.stderr)
+    if as_json:
+        print(json.dumps({"error": "\n".join(sentences)}))

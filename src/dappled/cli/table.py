@@ -1,0 +1,38 @@
+"""The verbs of `dappled`, in the order of --help: the module that holds each, and its line there."""
+
+from __future__ import annotations
+
+# What actions belong to, and its line in --help.
+GROUPS: dict[str, str] = {}
+
+# Words of a verb: (module below `dappled.cli`, whose CLASSES has the verb's class under these words, and its line).
+VERBS: dict[str, tuple[str, str]] = {
+    "run": ("run", "run the daemon: fire, record, tag, decode, publish"),
+    "replay": ("replay", "run a recorded flight, or a folder of frames, through the same pipeline"),
+    "doctor": ("doctor", "say what is missing on this machine; fire a test shot; measure latency"),
+    "status": ("status", "show the state of the running daemon"),
+    "open": ("open", "look at a recorded flight or a light field in the browser"),
+    "watch": ("watch", "subscribe to the stream: show and save what arrives"),
+    "keys": ("keys", "make keys for subscribers on the network, and the console's token"),
+    "trigger": ("trigger", "ask for frames over MAVLink, as a ground station does"),
+    "mavlink": ("keys", "make keys for signed MAVLink links"),
+    "decode": ("decode", "decode frames to light fields"),
+    "picture": ("picture", "make photographs without the mask's shadow, at the sensor's own resolution"),
+    "carriers": ("carriers", "show the predicted and the measured carriers of a frame"),
+    "calibrate": ("calibrate", "fit lattice, law and phases to calibration frames"),
+    "views": ("views", "draw a light field's views, slices or shifts as one picture"),
+    "refocus": ("refocus", "refocus a light field: by α, disparity or metres, on a plane, as a stereo pair"),
+    "depth": ("depth", "measure disparities and distances with their uncertainty; write point clouds"),
+    "export": ("export", "write light fields for other tools: hci, eslf, mat, quilt, h5 …"),
+    "mask": ("mask", "the printed mask: make, table, diffraction, design, and plan a flight with it"),
+    "plan": ("mask.plan", "plan a flight: interval, motion blur, frame rate and disk space"),
+    "flight": ("flight", "recorded flights: list, show, check, report, coverage, offload, pickup"),
+    "geotag": ("geotag", "write positions and attitudes for other programs: XMP, geo.txt, CSV, GeoJSON"),
+    "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
+    "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),
+    "hand-over": ("hand_over", "give pictures to OpenDroneMap (NodeODM), and fetch the model"),
+    "config": ("config", "check or show settings"),
+    "init": ("init", "write a settings file: finds what is plugged in, and asks"),
+    "completion": ("completion", "print a completion script for bash, zsh or fish"),
+    "profiles": ("config", "list the shipped camera and mask profiles"),
+}
