@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from dappled.cli import VERBS, completion, decode_arguments, main
-from dappled.cli.arguments import OutputExistsError, refuse_existing
+from dappled.cli.arguments import refuse_existing
 from dappled.cli.command_line import parser
+from dappled.cli.verb import OutputExistsError
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 

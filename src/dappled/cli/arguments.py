@@ -8,11 +8,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.errors import DappledError
-
-
-class OutputExistsError(DappledError):
-    """What is to be written is there already; one sentence."""
+from dappled.cli.verb import OutputExistsError
 
 
 def whole(text: str) -> int:

@@ -10,9 +10,10 @@ from typing import Any
 
 from dappled import durable, findings
 from dappled.cli import decode_arguments
-from dappled.cli.arguments import OutputExistsError, add_overwrite
+from dappled.cli.arguments import add_overwrite
 from dappled.cli.each_frame import each_frame
 from dappled.cli.picture import places
+from dappled.cli.verb import OutputExistsError
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError, counted
 from dappled.products.handover import picture_files
