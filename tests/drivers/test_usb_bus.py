@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import usb.core
 
-from dappled.drivers.usb_bus import UsbError, bodies, changes, holders, reset
+from dappled.drivers.camera import CameraError
+from dappled.drivers.usb_bus import bodies, changes, holders, reset
 from tests.simulated.usb_devices import EOS_450D, FINEPIX_DISK, MOUSE, UsbDevices
 
 
@@ -42,7 +43,7 @@ def test_without_a_libusb_it_says_what_to_install(monkeypatch: pytest.MonkeyPatc
         raise usb.core.NoBackendError("No backend available")
 
     monkeypatch.setattr(usb.core, "find", find)
-    with pytest.raises(UsbError, match="install libusb"):
+    with pytest.raises(CameraError, match="install libusb"):
         bodies()
 
 
@@ -59,11 +60,11 @@ def test_reset_resets_the_one_at_the_port() -> None:
     one, other = replace(EOS_450D), replace(FINEPIX_DISK)
     reset("usb:001,005", UsbDevices([one, other]))
     assert (one.resets, other.resets) == (1, 0)
-    with pytest.raises(UsbError, match="there is no device at usb:001,007 any more"):
+    with pytest.raises(CameraError, match="there is no device at usb:001,007 any more"):
         reset("usb:001,007", UsbDevices([one]))
-    with pytest.raises(UsbError, match="can't be reset"):
+    with pytest.raises(CameraError, match="can't be reset"):
         reset("usb:001,005", UsbDevices([replace(EOS_450D, allowed=False)]))
-    with pytest.raises(UsbError, match="names no device"):
+    with pytest.raises(CameraError, match="names no device"):
         reset("ptpip:127.0.0.1:1:1")
 
 

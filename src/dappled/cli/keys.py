@@ -13,6 +13,7 @@ from dappled import key_files
 from dappled.cli.arguments import Actions
 from dappled.daemon.stream import curve
 from dappled.drivers.mavlink import SigningError, make_key
+from dappled.errors import DappledError
 from dappled.flight import seal_key
 
 HOME = Path("~/.config/dappled/keys")
@@ -88,9 +89,9 @@ def _token(path: Path) -> str:
     try:
         key_files.write_new(path.expanduser(), secrets.token_urlsafe(24) + "\n")
     except FileExistsError:
-        raise curve.KeyFileError(f"{path} is there already: choose another name, or move it away") from None
+        raise DappledError(f"{path} is there already: choose another name, or move it away") from None
     except OSError as error:
-        raise curve.KeyFileError(f"{path} can't be written: {error.strerror}") from None
+        raise DappledError(f"{path} can't be written: {error.strerror}") from None
     return f"{path}  name it in console.token; anyone who knows its content may use the console"
 
 

@@ -12,10 +12,10 @@ from dappled.cli.status import stream_endpoint
 from dappled.cli.terminal import remark, waiting_for
 from dappled.clock import SystemClock
 from dappled.daemon.stream import watch
-from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
+from dappled.daemon.stream.curve import ClientKeys, load_own, load_public
 from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
 from dappled.daemon.stream.wire import Message
-from dappled.errors import counted
+from dappled.errors import DappledError, counted
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     endpoint = arguments.endpoint or stream_endpoint(arguments.config)
     ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
     if bool(arguments.keys) != bool(arguments.server_key):
-        raise KeyFileError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
+        raise DappledError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
     keys = ClientKeys(load_own(arguments.keys), load_public(arguments.server_key)) if arguments.keys else None
     if arguments.save:
         arguments.save.mkdir(parents=True, exist_ok=True)

@@ -25,10 +25,6 @@ END_S = 60.0
 _LOOK_S = 0.02
 
 
-class TestShotError(DappledError):
-    """No shot can be taken; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Latency:
     """One shot's times in milliseconds; None where a time could not be measured.
@@ -100,25 +96,23 @@ class TestShot:
         return self._service.folder
 
     def until_ready(self, timeout_s: float = READY_S) -> None:
-        """Wait for the camera. Raises TestShotError with the camera's own reason."""
+        """Wait for the camera. Raises DappledError with the camera's own reason."""
         until = time.monotonic() + timeout_s
         while (state := self._service.health()["camera"])["state"] != "ready":
             if time.monotonic() >= until:
-                raise TestShotError(
-                    f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}"
-                )
+                raise DappledError(f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}")
             time.sleep(_LOOK_S)
 
     def shoot(self, timeout_s: float = END_S) -> PendingShot:
-        """Take one shot and wait for its end. Raises TestShotError where it is refused, or does not end."""
+        """Take one shot and wait for its end. Raises DappledError where it is refused, or does not end."""
         self.until_ready()
         self._requests += 1
         decision = self._service.request(CaptureRequest("doctor", "test shot", self._requests, acknowledged=False))
         if decision.index is None or not decision.accepted:
-            raise TestShotError(f"the shot was refused: {decision.reason}")
+            raise DappledError(f"the shot was refused: {decision.reason}")
         pending = self._ended.wait_for(decision.index, timeout_s)
         if pending is None:
-            raise TestShotError(f"the shot did not end within {timeout_s:g} s")
+            raise DappledError(f"the shot did not end within {timeout_s:g} s")
         return pending
 
 

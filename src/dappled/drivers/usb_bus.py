@@ -25,10 +25,6 @@ _STILL_IMAGE, _MASS_STORAGE = 0x06, 0x08  # USB class codes; a still image devic
 _NO_LIBUSB = "no libusb works on this machine: install libusb-1.0-0 (Debian, Ubuntu) or libusb1 (Fedora)"
 
 
-class UsbError(CameraError):
-    """The bus can't be read, or a device can't be reset; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class UsbBody:
     """A camera on the bus. `name` is its own name, "" where this user may not read it."""
@@ -61,7 +57,7 @@ class UsbBody:
 
 
 def bodies(backend: Any = None) -> list[UsbBody]:
-    """List all cameras on the bus in the order of their addresses. Raises UsbError without a libusb.
+    """List all cameras on the bus in the order of their addresses. Raises CameraError without a libusb.
 
     `backend` is PyUSB's; None: the libusb of this machine, or the one that the package libusb-package brings.
     """
@@ -76,21 +72,21 @@ def changes(before: Iterable[UsbBody], after: Iterable[UsbBody]) -> tuple[list[U
 
 
 def reset(port: str, backend: Any = None) -> None:
-    """Reset the device at a libgphoto2 port ("usb:001,005"), as if its cable had been pulled. Raises UsbError."""
+    """Reset the device at a libgphoto2 port ("usb:001,005"), as if its cable had been pulled. Raises CameraError."""
     match = re.fullmatch(r"usb:(\d+),(\d+)", port)
     if match is None:
-        raise UsbError(f"{port!r} names no device on USB, as usb:001,005 does")
+        raise CameraError(f"{port!r} names no device on USB, as usb:001,005 does")
     bus, address = int(match[1]), int(match[2])
     for device in _devices(backend):
         if (device.bus, device.address) == (bus, address):
             try:
                 device.reset()
             except (usb.core.USBError, NotImplementedError) as error:
-                raise UsbError(f"the device at {port} can't be reset ({error}): pull its cable") from None
+                raise CameraError(f"the device at {port} can't be reset ({error}): pull its cable") from None
             finally:
                 usb.util.dispose_resources(device)
             return
-    raise UsbError(f"there is no device at {port} any more")
+    raise CameraError(f"there is no device at {port} any more")
 
 
 def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:
@@ -111,9 +107,9 @@ def _devices(backend: Any) -> Iterator[Any]:
     try:
         yield from usb.core.find(find_all=True, backend=backend or _libusb())
     except usb.core.NoBackendError:
-        raise UsbError(_NO_LIBUSB) from None
+        raise CameraError(_NO_LIBUSB) from None
     except usb.core.USBError as error:
-        raise UsbError(f"the USB bus can't be read ({error})") from None
+        raise CameraError(f"the USB bus can't be read ({error})") from None
 
 
 def _libusb() -> Any:

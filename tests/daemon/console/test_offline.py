@@ -17,13 +17,7 @@ from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
 from dappled.daemon.console.feed import FeedError
 from dappled.daemon.console.offline import RecordedFeed, RecordedHub, RecordedStudio
-from dappled.daemon.console.recorded import (
-    FlightFrames,
-    FrameSource,
-    LightFieldFrames,
-    RecordedFrameError,
-    ShownFrame,
-)
+from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFieldFrames, ShownFrame
 from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.lightfield import LightField
@@ -190,7 +184,7 @@ def test_all_frames_get_their_small_pictures_and_a_bad_one_stops_none(
 
 def test_a_flight_without_a_mask_says_so(flight: Path) -> None:
     source = FlightFrames(layout.open_folder(flight), flight_report.show(flight), None)
-    with pytest.raises(RecordedFrameError, match="without a mask: name one with --mask"):
+    with pytest.raises(DappledError, match="without a mask: name one with --mask"):
         source.slices(0)
     served = Served(source)
     with pytest.raises(FeedError, match="there is no frame 7"):

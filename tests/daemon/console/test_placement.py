@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 from dappled.daemon.console import placement
-from dappled.daemon.console.placement import BackgroundError, oriented_frame
+from dappled.daemon.console.placement import oriented_frame
 from dappled.daemon.console.studio import Studio
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.footprint import RectifiedFrame
+from dappled.errors import DappledError
 from tests import globe
 
 NS = {"k": placement.KML_NAMESPACE}
@@ -58,18 +59,18 @@ def test_any_world_file_s_name_will_do(picture: Path) -> None:
 )
 def test_what_is_no_map_is_refused_in_words(picture: Path, world: str, words: str) -> None:
     picture.with_suffix(".pgw").write_text(world)
-    with pytest.raises(BackgroundError, match=words):
+    with pytest.raises(DappledError, match=words):
         placement.load_background(picture)
 
 
 def test_a_file_that_is_no_picture(tmp_path: Path, picture: Path) -> None:
     picture.write_bytes(b"no picture")
-    with pytest.raises(BackgroundError, match="can't be used"):
+    with pytest.raises(DappledError, match="can't be used"):
         placement.load_background(picture)
-    with pytest.raises(BackgroundError, match="a PNG or a JPEG"):
+    with pytest.raises(DappledError, match="a PNG or a JPEG"):
         placement.load_background(tmp_path / "map.tif")
     (tmp_path / "alone.jpg").write_bytes(b"")
-    with pytest.raises(BackgroundError, match=r"no world file alone\.jgw"):
+    with pytest.raises(DappledError, match=r"no world file alone\.jgw"):
         placement.load_background(tmp_path / "alone.jpg")
 
 

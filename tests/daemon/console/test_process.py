@@ -21,9 +21,9 @@ import pytest
 from dappled.clock import SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
 from dappled.daemon.console import process
-from dappled.daemon.console.process import Console, ConsoleError
-from dappled.daemon.stream.curve import KeyFileError
+from dappled.daemon.console.process import Console
 from dappled.drivers.child_process import RestartBudget
+from dappled.errors import DappledError
 from tests.daemon.fakes import eventually
 
 TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
@@ -38,13 +38,13 @@ def token_file(folder: Path, text: str = TOKEN, mode: int = 0o600) -> str:
 
 @pytest.mark.parametrize("bind", ["8080", "127.0.0.1", "127.0.0.1:x", ":8080", "127.0.0.1:99999", "127.0.0.1:-1"])
 def test_an_address_that_is_none(bind: str) -> None:
-    with pytest.raises(ConsoleError, match="must be host:port"):
+    with pytest.raises(DappledError, match="must be host:port"):
         process.listen(ConsoleSettings(bind=bind))
 
 
 @pytest.mark.parametrize("bind", ["0.0.0.0:0", "192.0.2.1:0", "[::]:0", "drone.lan:0"])
 def test_beyond_loopback_a_token_is_needed(bind: str) -> None:
-    with pytest.raises(ConsoleError, match="open to the network without a token"):
+    with pytest.raises(DappledError, match="open to the network without a token"):
         process.listen(ConsoleSettings(bind=bind))
 
 
@@ -56,16 +56,16 @@ def test_with_a_token_it_opens_wider(tmp_path: Path) -> None:
 
 
 def test_a_token_that_others_can_read_or_guess_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(KeyFileError, match="chmod 600"):
+    with pytest.raises(DappledError, match="chmod 600"):
         process.listen(ConsoleSettings(bind="127.0.0.1:0", token=token_file(tmp_path, mode=0o644)))
-    with pytest.raises(ConsoleError, match="holds no token"):
+    with pytest.raises(DappledError, match="holds no token"):
         process.listen(ConsoleSettings(bind="127.0.0.1:0", token=token_file(tmp_path, "short")))
-    with pytest.raises(KeyFileError, match="can't be read"):
+    with pytest.raises(DappledError, match="can't be read"):
         process.listen(ConsoleSettings(bind="127.0.0.1:0", token=str(tmp_path / "none")))
 
 
 def test_a_port_that_is_taken_is_refused_in_words() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(ConsoleError, match="can't listen on"):
+    with socket.create_server(("127.0.0.1", 0)) as taken, pytest.raises(DappledError, match="can't listen on"):
         process.listen(ConsoleSettings(bind=f"127.0.0.1:{taken.getsockname()[1]}"))
 
 

@@ -15,7 +15,7 @@ from dappled.daemon.health import host_checks
 from dappled.daemon.health.go_no_go import Check, next_step
 from dappled.daemon.health.host_checks import Machine
 from dappled.drivers.camera import CameraError
-from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody, UsbError
+from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody
 from tests.daemon.fakes import FakeCamera
 
 EOS = UsbBody(1, 5, CANON, 0x3145, "PTP", "EOS 450D")
@@ -38,7 +38,7 @@ def the_one(findings: list[Check]) -> Check:
 
 
 def no_libusb() -> list[UsbBody]:
-    raise UsbError("no libusb is on this machine")
+    raise CameraError("no libusb is on this machine")
 
 
 def test_without_a_camera_it_says_what_to_do_next(machine: Machine) -> None:

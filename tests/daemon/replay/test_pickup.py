@@ -13,9 +13,10 @@ from dappled import durable
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.daemon.replay import pickup
-from dappled.daemon.replay.pickup import Choice, PickupError
+from dappled.daemon.replay.pickup import Choice
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
+from dappled.errors import DappledError
 from dappled.findings import Code, Subject, finding, told
 from dappled.flight import Cause, LedgerReader, Shot, recording
 from tests.flight.conftest import START_UTC_NS
@@ -36,7 +37,7 @@ def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
     card.mkdir()
     (card / "DSCF0001.RAF").write_bytes(b"a frame")
     source = parse_source(str(card), PtpSource)
-    with pytest.raises(PickupError, match=r"shot 1 never fired, according to the flight: the camera was absent$"):
+    with pytest.raises(DappledError, match=r"shot 1 never fired, according to the flight: the camera was absent$"):
         pickup.propose(flight.folder.path, source, Choice(pairs={1: "DSCF0001.RAF"}))
     proposal = pickup.propose(flight.folder.path, source, Choice(pairs={0: "DSCF0001.RAF"}))
     assert [index for index, _ in proposal.pairs] == [0]

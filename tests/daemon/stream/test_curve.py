@@ -14,10 +14,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.daemon.stream import curve
-from dappled.daemon.stream.curve import ClientKeys, KeyFileError, ServerKeys
+from dappled.daemon.stream.curve import ClientKeys, ServerKeys
 from dappled.daemon.stream.publisher import Publisher
 from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import Message
+from dappled.errors import DappledError
 from dappled.mocks.simulation import free_port
 
 
@@ -41,7 +42,7 @@ def test_files_are_zeromq_s_own_and_only_their_owner_reads_the_secret(tmp_path: 
     own = curve.load_own(secret)
     assert zmq.auth.load_certificate(str(secret)) == (own.public, own.secret)
     assert zmq.auth.load_certificate(str(public)) == (own.public, None)
-    with pytest.raises(KeyFileError, match="exists already"):
+    with pytest.raises(DappledError, match="exists already"):
         curve.make(tmp_path / "new", "vehicle")
 
 
@@ -53,32 +54,32 @@ def test_pyzmq_s_own_files_are_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["", "../up", "a/b", ".hidden", "x" * 65, "with space"])
 def test_strange_names_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(KeyFileError, match="be the name of a key"):
+    with pytest.raises(DappledError, match="be the name of a key"):
         curve.make(tmp_path, name)
 
 
 def test_a_secret_that_others_can_read_is_refused(tmp_path: Path) -> None:
     _, secret = curve.make(tmp_path, "vehicle")
     secret.chmod(0o640)
-    with pytest.raises(KeyFileError, match="chmod 600"):
+    with pytest.raises(DappledError, match="chmod 600"):
         curve.load_own(secret)
 
 
 def test_a_list_that_anybody_can_add_to_is_refused(tmp_path: Path) -> None:
     curve.make(tmp_path / "allowed", "friend")
     (tmp_path / "allowed").chmod(0o777)
-    with pytest.raises(KeyFileError, match="can be written by any user"):
+    with pytest.raises(DappledError, match="can be written by any user"):
         curve.load_allowed(tmp_path / "allowed")
 
 
 def test_what_is_missing_is_named(tmp_path: Path) -> None:
     assert curve.server("", "") is None
-    with pytest.raises(KeyFileError, match="go together"):
+    with pytest.raises(DappledError, match="go together"):
         curve.server("x", "")
-    with pytest.raises(KeyFileError, match="can't be read"):
+    with pytest.raises(DappledError, match="can't be read"):
         curve.load_own(tmp_path / "none")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(KeyFileError, match="put the public key of each subscriber there"):
+    with pytest.raises(DappledError, match="put the public key of each subscriber there"):
         curve.load_allowed(tmp_path / "empty")
 
 
@@ -88,7 +89,7 @@ def test_any_file_is_a_key_or_an_error(tmp_path_factory: pytest.TempPathFactory,
     path.write_text(f'curve\n    public-key = "{text}"\n', encoding="ascii", newline="")
     try:
         key = curve.load_public(path)
-    except KeyFileError:
+    except DappledError:
         return
     assert key == text.encode()
 

@@ -24,10 +24,10 @@ from hypothesis import strategies as st
 
 from dappled.config.settings import PublishSettings
 from dappled.daemon.stream import publisher, sockets, wire
-from dappled.daemon.stream.curve import KeyFileError
 from dappled.daemon.stream.publisher import UNREAD_STACKS, Publisher, Reply
 from dappled.daemon.stream.subscriber import AsyncSubscriber, Subscriber, subscribe
 from dappled.daemon.stream.wire import Message, WireError
+from dappled.errors import DappledError
 from tests.schemas import schema
 
 STACK = np.arange(24, dtype=np.complex64).reshape(2, 3, 4)
@@ -496,7 +496,7 @@ def test_a_subscription_asks_for_what_was_sent_before(endpoint: str) -> None:
 
 
 def test_a_subscription_needs_both_key_files() -> None:
-    with pytest.raises(KeyFileError, match="keys and server_key go together"):
+    with pytest.raises(DappledError, match="keys and server_key go together"):
         subscribe("tcp://127.0.0.1:5555", keys="laptop.key_secret")
 
 

@@ -123,7 +123,7 @@ def _check_writable(path: Path) -> None:
 
 
 def _token(file: Path | None) -> str:
-    """The server's token, "" for none. Raises KeyFileError for a file that others can read."""
+    """The server's token, "" for none. Raises DappledError for a file that others can read."""
     if file is None:
         return os.environ.get(TOKEN_VARIABLE, "")
     return read_private(file.expanduser(), "the server's token").strip()

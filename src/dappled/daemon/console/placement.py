@@ -25,10 +25,6 @@ _WORLD_BYTES = 4096
 _WORLD = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw"}
 
 
-class BackgroundError(DappledError):
-    """A background map can't be used; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Background:
     """The background picture's file, and its bounds in degrees."""
@@ -47,29 +43,27 @@ class Background:
 def load_background(file: Path) -> Background:
     """Read a map and its world file: six lines, with degrees per pixel and the centre of the first pixel.
 
-    Raises BackgroundError for a file that is not a picture, is turned, or is not in degrees.
+    Raises DappledError for a file that is not a picture, is turned, or is not in degrees.
     """
     if file.suffix.lower() not in _WORLD:
-        raise BackgroundError(f"{file}: a map is a PNG or a JPEG")
+        raise DappledError(f"{file}: a map is a PNG or a JPEG")
     world = next((p for p in (file.with_suffix(_WORLD[file.suffix.lower()]), file.with_suffix(".wld")) if p.is_file()),
                  None)  # fmt: skip
     if world is None:
-        raise BackgroundError(
-            f"{file} has no world file {file.with_suffix(_WORLD[file.suffix.lower()]).name} beside it"
-        )
+        raise DappledError(f"{file} has no world file {file.with_suffix(_WORLD[file.suffix.lower()]).name} beside it")
     try:
         lines = read_bytes(world, _WORLD_BYTES).decode("ascii").split()
         across, turned, turned_too, down, left, top = (float(line) for line in lines)
         with file.open("rb") as picture:
             width, height = open_picture(picture).size
     except (OSError, ValueError) as error:
-        raise BackgroundError(f"{file} with {world.name} can't be used as a map: {first_line(error)}") from None
+        raise DappledError(f"{file} with {world.name} can't be used as a map: {first_line(error)}") from None
     if turned or turned_too or across <= 0 or down >= 0:
-        raise BackgroundError(f"{file}: a map must be north up; warp it first (gdalwarp -t_srs EPSG:4326)")
+        raise DappledError(f"{file}: a map must be north up; warp it first (gdalwarp -t_srs EPSG:4326)")
     west, north = left - across / 2, top - down / 2
     east, south = west + across * width, north + down * height
     if not (-180 <= west < east <= 181 and -90 <= south < north <= 90):
-        raise BackgroundError(f"{file} is not in degrees; warp it first (gdalwarp -t_srs EPSG:4326)")
+        raise DappledError(f"{file} is not in degrees; warp it first (gdalwarp -t_srs EPSG:4326)")
     return Background(file, north, south, east, west)
 
 

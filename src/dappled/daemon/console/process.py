@@ -30,10 +30,6 @@ _TOKEN_CHARACTERS = 12
 _ANSWER_S = 3.0
 
 
-class ConsoleError(DappledError):
-    """The console can't be opened; one sentence."""
-
-
 class ConsoleRequestError(DappledError):
     """The daemon did not answer the console; one sentence."""
 
@@ -41,16 +37,16 @@ class ConsoleRequestError(DappledError):
 def credentials(settings: ConsoleSettings) -> tuple[str, int, str]:
     """Host and port of `console.bind`, and the token ("" on loopback without one). Nothing is opened but its file.
 
-    Raises ConsoleError, or KeyFileError for a token file that others can read.
+    Raises DappledError, or DappledError for a token file that others can read.
     """
     host, port = address(settings.bind)
     token = read_private(Path(settings.token), "the console's token").strip() if settings.token else ""
     if settings.token and len(token) < _TOKEN_CHARACTERS:
-        raise ConsoleError(
+        raise DappledError(
             f"{settings.token} holds no token of {_TOKEN_CHARACTERS} characters: make one with `dappled keys token`"
         )
     if not token and not is_loopback(host):
-        raise ConsoleError(
+        raise DappledError(
             f"console.bind = {settings.bind!r} would be open to the network without a token: make one with "
             "`dappled keys token FILE`, and name it in console.token"
         )
@@ -68,17 +64,17 @@ def listen(settings: ConsoleSettings) -> tuple[socket.socket, str]:
         one.listen(_BACKLOG)
     except OSError as error:
         one.close()
-        raise ConsoleError(
+        raise DappledError(
             f"the console can't listen on {settings.bind}: {error.strerror}; choose another console.bind"
         ) from None
     return one, token
 
 
 def address(bind: str) -> tuple[str, int]:
-    """(host, port) of "host:port" or "[host]:port". Raises ConsoleError."""
+    """(host, port) of "host:port" or "[host]:port". Raises DappledError."""
     host, colon, port = bind.rpartition(":")
     if not colon or not port.isascii() or not port.isdigit() or int(port) > 65535 or not host:
-        raise ConsoleError(f"console.bind = {bind!r} must be host:port, such as 127.0.0.1:8080")
+        raise DappledError(f"console.bind = {bind!r} must be host:port, such as 127.0.0.1:8080")
     return host.strip("[]"), int(port)
 
 

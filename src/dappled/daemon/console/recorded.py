@@ -23,10 +23,6 @@ _NO_POSE = (
 )  # fmt: skip
 
 
-class RecordedFrameError(DappledError):
-    """A recorded frame can't be shown; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class ShownFrame:
     """The header of a frame's `frame` message, and its verdict in flight, if it was judged."""
@@ -89,9 +85,9 @@ class FlightFrames:
         """See FrameSource."""
         line = self._lines.get(index)
         if line is None or line.frame is None or line.tag is None:
-            raise RecordedFrameError(f"there is no frame {index} in this flight")
+            raise DappledError(f"there is no frame {index} in this flight")
         if self._decoder is None:
-            raise RecordedFrameError("this flight was recorded without a mask: name one with --mask")
+            raise DappledError("this flight was recorded without a mask: name one with --mask")
         path = str(self._folder.file(line.frame.name))
         decoded = self._decoder.decode(path, line.tag.focal_length_mm, line.tag.f_number, index=index)
         return Message("slices", self._named(wire.slices_header(line.tag, decoded)), decoded.body)
@@ -129,7 +125,7 @@ class LightFieldFrames:
     def slices(self, index: int) -> Message:
         """See FrameSource."""
         if index != 0:
-            raise RecordedFrameError(f"there is no frame {index} in {self._name}")
+            raise DappledError(f"there is no frame {index} in {self._name}")
         slices, carriers = self._field.slices, self._field.carriers
         if not len(slices):  # it came as views: their mean is what the carrier (0, 0) holds
             mean = self._field.views.reshape(-1, *self._field.views.shape[2:]).mean(axis=0)

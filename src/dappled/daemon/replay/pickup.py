@@ -38,10 +38,6 @@ from dappled.flight.seal_key import SealKey
 _ANCHORS = 64  # frames whose times tell the camera's clock
 
 
-class PickupError(DappledError):
-    """Nothing can be picked up for this flight, or not like this; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Choice:
     """What a person says about the matching. `pairs`: image index → file name (or its last part). `offset_s`: the
@@ -89,11 +85,11 @@ def propose(
     flight: Path, source: FileSource, choice: Choice, progress: Callable[[int], Any] = lambda _: None
 ) -> Proposal:
     """Which files belong to which shots. Changes nothing. `progress` gets the bytes that were compared. Raises
-    PickupError, FlightError, CameraError."""
+    DappledError, FlightError, CameraError."""
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
         if "closed_utc_ns" not in ledger.facts():
-            raise PickupError(f"{flight} is still being recorded, or was never closed: stop the daemon first")
+            raise DappledError(f"{flight} is still being recorded, or was never closed: stop the daemon first")
         rows = {row.shot.index: row for row in ledger.shots()}
         frames = ledger.frames()
         had = frames + ledger.companions()
@@ -274,17 +270,19 @@ def _chosen(
     for index, name in choice.pairs.items():
         row = rows.get(index)
         if row is None or row.state == "safe":
-            raise PickupError(
+            raise DappledError(
                 f"--pair {index}={name}: shot {index} {'has its frame' if row else 'is not in the flight'}"
             )
         if row.fired_called_monotonic_ns is None:
-            raise PickupError(f"--pair {index}={name}: shot {index} never fired, according to the flight: {row.reason}")
+            raise DappledError(
+                f"--pair {index}={name}: shot {index} never fired, according to the flight: {row.reason}"
+            )
         fitting = [group for group in fresh if name in (group.main.name, group.main.base)]
         frames = [frame.index for full, frame in known.items() if name in (full, full.rpartition("/")[2])]
         if frames and not fitting:
-            raise PickupError(f"--pair {index}={name}: its bytes are the frame of shot {frames[0]} already")
+            raise DappledError(f"--pair {index}={name}: its bytes are the frame of shot {frames[0]} already")
         if len(fitting) != 1:
-            raise PickupError(f"--pair {index}={name}: {len(fitting)} new files have this name; give the full name")
+            raise DappledError(f"--pair {index}={name}: {len(fitting)} new files have this name; give the full name")
         chosen[index] = fitting[0]
     return chosen
 
@@ -293,7 +291,7 @@ def _matched(shots: list[FiredShot], files: list[DatedFile], choice: Choice, off
     if choice.by_order:
         pairs = matching.in_order(shots, files)
         if pairs is None:
-            raise PickupError(
+            raise DappledError(
                 f"--by-order needs as many files as shots: {counted(len(shots), 'shot')}, {counted(len(files), 'file')}"
             )
         return Matching(pairs, (), (), tuple(_against(files)))

@@ -51,10 +51,6 @@ _READ = {
 Kind = Literal["lost", "refused", "without a file", "doubled", "phantom"]
 
 
-class BooksError(DappledError):
-    """A log can't be compared with a flight; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Imbalance:
     """What does not balance: a trigger, a shot or a file, each with what is known of it. `utc_ns` is None where UTC
@@ -166,7 +162,7 @@ class _Flight:
 def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     """Compare a flight with the logs of the autopilot's boots in it.
 
-    Raises BooksError, FlightError, AutopilotLogError.
+    Raises DappledError, FlightError, AutopilotLogError.
     """
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
@@ -226,7 +222,7 @@ def _read(path: Path, cam_idx: int, bounds: UtcBounds) -> TriggerLog:
         from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
 
         return dataflash.triggers(path, cam_idx, bounds)
-    raise BooksError(f"{path} is no log of an autopilot: give ArduPilot's .bin or PX4's .ulg")
+    raise DappledError(f"{path} is no log of an autopilot: give ArduPilot's .bin or PX4's .ulg")
 
 
 def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside: bool) -> _Heard:
@@ -259,7 +255,7 @@ def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside
 
 def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[tuple[Floats, Floats], float]:
     """The daemon's time minus the time since boot, at times since boot: (n,) µs each; and by how much the link delays
-    half of its messages. Raises BooksError where the flight heard no such boot."""
+    half of its messages. Raises DappledError where the flight heard no such boot."""
     mine = [
         (boot_us, stamp_us - boot_us)
         for boot_us, unix_minus_boot_us, stamp_us in heard.times
@@ -271,11 +267,11 @@ def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[tuple[Floats, F
         least_us = np.array([offsets_us[begins : ends + 1].min() for begins, ends in near])
         return (boots_us, least_us), float(np.median(offsets_us - least_us))
     if not heard.times:
-        raise BooksError(
+        raise DappledError(
             "the flight's telemetry has no time of the autopilot (SYSTEM_TIME with UTC), so no log can be placed in it"
         )
     flown = _utc_text(min(unix_us for _, unix_us, _ in heard.times) * 1000)
-    raise BooksError(
+    raise DappledError(
         f"{path} is not a log of this flight: its autopilot was started at {_utc_text(log.clock.utc_us(0) * 1000)}, "
         f"that of the flight at {flown}; give the log of that start"
     )

@@ -23,10 +23,6 @@ _KEY = r'^\s*{}-key\s*=\s*"([^"\n]*)"\s*$'
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 
 
-class KeyFileError(DappledError):
-    """A key file can't be made or used; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Keys:
     """One party's own pair, Z85."""
@@ -54,10 +50,10 @@ class ClientKeys:
 def make(folder: Path, name: str) -> tuple[Path, Path]:
     """Make a pair as `folder`/NAME.key and NAME.key_secret (mode 0600); existing files are never overwritten.
 
-    Raises KeyFileError.
+    Raises DappledError.
     """
     if not _NAME.fullmatch(name):
-        raise KeyFileError(
+        raise DappledError(
             f"{name!r} can't be the name of a key: use letters, digits, dot, dash and underscore, 64 at most"
         )
     public, secret = zmq.curve_keypair()
@@ -76,64 +72,64 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
             secret_file.unlink()  # half a pair would stop the next attempt
             raise
     except FileExistsError as error:
-        raise KeyFileError(f"{error.filename} exists already: choose another name, or move it away") from None
+        raise DappledError(f"{error.filename} exists already: choose another name, or move it away") from None
     except OSError as error:
-        raise KeyFileError(f"{error.filename or folder} can't be written: {error.strerror}") from None
+        raise DappledError(f"{error.filename or folder} can't be written: {error.strerror}") from None
     return public_file, secret_file
 
 
 def read_private(path: Path, what: str) -> str:
-    """The text of a secret file that only its owner can read. Raises KeyFileError with what to do."""
+    """The text of a secret file that only its owner can read. Raises DappledError with what to do."""
     try:
         file = key_files.read(path)
         text = file.data.decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise KeyFileError(f"{path} can't be read as {what}: {why}") from None
+        raise DappledError(f"{path} can't be read as {what}: {why}") from None
     if not file.private:
-        raise KeyFileError(f"{path} can be read by others than its owner: chmod 600 {path}")
+        raise DappledError(f"{path} can be read by others than its owner: chmod 600 {path}")
     if not file.own:
-        raise KeyFileError(f"{path} belongs to another user: {what} must be your own")
+        raise DappledError(f"{path} belongs to another user: {what} must be your own")
     return text
 
 
 def load_own(path: Path) -> Keys:
-    """A pair from NAME.key_secret. Raises KeyFileError, also where others could read it."""
+    """A pair from NAME.key_secret. Raises DappledError, also where others could read it."""
     text = read_private(path, "a secret key")
     return Keys(_key(text, "public", path), _key(text, "secret", path))
 
 
 def load_public(path: Path) -> bytes:
-    """A public key from NAME.key (or NAME.key_secret). Raises KeyFileError."""
+    """A public key from NAME.key (or NAME.key_secret). Raises DappledError."""
     try:
         text = path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise KeyFileError(f"{path} can't be read as a public key: {why}") from None
+        raise DappledError(f"{path} can't be read as a public key: {why}") from None
     return _key(text, "public", path)
 
 
 def load_allowed(folder: Path) -> dict[bytes, str]:
-    """The public keys of a folder's *.key files by key, named by file. Raises KeyFileError where it is empty, holds a
+    """The public keys of a folder's *.key files by key, named by file. Raises DappledError where it is empty, holds a
     file that is not a key, or can be written by any user."""
     try:
         mode = folder.stat().st_mode
         files = sorted(folder.glob("*.key"))
     except OSError as error:
-        raise KeyFileError(f"{folder} can't be read as a folder of clients' keys: {error.strerror}") from None
+        raise DappledError(f"{folder} can't be read as a folder of clients' keys: {error.strerror}") from None
     if mode & 0o002:
-        raise KeyFileError(f"{folder} can be written by any user, who could add a key: chmod o-w {folder}")
+        raise DappledError(f"{folder} can be written by any user, who could add a key: chmod o-w {folder}")
     if not files:
-        raise KeyFileError(f"{folder} holds no NAME.key: put the public key of each subscriber there")
+        raise DappledError(f"{folder} holds no NAME.key: put the public key of each subscriber there")
     return {load_public(path): path.stem for path in files}
 
 
 def server(own: str, allowed: str) -> ServerKeys | None:
-    """A publisher's keys from its two settings; None where neither is set. Raises KeyFileError."""
+    """A publisher's keys from its two settings; None where neither is set. Raises DappledError."""
     if not own and not allowed:
         return None
     if not own or not allowed:
-        raise KeyFileError(
+        raise DappledError(
             "publish.keys and publish.clients go together: your secret key, and the folder of subscribers' keys"
         )
     return ServerKeys(load_own(Path(own)), load_allowed(Path(allowed)))
@@ -152,10 +148,10 @@ def judge(request: Sequence[bytes], allowed: Mapping[bytes, str]) -> tuple[list[
 def _key(text: str, which: str, path: Path) -> bytes:
     found = re.search(_KEY.format(which), text, re.MULTILINE)
     if found is None:
-        raise KeyFileError(f"{path} holds no {which} key: make one with `dappled keys make`")
+        raise DappledError(f"{path} holds no {which} key: make one with `dappled keys make`")
     key = found[1].encode()
     if not _is_key(key):
-        raise KeyFileError(f"{path}: its {which} key is not 40 characters of Z85")
+        raise DappledError(f"{path}: its {which} key is not 40 characters of Z85")
     return key
 
 

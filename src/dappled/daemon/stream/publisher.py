@@ -120,7 +120,7 @@ class Publisher:
 
     @classmethod
     def of(cls, settings: PublishSettings, *, private: str = "", clock: Clock | None = None) -> Self:
-        """A publisher at the endpoints of these settings. Raises WireError, KeyFileError."""
+        """A publisher at the endpoints of these settings. Raises WireError, DappledError."""
         return cls(
             settings.slices,
             settings.ask,

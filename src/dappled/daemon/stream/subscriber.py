@@ -15,8 +15,9 @@ import zmq
 import zmq.asyncio
 
 from dappled.daemon.stream import wire
-from dappled.daemon.stream.curve import ClientKeys, KeyFileError, load_own, load_public
+from dappled.daemon.stream.curve import ClientKeys, load_own, load_public
 from dappled.daemon.stream.wire import Message, WireError
+from dappled.errors import DappledError
 
 MOST_MISSING = 2**16  # as many as a publisher remembers; a header that claims more is not believed
 AT_ONCE = 4  # questions under way; the others wait
@@ -337,11 +338,11 @@ def subscribe(
     `ask` is the endpoint where lost slices are asked for again: by default the one beside an ipc endpoint, "" for none.
     With `from_start` the slices that the flight sent before count as lost too. The loop ends after the flight, or when
     no message came for `idle_s`. A tcp endpoint with CURVE needs both files: `keys`, your own NAME.key_secret, and
-    `server_key`, the vehicle's NAME.key. Raises KeyFileError for the files; the loop raises WireError for an endpoint
+    `server_key`, the vehicle's NAME.key. Raises DappledError for the files; the loop raises WireError for an endpoint
     or an invalid message.
     """
     if (keys is None) != (server_key is None):
-        raise KeyFileError("keys and server_key go together: your own secret key, and the vehicle's public one")
+        raise DappledError("keys and server_key go together: your own secret key, and the vehicle's public one")
     pair = None
     if keys is not None and server_key is not None:
         pair = ClientKeys(load_own(Path(keys)), load_public(Path(server_key)))
