@@ -16,9 +16,9 @@ from dappled.daemon.pipeline.spacing import Spacing
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
+from dappled.findings import Finding
 from dappled.flight import Shot
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import LostTriggers, Refusals
 
 START_NS = 1_790_000_000 * 10**9
 LATENCY_MS, LATENCY_SIGMA_MS = 60.0, 10.0
@@ -116,7 +116,7 @@ class Daemon:
     def fire(self, shot: Shot) -> None:
         self._fired(shot)
 
-    def refused(self, refusals: Refusals) -> None:
+    def refused(self, why: Finding) -> None:
         """Counted by the shutter."""
 
     def facts(self) -> CameraFacts:
@@ -134,5 +134,5 @@ class Daemon:
     def troubled(self) -> bool:
         return False
 
-    def lost(self, triggers: LostTriggers) -> None:
-        self.named += triggers.count
+    def lost(self, triggers: Finding) -> None:
+        self.named += triggers.number("triggers")

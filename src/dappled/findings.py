@@ -6,9 +6,11 @@ sentences; no code reads a sentence back.
 
 from __future__ import annotations
 
+import json
+import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from importlib import resources
 from types import MappingProxyType
@@ -34,10 +36,20 @@ class Level(IntEnum):
 class Code(StrEnum):
     """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""
 
+    CAMERA_ABSENT = "camera.absent"
     CAMERA_CLOCK_FAR = "camera.clock_far"
+    CAMERA_FAULTED = "camera.faulted"
+    CAMERA_FIRED_OUTSIDE = "camera.fired_outside"
+    CAMERA_SHOTS_WAITING = "camera.shots_waiting"
+    CAMERA_STARTING = "camera.starting"
     CARD_CHANGED = "card.changed"
     CARD_NOT_LISTED = "card.not_listed"
     CARD_PICTURES_LEFT = "card.pictures_left"
+    DISK_FEW_FILES = "disk.few_files"
+    DISK_FULL = "disk.full"
+    DISK_NEARLY_FULL = "disk.nearly_full"
+    DISK_UNREADABLE = "disk.unreadable"
+    FLIGHT_NEXT_BEGINS = "flight.next_begins"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
     FRAME_RIVAL_PICTURE = "frame.rival_picture"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"
@@ -53,6 +65,24 @@ class Code(StrEnum):
     LOG_STAMPS_UNSET = "log.stamps_unset"
     LOG_VALUES_MISSING = "log.values_missing"
     LOG_VEHICLE = "log.vehicle"
+    MACHINE_FEW_DESCRIPTORS = "machine.few_descriptors"
+    MACHINE_LITTLE_MEMORY = "machine.little_memory"
+    PEER_DISPLACED = "peer.displaced"
+    PEER_GUESS_BY_PAGE = "peer.guess_by_page"
+    PEER_GUESS_WRONG = "peer.guess_wrong"
+    PEER_GUESSES = "peer.guesses"
+    PEER_HANDSHAKE_FAILED = "peer.handshake_failed"
+    PEER_HANDSHAKE_SLOW = "peer.handshake_slow"
+    PEER_KEY_UNLISTED = "peer.key_unlisted"
+    PEER_NOT_HTTP = "peer.not_http"
+    PEER_NOT_TAKEN = "peer.not_taken"
+    PEER_NOT_ZEROMQ = "peer.not_zeromq"
+    PEER_OTHER_HOST = "peer.other_host"
+    PEER_OTHER_PROTOCOL = "peer.other_protocol"
+    PEER_READS_NOTHING = "peer.reads_nothing"
+    PEER_SILENT = "peer.silent"
+    PEER_TOO_MANY = "peer.too_many"
+    PEER_WRONG_REQUEST = "peer.wrong_request"
     PICTURE_CLIPPED = "picture.clipped"
     PICTURE_DARK = "picture.dark"
     PICTURE_DEVELOPED = "picture.developed"
@@ -63,8 +93,13 @@ class Code(StrEnum):
     PICTURE_SHADOW_UNSEEN = "picture.shadow_unseen"
     PICTURE_SOFT = "picture.soft"
     PICTURE_UNDATED = "picture.undated"
+    SERVICE_STOPPING = "service.stopping"
+    SHOT_INTERVAL_BOUNDS = "shot.interval_bounds"
+    SHOT_NOT_NOTED = "shot.not_noted"
     TIME_WEEK_MENDED = "time.week_mended"
     TIME_WEEK_ROLLOVER = "time.week_rollover"
+    TRIGGER_JUMP = "trigger.jump"
+    TRIGGER_LOST = "trigger.lost"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -104,6 +139,15 @@ class Finding:
     def __hash__(self) -> int:
         return hash((self.code, self.subject))
 
+    def with_facts(self, **more: Value) -> Self:
+        """It with more facts, or others."""
+        return replace(self, facts={**self.facts, **more})
+
+    def number(self, name: str) -> int:
+        """A whole number of its facts; 0 where there is none of this name."""
+        value = self.facts.get(name)
+        return value if isinstance(value, int) else 0
+
     @property
     def kind(self) -> tuple[Code, Subject]:
         """What makes two findings the same, whatever their numbers."""
@@ -130,6 +174,19 @@ class Finding:
         )
 
 
+def json_text(one: Finding) -> str:
+    """A finding as an event of the ledger holds it."""
+    return json.dumps(one.to_json(), ensure_ascii=False)
+
+
+def of_json_text(words: str) -> Finding | None:
+    """The finding that a text holds as JSON, as an event of the ledger does; None for another text."""
+    try:
+        return Finding.from_json(json.loads(words))
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return None
+
+
 def finding(code: Code, subject: Subject, level: Level | None = None, **facts: Value) -> Finding:
     """A finding with its code's own level, unless another is given."""
     return Finding(code, subject, facts, WORDS[code].level if level is None else level)
@@ -153,14 +210,37 @@ def in_order(found: Sequence[Finding]) -> list[Finding]:
     return sorted(found[::-1], key=lambda one: -one.level)  # noqa: C415  sorted() keeps the order of equals
 
 
+class _Sentences(string.Formatter):
+    """Formats facts as `str.format` does. `{reason:?: }` is empty, or ": " and the reason; `{frames:#frame}` is
+    1 frame, 2 frames. Facts may come from damaged files: one that is missing, or of another type, is shown as it is.
+    """
+
+    def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
+        return kwargs.get(str(key))
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        if format_spec.startswith("?"):
+            return "" if value in (None, "") else f"{format_spec[1:]}{value}"
+        if format_spec.startswith("#") and isinstance(value, int):
+            return f"{value} {format_spec[1:]}" + ("" if value == 1 else "s")
+        try:
+            return format(value, format_spec)
+        except (ValueError, TypeError):
+            return str(value)
+
+
+def _filled(sentence: str, facts: Mapping[str, Value]) -> str:
+    return _Sentences().vformat(sentence, (), facts)
+
+
 def text(one: Finding) -> str:
     """What was found, as a clause without its subject and without a full stop."""
-    return WORDS[one.code].sentence.format_map(one.facts)
+    return _filled(WORDS[one.code].sentence, one.facts)
 
 
 def told(one: Finding) -> str:
     """What was found, of what, and what to do."""
-    remedy = WORDS[one.code].remedy.format_map(one.facts)
+    remedy = _filled(WORDS[one.code].remedy, one.facts)
     return f"{one.subject}: {text(one)}" + (f": {remedy}" if remedy else "")
 
 

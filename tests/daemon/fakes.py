@@ -38,8 +38,8 @@ from dappled.drivers.camera import (
     check_change,
 )
 from dappled.drivers.raw.recipe import LawDecision
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Shot, recording
-from dappled.refusals import Refusals
 
 
 def no_pose(utc_ns: int = 0) -> Pose:
@@ -174,7 +174,7 @@ class Rig:
         raise AssertionError(f"shot {index} never ended")
 
     def events(self) -> list[str]:
-        return [f"{event.kind}: {event.text}" for event in self.flight.ledger.events()]
+        return [f"{event.kind}: {event.words}" for event in self.flight.ledger.events()]
 
 
 class CallingObserver(Observer):
@@ -198,20 +198,23 @@ class CallingObserver(Observer):
         self._finished(pending)
 
 
+NO_CAMERA = finding(Code.CAMERA_ABSENT, Subject("camera"), reason="none is on the bus")
+
+
 class FakeSink:
     """A ShotSink that keeps what it is given: `done` in order. `problem` stands in the way of every shot."""
 
     def __init__(self) -> None:
-        self.problem: str | None = None
+        self.problem: Finding | None = None
         self.note_error: OSError | None = None
         self.done: list[tuple[str, int]] = []
-        self.refusals: list[Refusals] = []
+        self.refusals: list[Finding] = []
 
     @property
     def fired(self) -> list[int]:
         return [index for act, index in self.done if act == "fire"]
 
-    def obstacle(self) -> str | None:
+    def obstacle(self) -> Finding | None:
         return self.problem
 
     def note(self, shot: Shot) -> None:
@@ -222,8 +225,8 @@ class FakeSink:
     def fire(self, shot: Shot) -> None:
         self.done.append(("fire", shot.index))
 
-    def refused(self, refusals: Refusals) -> None:
-        self.refusals.append(refusals)
+    def refused(self, why: Finding) -> None:
+        self.refusals.append(why)
 
 
 class Nowhere:
@@ -258,7 +261,7 @@ class FlightSink:
     def fire(self, shot: Shot) -> None:
         self.shots.fire(shot)
 
-    def refused(self, refusals: Refusals) -> None:
+    def refused(self, why: Finding) -> None:
         """Only the sender hears it."""
 
 

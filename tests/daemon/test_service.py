@@ -71,7 +71,7 @@ def started(settings: Settings, shots: list[PendingShot]) -> Service:
 def told(flight: Path) -> list[str]:
     """The ledger's events, as "kind: text"."""
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
-        return [f"{event.kind}: {event.text}" for event in ledger.events()]
+        return [f"{event.kind}: {event.words}" for event in ledger.events()]
 
 
 def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: FakeCamera, settings: Settings) -> None:
@@ -100,7 +100,7 @@ def test_triggers_lost_in_the_last_seconds_of_a_flight_are_in_its_ledger(
     for number in (10, 14):
         numbers.heard(number, service._clock.monotonic_ns(), lambda: "noticed here")
     service.stop()
-    assert "lost trigger: triggers 11 to 13 noticed here" in told(service.folder)
+    assert "lost trigger: trigger 11 to 13: became no shot, noticed here" in told(service.folder)
     assert not flight_report.balance(service.folder).balanced
 
 
@@ -128,7 +128,7 @@ def test_a_disk_that_can_t_be_asked_refuses_in_words(
     with monkeypatch.context() as broken:
         broken.setattr(layout, "disk_space", refuse)
         decision = service.request(CaptureRequest("test", "console", 1))
-    assert (decision.outcome, decision.reason) == ("refused", "cannot ask for the free space of the disk")
+    assert decision.words == "no photo: cannot ask for the free space of the disk"
     service.stop()
     assert not camera.fired
 
@@ -157,7 +157,7 @@ def test_too_little_memory_refuses_in_words_as_long_as_that_is_fresh(
         service._control.look()
     decision = service.request(CaptureRequest("test", "console", 1))
     said = "too little memory is left for a photograph: 10 MB; end other programs"
-    assert (decision.outcome, decision.reason) == ("refused", said)
+    assert decision.words == f"no photo: {said}"
     assert said in service.health()["problems"]
     monkeypatch.setattr(flight_control, "LOOK_VALID_NS", 0)
     assert service.request(CaptureRequest("test", "console", 2)).accepted
@@ -320,7 +320,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         camera.say(event)
     eventually(lambda: service.shutter.statistics().pending == 0, "the interval's shot's end")
     assert parameters.change("LF_MASK", "mask-3")
-    assert "next flight begins" in str(service.request(CaptureRequest("test", "console", 3)).reason)
+    assert "next flight begins" in service.request(CaptureRequest("test", "console", 3)).words
     service.run()  # ends by itself
     service.stop()
     assert after.next == replace(settings, mask=MaskSettings("mask-3"))

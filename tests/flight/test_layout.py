@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.confined import OutsideError
+from dappled.findings import Code
 from dappled.flight import FlightError, FlightsLock, layout
 from tests.flight.conftest import START_UTC_NS
 
@@ -147,9 +148,12 @@ def test_a_disk_without_inodes_or_room_for_the_journal_is_too_small() -> None:
     room = layout.DiskSpace(10**12, 0, 10**9, files=16)
     assert room.shortage(500) is None
     assert replace(room, files=None).shortage(500) is None  # btrfs: no number is not none left
-    assert "only 15 more files" in (replace(room, files=15).shortage(500) or "")
-    assert "asks for 1001 MB" in (room.shortage(1001) or "")
-    assert "999 kB left, the shot journal" in (replace(room, available=999_999).shortage(0) or "")
+    short = replace(room, files=15).shortage(500), room.shortage(1001), replace(room, available=999_999).shortage(0)
+    assert [(one.code, dict(one.facts)) for one in short if one] == [
+        (Code.DISK_FEW_FILES, {"files": 15}),
+        (Code.DISK_NEARLY_FULL, {"left_mb": 1000, "least_mb": 1001}),
+        (Code.DISK_FULL, {"left_kb": 999}),
+    ]
 
 
 def test_a_file_system_without_inodes_reports_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -111,4 +111,4 @@ def assert_whole(flight: Path) -> None:
 def told(flight: Path) -> list[str]:
     """The ledger's events, as "kind: text"."""
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
-        return [f"{event.kind}: {event.text}" for event in ledger.events()]
+        return [f"{event.kind}: {event.words}" for event in ledger.events()]

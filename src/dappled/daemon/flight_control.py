@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dappled import findings
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, ReportedCamera
@@ -15,9 +16,10 @@ from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import PacketSender
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import FlightError, Recording, Shot, layout
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import LostTriggers, Refusals
+from dappled.flight.records import LOST, REFUSED
 
 LOOK_VALID_NS = 5 * 10**9
 
@@ -45,24 +47,24 @@ class FlightControl:
         self._settings, self._clock, self._recording, self._shots = settings, clock, recording, shots
         self._writer, self._navigation, self._camera = writer, navigation, camera
         self._sender, self._alarms, self._handover = sender, alarms, handover
-        self._looked: tuple[str | None, int] = (None, 0)
+        self._looked: tuple[Finding | None, int] = (None, 0)
 
     # ShotSink
 
-    def obstacle(self) -> str | None:
+    def obstacle(self) -> Finding | None:
         """See ShotSink."""
         if self._handover is not None and self._handover.next is not None:
-            return "the next flight begins in a moment, with what the ground station has set"
-        if self._shots.state not in ("ready", "busy"):
-            return self._shots.camera_sentence()
+            return finding(Code.FLIGHT_NEXT_BEGINS, Subject("flight"))
+        if (missing := self._shots.without_camera()) is not None:
+            return missing
         try:
             space = layout.disk_space(self._recording.folder.path)
         except FlightError as error:
-            return str(error)
+            return finding(Code.DISK_UNREADABLE, Subject("disk"), why=str(error))
         return space.shortage(self._settings.now.record.min_free_mb) or self.shortage
 
     @property
-    def shortage(self) -> str | None:
+    def shortage(self) -> Finding | None:
         """Why descriptors or memory don't suffice, as `look` found it; None where it is older than five seconds."""
         found, at_ns = self._looked
         return found if self._clock.monotonic_ns() - at_ns <= LOOK_VALID_NS else None
@@ -79,9 +81,9 @@ class FlightControl:
         """See ShotSink."""
         self._shots.fire(shot)
 
-    def refused(self, refusals: Refusals) -> None:
+    def refused(self, why: Finding) -> None:
         """See ShotSink."""
-        self._writer.later("refused", refusals.text())
+        self._writer.later(REFUSED, findings.json_text(why))
 
     # CameraModel
 
@@ -115,9 +117,9 @@ class FlightControl:
         """See CameraModel."""
         return self._alarms.troubled
 
-    def lost(self, triggers: LostTriggers) -> None:
+    def lost(self, triggers: Finding) -> None:
         """See CameraModel."""
-        self._writer.later("lost trigger", triggers.text())
+        self._writer.later(LOST, findings.json_text(triggers))
 
     # DistanceReceiver
 

@@ -383,7 +383,7 @@ class Service:
             *(findings.told(one) for one in self.component.findings()),
             navigation.utc.doubt(),
             *navigation.telemetry.doubts(self._clock.utc_ns()),
-            self._control.shortage,
+            *([] if (short := self._control.shortage) is None else [findings.text(short)]),
             *map(findings.told, self.links.findings()),
             None if self._gnss is None else self._gnss.problem(),
         )

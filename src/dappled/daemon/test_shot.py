@@ -109,7 +109,7 @@ class TestShot:
         self._requests += 1
         decision = self._service.request(CaptureRequest("doctor", "test shot", self._requests, acknowledged=False))
         if decision.index is None or not decision.accepted:
-            raise DappledError(f"the shot was refused: {decision.reason}")
+            raise DappledError(f"the shot was refused: {decision.words}")
         pending = self._ended.wait_for(decision.index, timeout_s)
         if pending is None:
             raise DappledError(f"the shot did not end within {timeout_s:g} s")

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dappled import findings
 from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import DOUBT, LATER_DOUBT, Frame, LedgerEvent, Result, ShotRow, Stray, Tag
-from dappled.refusals import OTHERS, LostTriggers, Refusals
+from dappled.flight.records import DOUBT, LATER_DOUBT, LOST, REFUSED, Frame, LedgerEvent, Result, ShotRow, Stray, Tag
 
-LOST = "lost trigger"
 _CARD = ("card.", "picture.")  # what a driver said of the camera's card: codes of `findings`
 
 
@@ -107,7 +105,7 @@ def balance(path: Path) -> Balance:
         events = ledger.events()
         results = ledger.results()
         judged = {index: found for index, one in results.items() if (found := one.verdict)}
-        lost = [one for event in events if event.kind == LOST and (one := LostTriggers.of_text(event.text))]
+        lost = [one for event in events if event.kind == LOST and (one := event.finding)]
         states = Counter(row.state for row in shots)
         return Balance(
             flight=folder.name,
@@ -125,8 +123,8 @@ def balance(path: Path) -> Balance:
             following=len(ledger.following()),
             companions=len(ledger.companions()),
             refused=_refused(events).total(),
-            lost=sum(one.count for one in lost),
-            lost_triggers=tuple(one.text() for one in lost),
+            lost=sum(one.number("triggers") for one in lost),
+            lost_triggers=tuple(findings.told(one) for one in lost),
             began_utc_ns=None
             if correction_ns is None or "began_utc_ns" not in facts
             else facts["began_utc_ns"] + correction_ns,
@@ -197,9 +195,6 @@ def list_flights(root: Path) -> list[ListedFlight]:
     return listed
 
 
-_PEER = re.compile(r"\S+ from (?P<source>\S+)")  # as the daemon notes it: kind and source
-
-
 @dataclass(frozen=True, slots=True)
 class SourceReport:
     """What became of one source's capture requests ("mavlink:1/1", "console" …).
@@ -238,11 +233,9 @@ def by_source(path: Path) -> tuple[SourceReport, ...]:
 
 
 def _refused(events: Iterable[LedgerEvent]) -> Counter[str]:
-    """Refused requests by source; "unknown" where the event names none. A flood is one event with a count a minute."""
+    """Refused requests by source. A flood is one event with a count a minute."""
     found: Counter[str] = Counter()
     for event in events:
-        if event.kind == "refused":
-            one = Refusals.of_text(event.text) or Refusals("", event.text, 1)
-            match = _PEER.fullmatch(one.peer)
-            found[match["source"] if match else OTHERS if one.peer == OTHERS else "unknown"] += one.count
+        if event.kind == REFUSED and (one := event.finding) is not None:
+            found[str(one.subject.which)] += one.number("times")
     return found

@@ -23,6 +23,7 @@ import tomli_w
 
 from dappled import confined, durable, file_lock
 from dappled.bounds.parsing import parse_toml, read_log
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
 
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
@@ -197,23 +198,19 @@ class DiskSpace:
     available: int
     files: int | None = None
 
-    def shortage(self, least_mb: int) -> str | None:
-        """See `disk_shortage`."""
-        return disk_shortage(self.available, self.files, least_mb)
+    def shortage(self, least_mb: int) -> Finding | None:
+        """Why no photograph should be taken with so many bytes and files left; None where there is room.
 
-
-def disk_shortage(available: int, files: int | None, least_mb: int) -> str | None:
-    """Why no photograph should be taken with so many bytes and files left, in a sentence; None where there is room.
-
-    `least_mb` is the setting record.min_free_mb. Shutter, health record, go/no-go and doctor all ask here.
-    """
-    if files is not None and files < FEWEST_FILES:
-        return f"the disk takes only {files} more files (its inodes are used up): remove small files"
-    if available < least_mb * 1_000_000:
-        return f"the disk is nearly full: {available // 1_000_000} MB left, record.min_free_mb asks for {least_mb} MB"
-    if available < JOURNAL_BYTES:
-        return f"the disk is full: {available // 1000} kB left, the shot journal needs more"
-    return None
+        `least_mb` is the setting record.min_free_mb. Shutter, health record and doctor all ask here.
+        """
+        disk = Subject("disk")
+        if self.files is not None and self.files < FEWEST_FILES:
+            return finding(Code.DISK_FEW_FILES, disk, files=self.files)
+        if self.available < least_mb * 1_000_000:
+            return finding(Code.DISK_NEARLY_FULL, disk, left_mb=self.available // 1_000_000, least_mb=least_mb)
+        if self.available < JOURNAL_BYTES:
+            return finding(Code.DISK_FULL, disk, left_kb=self.available // 1000)
+        return None
 
 
 def disk_space(path: Path) -> DiskSpace:

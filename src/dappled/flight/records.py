@@ -10,12 +10,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from dappled import findings
 from dappled.decode.geometry import Pose
+from dappled.findings import Finding
 
 ShotState = Literal["wished", "fired", "safe", "failed"]
 DOUBT, LATER_DOUBT = "doubt", "later doubt"
 """Kinds of events: a frame may be another shot's. The first kind came with its file and is in its tag; the second was
 found after that."""
+REFUSED, LOST = "refused", "lost trigger"
+"""Kinds of events that hold a finding: requests that became no shot, with their number `times` and their source as
+subject; triggers of the autopilot that became no request."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,10 +127,21 @@ class Stray:
 
 @dataclass(frozen=True, slots=True)
 class LedgerEvent:
-    """Something that happened, as a sentence. `index` is the shot's, where there is one."""
+    """Something that happened, as a sentence or a finding's JSON. `index` is the shot's, where there is one."""
 
     number: int
     utc_ns: int
     kind: str
     index: int | None
     text: str
+
+    @property
+    def finding(self) -> Finding | None:
+        """What was found; None for a sentence."""
+        return findings.of_json_text(self.text)
+
+    @property
+    def words(self) -> str:
+        """It as a person reads it."""
+        found = self.finding
+        return self.text if found is None else findings.told(found)

@@ -20,9 +20,9 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Signing, mavlink, pack
+from dappled.findings import Finding
 from dappled.flight import Cause, Shot
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import LostTriggers, Refusals
 from tests.daemon.fakes import Nowhere, eventually
 
 
@@ -63,7 +63,7 @@ class Camera:
         self.telemetry = Telemetry()
         self.logged = 0
         self.causes: list[Cause] = []
-        self.lost_triggers: list[LostTriggers] = []
+        self.lost_triggers: list[Finding] = []
         self.done: dict[int, Captured] = {} if done is None else done
         self.hung = False
         self._first, self._exposure_s, self._fails = first, exposure_s, fails
@@ -135,7 +135,7 @@ class Camera:
     def fire(self, shot: Shot) -> None:
         self._fired.put(shot.index)
 
-    def refused(self, refusals: Refusals) -> None:
+    def refused(self, why: Finding) -> None:
         """Told to the sender alone."""
 
     mount = PoseSettings().mount
@@ -152,7 +152,7 @@ class Camera:
     def pose(self) -> None:
         """Not known."""
 
-    def lost(self, triggers: LostTriggers) -> None:
+    def lost(self, triggers: Finding) -> None:
         self.lost_triggers.append(triggers)
 
     def troubled(self) -> bool:

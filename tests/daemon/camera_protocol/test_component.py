@@ -22,10 +22,10 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger, Spacing
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
+from dappled.findings import Finding
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import LostTriggers
 from tests.daemon.camera_protocol.rig import NothingEarlier
-from tests.daemon.fakes import FakeSink, Nowhere
+from tests.daemon.fakes import NO_CAMERA, FakeSink, Nowhere
 
 NAN = math.nan
 GCS = (255, 190)
@@ -73,7 +73,7 @@ class Rig:
         self.sent: list[MavlinkMessage] = []
         self.sent_on: list[int | None] = []  # None: on all links
         self.without: list[int | None] = []
-        self.lost_triggers: list[LostTriggers] = []
+        self.lost_triggers: list[Finding] = []
         self.well, self.critical = True, False
         self.clock = RecordedClock(10**18, 10**18 - 10**9)
         self.sink = FakeSink()
@@ -111,7 +111,7 @@ class Rig:
     def pose(self) -> None:
         """Not known."""
 
-    def lost(self, triggers: LostTriggers) -> None:
+    def lost(self, triggers: Finding) -> None:
         self.lost_triggers.append(triggers)
 
     def troubled(self) -> bool:
@@ -198,10 +198,10 @@ def test_a_broadcast_that_the_network_doubled_is_one_shot_and_the_next_one_anoth
 def test_a_refusal_says_why_and_pushes_the_status() -> None:
     rig = Rig()
     rig.tick(4)
-    rig.sink.problem = "no camera on the bus"
+    rig.sink.problem = NO_CAMERA
     result = rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1)
     assert result == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
-    assert any("no camera on the bus" in str(m) for m in rig.sent)
+    assert any("none is on the bus" in str(m) for m in rig.sent)
     assert "CAMERA_CAPTURE_STATUS" in rig.tick()
 
 

@@ -93,7 +93,10 @@ def test_an_interval_and_its_end() -> None:
     assert do(requests, do="stop interval")["text"] == "the interval is stopped"
     assert do(requests, do="stop interval")["text"] == "no interval was running"
     answer = do(requests, do="interval", sequence=2, interval_s=-1, count=0)
-    assert (answer["ok"], answer["error"]) == (False, "an interval must be 0 to 86400 s, and a count 0 or more")
+    assert (answer["ok"], answer["error"]) == (
+        False,
+        "no photo: an interval must be 0 to 86400 s, and a count 0 or more",
+    )
     shutter.stop()
 
 
@@ -101,7 +104,7 @@ def test_a_refusal_is_told_and_remembered(pipeline: Rig) -> None:
     requests = asked(pipeline.shutter)
     pipeline.shutter.stop()
     refused = do(requests, do="shoot", sequence=1)
-    assert refused["error"] == "the daemon is stopping"
+    assert refused["error"] == "no photo: the daemon is stopping"
     assert do(requests, do="outcome", sequence=1) == {"ok": True, "state": "known", "answer": refused}
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from dappled.daemon.health.resources import ResourcesLeft, look, shortage
+from dappled.findings import text
 
 
 def test_this_machine_has_enough() -> None:
@@ -33,7 +34,9 @@ def test_descriptors_are_counted() -> None:
     [(ResourcesLeft(15, 10**9), "too few file descriptors"), (ResourcesLeft(None, 47_999_999), "too little memory")],
 )
 def test_a_shortage_is_a_sentence(left: ResourcesLeft, words: str) -> None:
-    assert words in (shortage(left) or "")
+    found = shortage(left)
+    assert found is not None
+    assert words in text(found)
 
 
 def test_unknown_is_not_zero(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,9 +14,10 @@ from hypothesis import strategies as st
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.findings import Code, Subject, finding
 from dappled.flight import Shot
 from dappled.refusals import PEERS
-from tests.daemon.fakes import FakeSink, eventually
+from tests.daemon.fakes import NO_CAMERA, FakeSink, eventually
 
 PILOT = "mavlink:255/190"
 VEHICLE = "mavlink:1/1"
@@ -173,18 +174,18 @@ def test_the_counts_add_up_and_no_index_is_used_twice(messages: list[tuple[float
 
 def test_refusals_say_why_and_use_no_index() -> None:
     rig = Rig(capacity=1)
-    rig.sink.problem = "no camera on the bus"
-    assert rig.shutter.request(CaptureRequest(PILOT, "x", 1)).reason == "no camera on the bus"
+    rig.sink.problem = NO_CAMERA
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 1)).reason == NO_CAMERA
     rig.sink.problem, rig.sink.note_error = None, OSError(28, "No space left on device")
-    assert "No space left" in (rig.shutter.request(CaptureRequest(PILOT, "x", 2)).reason or "")
+    assert "No space left" in rig.shutter.request(CaptureRequest(PILOT, "x", 2)).words
     rig.sink.note_error = None
     assert rig.shutter.request(CaptureRequest(PILOT, "x", 3)).index == 42
-    assert "waiting for the camera" in (rig.shutter.request(CaptureRequest(PILOT, "x", 4)).reason or "")
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 4)).words == "no photo: 1 shot waiting for the camera already"
     rig.shutter.settled(42, ok=True)
     rig.shutter.settled(42, ok=False)
     assert rig.shutter.request(CaptureRequest(PILOT, "x", 5)).index == 43
     rig.shutter.stop()
-    assert rig.shutter.request(CaptureRequest(PILOT, "x", 6)).reason == "the daemon is stopping"
+    assert rig.shutter.request(CaptureRequest(PILOT, "x", 6)).words == "no photo: the daemon is stopping"
 
 
 def test_an_interval_counts_to_its_end_and_a_single_shot_does_not_cancel_it() -> None:
@@ -273,7 +274,7 @@ def test_a_burst_before_a_camera_that_is_gone_asks_once_a_second() -> None:
     rig = Rig()
     rig.shutter.start_interval(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", 1), 0.0, 0)
     rig.shutter.settled(42, ok=True)
-    rig.sink.problem = "the camera is absent"
+    rig.sink.problem = NO_CAMERA
     for _ in range(100):
         rig.tick(0.05)
     assert 4 <= rig.shutter.statistics().refused <= 6  # each is an event of the record
@@ -332,35 +333,34 @@ def test_every_refusal_is_told() -> None:
     for sequence in (2, 3):
         shutter.request(CaptureRequest(PILOT, "IMAGE_START_CAPTURE", sequence))
     assert len(sink.refusals) == shutter.statistics().refused == 2
-    assert "an interval must be" in sink.refusals[0].reason
-    assert "waiting for the camera" in sink.refusals[1].reason
+    assert [one.code for one in sink.refusals] == [Code.SHOT_INTERVAL_BOUNDS, Code.CAMERA_SHOTS_WAITING]
 
 
 def test_a_flood_of_refused_requests_is_one_line_in_the_log(caplog: pytest.LogCaptureFixture) -> None:
     rig = Rig()
-    rig.sink.problem = "no camera on the bus"
+    rig.sink.problem = NO_CAMERA
     for sequence in range(516):
         assert not rig.shutter.request(CaptureRequest(PILOT, "x", sequence)).accepted
     assert len(caplog.messages) == 1
-    assert "no camera on the bus" in caplog.messages[0]
+    assert "none is on the bus" in caplog.messages[0]
 
 
 def test_a_flood_of_refused_requests_is_a_few_events_that_count_each_one() -> None:
     rig = Rig()
     for sequence in range(5000):
-        rig.sink.problem = f"the disk is nearly full: {sequence} MB left"  # a number that changes defeats no limit
+        rig.sink.problem = finding(Code.DISK_FULL, Subject("disk"), left_kb=sequence)  # its number defeats no limit
         rig.shutter.request(CaptureRequest(PILOT, "x", sequence))
         rig.clock.advance(0.03)
     rig.shutter.settle_refusals(all_of_them=True)
     assert len(rig.sink.refusals) == 4  # the first, two minutes, the rest
-    assert sum(one.count for one in rig.sink.refusals) == rig.shutter.statistics().refused == 5000
+    assert sum(one.number("times") for one in rig.sink.refusals) == rig.shutter.statistics().refused == 5000
 
 
 def test_a_flood_from_any_number_of_senders_is_a_few_events_too() -> None:
     rig = Rig()
-    rig.sink.problem = "no camera on the bus"
+    rig.sink.problem = NO_CAMERA
     for sender in range(5000):
         rig.shutter.request(CaptureRequest(f"mavlink:{sender}/1", "x", 1))
     rig.shutter.settle_refusals(all_of_them=True)
     assert len(rig.sink.refusals) == PEERS + 2
-    assert sum(one.count for one in rig.sink.refusals) == 5000
+    assert sum(one.number("times") for one in rig.sink.refusals) == 5000

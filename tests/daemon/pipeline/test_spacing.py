@@ -14,7 +14,7 @@ from dappled.config.settings import PoseSettings
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger, Height, Spacing, seen_m
 from dappled.decode.geometry import Pose, from_euler, metres_per_radian
-from tests.daemon.fakes import FakeSink, no_pose
+from tests.daemon.fakes import NO_CAMERA, FakeSink, no_pose
 
 HOME = (math.radians(41.6), math.radians(-91.5), 220.0)
 MOUNT = PoseSettings().mount  # down, the image's top forward
@@ -219,7 +219,7 @@ def test_a_whole_spacing_late_is_missed_and_counted_as_refused() -> None:
 
 def test_a_camera_that_is_away_costs_one_refusal_a_photograph() -> None:
     rig = Rig()
-    rig.sink.problem = "there is no camera"
+    rig.sink.problem = NO_CAMERA
     rig.trigger.begin(Spacing(5.0), "console", at_once=True)
     rig.fly(10.1)
     assert rig.shots_m == []

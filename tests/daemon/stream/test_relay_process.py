@@ -15,6 +15,7 @@ from dappled.clock import RecordedClock
 from dappled.daemon.stream import relay_process
 from dappled.daemon.stream.admission import ConnectionLimits
 from dappled.daemon.stream.relay_process import Relay
+from dappled.findings import Code
 from tests.daemon.stream.test_admission import GREETING, READY
 
 LIMITS = ConnectionLimits(opening=6, opening_per_address=4, open=3, open_per_address=2)
@@ -122,7 +123,7 @@ def test_the_silent_and_what_is_not_zeromq_never_reach_the_daemon(rig: Rig) -> N
     rig.clock.advance(LIMITS.handshake_s + 1)
     rig.turn()
     assert all(closed(one) for one in silent)
-    assert rig.reasons() == {relay_process.NOT_ZEROMQ: 1, relay_process.SILENT: 3}
+    assert rig.reasons() == {Code.PEER_NOT_ZEROMQ: 1, Code.PEER_SILENT: 3}
 
 
 def test_a_handshake_that_is_not_completed_in_time_frees_the_daemon_s_end(rig: Rig) -> None:
@@ -133,7 +134,7 @@ def test_a_handshake_that_is_not_completed_in_time_frees_the_daemon_s_end(rig: R
     assert closed(viewer)
     assert daemon.recv(1000) == GREETING
     assert closed(daemon)
-    assert rig.reasons() == {relay_process.UNFINISHED: 1}
+    assert rig.reasons() == {Code.PEER_HANDSHAKE_SLOW: 1}
 
 
 def test_strangers_displace_strangers_and_no_viewer(rig: Rig) -> None:
@@ -145,7 +146,7 @@ def test_strangers_displace_strangers_and_no_viewer(rig: Rig) -> None:
     rig.turn()
     assert viewer.recv(1000).endswith(b"more")
     assert not closed(coming)
-    assert rig.reasons() == {relay_process.DISPLACED: 40 - LIMITS.opening_per_address}
+    assert rig.reasons() == {Code.PEER_DISPLACED: 40 - LIMITS.opening_per_address}
 
 
 def test_open_connections_have_a_limit_for_each_address_and_for_all(rig: Rig) -> None:
@@ -153,7 +154,7 @@ def test_open_connections_have_a_limit_for_each_address_and_for_all(rig: Rig) ->
     assert closed(rig.viewer(GREETING, "127.0.0.2"))
     viewers.append(rig.let_in("127.0.0.3"))
     assert closed(rig.viewer(GREETING, "127.0.0.4"))
-    assert rig.reasons() == {relay_process.TOO_MANY: 2}
+    assert rig.reasons() == {Code.PEER_TOO_MANY: 2}
     viewers[0][0].close()
     rig.turn()
     rig.let_in("127.0.0.4")
@@ -178,7 +179,7 @@ def test_who_reads_nothing_holds_up_the_daemon_s_end_and_is_closed(rig: Rig) -> 
     assert rig.reasons() == {}
     rig.clock.advance(2)
     rig.turn()
-    assert rig.reasons() == {relay_process.UNREAD: 1}
+    assert rig.reasons() == {Code.PEER_READS_NOTHING: 1}
     assert not rig.relay.busy
     viewer.close()
 
@@ -199,4 +200,4 @@ def test_a_wrong_key_is_reported_with_its_address(rig: Rig) -> None:
     rig.viewer(GREETING, "127.0.0.9")
     rig.accept().close()
     rig.turn()
-    assert rig.relay.refusals()["refused"] == [["127.0.0.9", relay_process.HANDSHAKE, 1]]
+    assert rig.relay.refusals()["refused"] == [["127.0.0.9", Code.PEER_HANDSHAKE_FAILED, 1]]

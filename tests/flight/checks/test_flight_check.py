@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from dappled import durable
+from dappled import durable, findings
 from dappled.cli.flight import lines as flight_lines
 from dappled.clock import SystemClock
+from dappled.findings import Code, Subject, finding
 from dappled.flight import FlightError, FlightFolder, Ledger, LedgerReader, Recording, Result, flight_report
 from dappled.flight.checks.flight_check import check
-from dappled.refusals import LostTriggers
+from dappled.flight.records import LOST
 from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag
 
 
@@ -156,15 +157,16 @@ def test_the_counts_balance(recorded: FlightFolder) -> None:
 
 
 def test_counts_with_lost_triggers_do_not_balance(recorded: FlightFolder) -> None:
-    lost = LostTriggers(13, 15, "noticed at 2026-11-21T10:15:03.2Z near 47.397700, 8.545600")
+    where = "noticed at 2026-11-21T10:15:03.2Z near 47.397700, 8.545600"
+    lost = finding(Code.TRIGGER_LOST, Subject("trigger", "13 to 15"), first=13, triggers=3, where=where)
     with Ledger(recorded.ledger, SystemClock()) as ledger:
-        ledger.add_event("lost trigger", lost.text())
+        ledger.add_event(LOST, findings.json_text(lost))
     counts = flight_report.balance(recorded.path)
-    assert (counts.lost, counts.lost_triggers) == (3, (lost.text(),))
+    assert (counts.lost, counts.lost_triggers) == (3, (findings.told(lost),))
     assert not counts.balanced
     lines = list(flight_lines.of_report(counts, ()))
     assert lines[-2:] == [
-        "became no shot: the autopilot's triggers 13 to 15 noticed at 2026-11-21T10:15:03.2Z near 47.397700, 8.545600",
+        f"lost: trigger 13 to 15: became no shot, {where}",
         "THE COUNTS DO NOT AGREE: 3 triggers of the autopilot became no shot",
     ]
 

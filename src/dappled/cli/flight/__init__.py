@@ -163,7 +163,10 @@ def _list(folder: Path, as_json: bool) -> int:
 
 def _show(flight: Path, as_json: bool) -> int:
     found = flight_report.show(flight)
-    return _said(_plain(found), flight_lines.of_flight(found), as_json)
+    events = [
+        {**_plain(one), "text": one.words, "finding": one.finding and one.finding.to_json()} for one in found.events
+    ]
+    return _said({**_plain(found), "events": events}, flight_lines.of_flight(found), as_json)
 
 
 def _check(flight: Path, config: Path | None, key: Path | None, as_json: bool) -> int:

@@ -105,7 +105,7 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     if len(found.card) > _SHOWN:
         yield f"  {'':13}  and {len(found.card) - _SHOWN} more (--json names all)"
     for text in found.lost_triggers:
-        yield f"became no shot: the autopilot's {text}"
+        yield f"lost: {text}"
     if found.balanced and not found.wishes:
         yield "NO SHOT in this flight: there are no counts to compare"
         return

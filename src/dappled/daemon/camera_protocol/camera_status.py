@@ -19,9 +19,9 @@ from dappled.decode.geometry import Pose, field_of_view
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.errors import DappledError, report
+from dappled.findings import Finding
 from dappled.flight import ImageIndex, LedgerReader
 from dappled.flight.layout import DiskSpace
-from dappled.refusals import LostTriggers
 
 log = logging.getLogger(__name__)
 ZOOM = "CAM_FOCALLEN"
@@ -121,7 +121,7 @@ class CameraModel(Protocol):
     def troubled(self) -> bool:
         """Whether the heartbeat says MAV_STATE_CRITICAL."""
 
-    def lost(self, triggers: LostTriggers) -> None:
+    def lost(self, triggers: Finding) -> None:
         """Write down triggers of the autopilot that became no shot."""
 
 

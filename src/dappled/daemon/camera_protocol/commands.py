@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
+from dappled import findings
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import ZOOM, CameraStatus
 from dappled.daemon.camera_protocol.parameters import Parameters, unsigned_refusal
@@ -273,7 +274,7 @@ class CameraCommands:
             self._series.end()
             return CommandAnswer(ACCEPTED)
         if not self._shutter.fires:
-            return CommandAnswer(DENIED, words=f"no photos: {CANNOT_FIRE}")
+            return CommandAnswer(DENIED, words=f"no photos: {findings.text(CANNOT_FIRE)}")
         try:
             self._series.begin(Spacing(metres), command.source, at_once=command.integer(3) == 1)
         except ValueError as error:
@@ -291,7 +292,7 @@ class CameraCommands:
         if wanted != 1:
             return CommandAnswer(ACCEPTED)
         if not self._shutter.fires:
-            return CommandAnswer(DENIED, words=f"no photos: {CANNOT_FIRE}")
+            return CommandAnswer(DENIED, words=f"no photos: {findings.text(CANNOT_FIRE)}")
         if not self._series.begin_configured(command.source):
             return CommandAnswer(DENIED, words="no photos: set trigger.distance_m or overlap")
         return CommandAnswer(ACCEPTED)
@@ -455,4 +456,4 @@ def _decided(decision: ShotDecision) -> CommandAnswer:
     if decision.accepted:
         return CommandAnswer(ACCEPTED, new_shot=decision.outcome == "shot")
     result = DENIED if decision.reason == CANNOT_FIRE else REJECTED
-    return CommandAnswer(result, words=f"no photo: {decision.reason}")
+    return CommandAnswer(result, words=decision.words)

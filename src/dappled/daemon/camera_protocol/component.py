@@ -32,7 +32,7 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
-from dappled.findings import Code, Finding, Subject, finding
+from dappled.findings import Code, Finding, Subject, finding, told
 
 PROOF_NS = 500_000_000
 _STEADY_NS = 300_000_000  # telemetry is requested at 50 Hz
@@ -333,7 +333,7 @@ class Component:
         finally:  # a shot that could not be fired is in the books as failed, and not lost
             numbers.heard(sequence, now_ns, self._here, known=known)
         if not decision.accepted:
-            self.say(f"no photo: {decision.reason}")
+            self.say(decision.words)
             self.state_changed()
 
     def _parameter(self, packet: Packet) -> None:
@@ -450,7 +450,7 @@ class Component:
     def _tell_lost_triggers(self, *, at_once: bool = False) -> None:
         for lost in self._autopilot.lost_triggers(at_once=at_once):
             self._model.lost(lost)
-            self.say(f"lost: the autopilot's {lost.text()}", mavlink.MAV_SEVERITY_ERROR)
+            self.say(f"lost: {told(lost)}", mavlink.MAV_SEVERITY_ERROR)
 
     def _send_reply(self, reply: ParameterReply, link: int) -> None:
         for message in reply.messages:

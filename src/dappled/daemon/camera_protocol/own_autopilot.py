@@ -14,7 +14,7 @@ from dappled.daemon.navigation.samples import EPOCH_US, WRAP_US
 from dappled.daemon.pipeline.repeats import AutopilotCommands
 from dappled.daemon.vehicle_battery import BATTERY_STREAM, BatteryReports, VehicleBattery
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
-from dappled.refusals import LostTriggers
+from dappled.findings import Code, Finding, Subject, finding
 
 TIMESYNC_NS = 200_000_000
 STREAMS_NS = 5 * 10**9
@@ -260,7 +260,7 @@ class TriggerNumbers:
         self._top: int | None = None
         self._missing: dict[int, tuple[int, str]] = {}  # when it counts as lost, and where that was noticed
         self._jumps: list[_Jump] = []
-        self._over: list[LostTriggers] = []  # of before a restart
+        self._over: list[Finding] = []  # of before a restart
         # when messages without a number became shots whose number is not known
         self._unnumbered: deque[int] = deque(maxlen=MOST_LOST)
 
@@ -293,7 +293,7 @@ class TriggerNumbers:
         with self._lock:
             self._unnumbered.append(now_ns)
 
-    def lost(self, now_ns: int, *, at_once: bool = False) -> list[LostTriggers]:
+    def lost(self, now_ns: int, *, at_once: bool = False) -> list[Finding]:
         """Those that have not come in time, each told once; `at_once`: those that are waited for too."""
         with self._lock:
             found, self._over = [*self._over, *self._take(now_ns, at_once=at_once)], []
@@ -310,7 +310,7 @@ class TriggerNumbers:
             if last is not None:
                 self._heard.append(last)
 
-    def _take(self, now_ns: int, *, at_once: bool) -> list[LostTriggers]:
+    def _take(self, now_ns: int, *, at_once: bool) -> list[Finding]:
         """Those that are lost by now, which are waited for no longer."""
         over = sorted(number for number, (due_ns, _) in self._missing.items() if at_once or due_ns <= now_ns)
         first_ns = min((self._missing[number][0] for number in over), default=now_ns) - LATE_NS - _COVERS_NS
@@ -321,15 +321,18 @@ class TriggerNumbers:
         while places and self._unnumbered:
             self._unnumbered.popleft()
             places.pop(0)
-        found: list[LostTriggers] = []
+        runs: list[tuple[int, int, str]] = []
         for number, where in places:
-            if found and found[-1].last == number - 1 and found[-1].where == where:
-                found[-1] = LostTriggers(found[-1].first, number, where)
+            if runs and runs[-1][1:] == (number - 1, where):
+                runs[-1] = runs[-1][0], number, where
             else:
-                found.append(LostTriggers(number, number, where))
+                runs.append((number, number, where))
         jumps = [jump for jump in self._jumps if at_once or jump.due_ns <= now_ns]
         self._jumps = [jump for jump in self._jumps if jump not in jumps]
-        return found + [LostTriggers(jump.first, jump.last, jump.where) for jump in jumps]
+        return [
+            *(_lost(Code.TRIGGER_LOST, *run) for run in runs),
+            *(_lost(Code.TRIGGER_JUMP, jump.first, jump.last, jump.where) for jump in jumps),
+        ]
 
     def _miss(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         if number not in self._heard:
@@ -342,8 +345,7 @@ class TriggerNumbers:
             self._top = number
             return
         if number > top + MOST_LOST:
-            words = f"{where()}, or its counter was set"
-            self._jumps.append(_Jump(top + 1, number - 1, now_ns + LATE_NS, words))
+            self._jumps.append(_Jump(top + 1, number - 1, now_ns + LATE_NS, where()))
         elif number > top + 1:
             self._missing |= dict.fromkeys(range(top + 1, number), (now_ns + LATE_NS, where()))
         elif number < top - MOST_LOST:
@@ -352,6 +354,12 @@ class TriggerNumbers:
             self._jumps = [part for jump in self._jumps for part in _without(jump, number)]
         if number > top or number < top - MOST_LOST:
             self._top = number
+
+
+def _lost(code: Code, first: int, last: int, where: str) -> Finding:
+    """Triggers of the autopilot that became no shot, by its own numbers, the last included."""
+    which = f"{first}" if first == last else f"{first} to {last}"
+    return finding(code, Subject("trigger", which), first=first, triggers=last - first + 1, where=where)
 
 
 def _without(jump: _Jump, number: int) -> list[_Jump]:
@@ -388,7 +396,7 @@ class OwnAutopilot:
             for numbers in self.numbers.values():
                 numbers.restart(since_ns)
 
-    def lost_triggers(self, *, at_once: bool = False) -> list[LostTriggers]:
+    def lost_triggers(self, *, at_once: bool = False) -> list[Finding]:
         """Triggers of the autopilot that became no request here, each told once; `at_once`: without waiting for those
         that may be late."""
         now_ns = self._clock.monotonic_ns()

@@ -19,6 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.stream.admission import network_of
 from dappled.errors import report
+from dappled.findings import Code, Finding, Subject, Value
 from dappled.refusals import RefusalLog
 
 log = logging.getLogger(__name__)
@@ -29,7 +30,6 @@ BODY_BYTES = 4096
 _LENGTH_DIGITS = 10
 _PATH_CHARACTERS = 80
 _OWN_SITES = (None, "none", "same-origin")  # Sec-Fetch-Site of what no page of another site made the browser ask for
-_OTHER_HOST = "it asked for a host name that is not in console.hosts"
 HEADERS = {
     "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
     "img-src 'self' blob: data:; manifest-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
@@ -87,12 +87,16 @@ class Access:
         """None for a request that is allowed."""
         refusal = self._host(request) or self._state_change(request)
         if refusal is not None:  # a page without its token yet is no such case
-            self._refusals.refused(request.client, _OTHER_HOST if refusal.status == 421 else refusal.text)
+            code = Code.PEER_OTHER_HOST if refusal.status == 421 else Code.PEER_WRONG_REQUEST
+            self._log(code, request.client, why=refusal.text)
         else:
             refusal = self._known(request)
         if refusal is not None:
             self.refused += 1
         return refusal
+
+    def _log(self, code: Code, client: str, **facts: Value) -> None:
+        self._refusals.refused(Finding(code, Subject("peer", client), facts))
 
     def settle(self) -> None:
         """See `RefusalLog.settle`."""
@@ -110,7 +114,7 @@ class Access:
             return None
         self.refused += 1
         if site not in _OWN_SITES:
-            self._refusals.refused(client, "a wrong token, brought by a page of another site")
+            self._log(Code.PEER_GUESS_BY_PAGE, client)
             return Refusal(403, "this is not the token")
         now, guesser = self._clock.monotonic_ns() / 1e9, (network_of(client), way)
         guesses = self._guesses.setdefault(guesser, deque(maxlen=GUESSES))
@@ -118,10 +122,10 @@ class Access:
         if len(self._guesses) > GUESSERS:
             self._guesses.popitem(last=False)
         if len(guesses) == GUESSES and now - guesses[0] < GUESS_WINDOW_S:
-            self._refusals.refused(client, "too many wrong tokens")
+            self._log(Code.PEER_GUESSES, client)
             return Refusal(429, "too many wrong tokens: wait a minute")
         guesses.append(now)
-        self._refusals.refused(client, "a wrong token")
+        self._log(Code.PEER_GUESS_WRONG, client)
         return Refusal(403, "this is not the token")
 
     def _host(self, request: ConsoleRequest) -> Refusal | None:

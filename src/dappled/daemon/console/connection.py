@@ -10,6 +10,7 @@ from typing import Any, cast
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from dappled.findings import Code, Subject, finding
 from dappled.refusals import RefusalLog
 
 CONNECTIONS = 64  # with more, an idle one is closed
@@ -66,14 +67,14 @@ class Connection(H11Protocol):
             self._unread = None
 
     def send_400_response(self, msg: str) -> None:
-        self._refused("a request that is not HTTP")
+        self._refused(Code.PEER_NOT_HTTP)
         super().send_400_response(msg)
 
     def _unsupported_upgrade_warning(self) -> None:
-        self._refused("a request for another protocol than HTTP")
+        self._refused(Code.PEER_OTHER_PROTOCOL)
 
-    def _refused(self, reason: str) -> None:
-        self.refusals.refused(str(self._address() or "a console's peer"), reason)
+    def _refused(self, code: Code) -> None:
+        self.refusals.refused(finding(code, Subject("peer", str(self._address() or "a console's peer"))))
 
     @property
     def idle(self) -> bool:

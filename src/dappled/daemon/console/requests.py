@@ -167,6 +167,5 @@ class ConsoleRequests:
 
 def _decided(decision: ShotDecision) -> dict[str, Any]:
     if not decision.accepted:
-        return {"ok": False, "error": decision.reason, "index": None}
-    text = f"shot {decision.index}" if decision.outcome == "shot" else f"already shot {decision.index}"
-    return {"ok": True, "index": decision.index, "text": text}
+        return {"ok": False, "error": decision.words, "index": None}
+    return {"ok": True, "index": decision.index, "text": decision.words}

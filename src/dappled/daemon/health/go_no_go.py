@@ -6,8 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from dappled import findings
 from dappled.errors import counted
-from dappled.flight.layout import disk_shortage
+from dappled.flight.layout import DiskSpace
 
 State = Literal["go", "caution", "no-go"]
 _WEAK_FIXES = {1: "no fix", 2: "a 2D fix"}  # by GPS_FIX_TYPE; 0, no receiver, may fly by other means
@@ -122,9 +123,9 @@ def _disk(health: Mapping[str, Any]) -> Check:
         "room for frames: unknown before the first" if known is None else f"room for {count} frame{'s'[: frames != 1]}"
     )
     text = f"{free / 1e9:.1f} GB free, {room}"
-    short = disk_shortage(free, health["disk"].get("free_files"), least // 1_000_000)
+    short = DiskSpace(free, 0, free, health["disk"].get("free_files")).shortage(least // 1_000_000)
     if short is not None:
-        return Check("Disk", "no-go", f"{short}; shots are refused")
+        return Check("Disk", "no-go", f"{findings.text(short)}; shots are refused")
     return Check("Disk", "go" if frames >= 100 else "caution", text)
 
 

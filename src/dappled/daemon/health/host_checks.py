@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
 
+from dappled import findings
 from dappled.config.settings import Settings
 from dappled.daemon.health import resources
 from dappled.daemon.health.go_no_go import Check
@@ -164,14 +165,18 @@ def disk(settings: Settings, machine: Machine) -> list[Check]:
     text = f"{free / 1e9:.1f} GB free at {folder}, room for about {frames} of {_FRAME_BYTES / 1e6:.0f} MB"
     short = space.shortage(settings.record.min_free_mb)
     if short is not None:
-        return [Check("disk", "no-go", f"{text}: {short}", "`dappled flight offload DEST --prune` makes room")]
+        return [
+            Check(
+                "disk", "no-go", f"{text}: {findings.text(short)}", "`dappled flight offload DEST --prune` makes room"
+            )
+        ]
     return [Check("disk", "go", text)]
 
 
 def memory(settings: Settings, machine: Machine) -> list[Check]:
     """Memory for a file on its way, and descriptors; nothing where there is enough."""
     short = resources.shortage(resources.look(machine.proc))
-    return [] if short is None else [Check("memory", "no-go", short, "then `dappled doctor` again")]
+    return [] if short is None else [Check("memory", "no-go", findings.text(short), "then `dappled doctor` again")]
 
 
 def clock(settings: Settings, machine: Machine) -> list[Check]:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dappled import findings
 from dappled.config.settings import RecordSettings, Settings
 from dappled.daemon.body_plan import BodyReport
 from dappled.daemon.health.go_no_go import FAILING
@@ -107,7 +108,7 @@ def record(
     disk, shortages = _disk(settings.record, folder)
     problems = [
         *(f"the {name} thread has ended: restart dappled" for name in dead_threads),
-        *([] if shots.state in ("starting", "ready", "busy") else [shots.camera_sentence()]),
+        *([] if shots.state == "starting" or (gone := shots.without_camera()) is None else [findings.text(gone)]),
         *silences,
         *doubts,
         *([] if series is None or series.problem is None else [series.problem]),
@@ -213,7 +214,7 @@ def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[st
         return facts, [f"{error}; new shots are refused"]
     facts |= {"free_bytes": space.available, "free_files": space.files}
     if (short := space.shortage(record.min_free_mb)) is not None:
-        return facts, [f"{short}; new shots are refused"]
+        return facts, [f"{findings.text(short)}; new shots are refused"]
     if space.available >= record.warn_free_mb * 1_000_000:
         return facts, []
     left = f"{space.available // 10**6} MB left"

@@ -7,6 +7,8 @@ import resource
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.findings import Code, Finding, Subject, finding
+
 FEWEST_DESCRIPTORS = 16  # a frame on its way, its companion, temporary files and folders
 LEAST_MEMORY_BYTES = 48_000_000  # a raw file in the camera's process and in its memfd
 
@@ -30,12 +32,13 @@ def look(proc: Path = Path("/proc")) -> ResourcesLeft:
     return ResourcesLeft(None if unknown or used is None else max(0, soft - used), _memory_bytes(proc))
 
 
-def shortage(left: ResourcesLeft) -> str | None:
-    """Why no photograph could be kept, in a sentence; None where one can, as far as is known."""
+def shortage(left: ResourcesLeft) -> Finding | None:
+    """Why no photograph could be kept; None where one can, as far as is known."""
+    machine = Subject("machine")
     if left.descriptors is not None and left.descriptors < FEWEST_DESCRIPTORS:
-        return f"too few file descriptors are left for a photograph ({left.descriptors}): raise LimitNOFILE"
+        return finding(Code.MACHINE_FEW_DESCRIPTORS, machine, left=left.descriptors)
     if left.memory_bytes is not None and left.memory_bytes < LEAST_MEMORY_BYTES:
-        return f"too little memory is left for a photograph: {left.memory_bytes // 10**6} MB; end other programs"
+        return finding(Code.MACHINE_LITTLE_MEMORY, machine, left_mb=left.memory_bytes // 10**6)
     return None
 
 

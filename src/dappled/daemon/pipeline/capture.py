@@ -30,12 +30,17 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.errors import report, sentence
-from dappled.findings import Finding
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Frame, Shot, Tag
 from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
+_WITHOUT_CAMERA = {
+    "absent": Code.CAMERA_ABSENT,
+    "faulted": Code.CAMERA_FAULTED,
+    "starting": Code.CAMERA_STARTING,
+}
 GIVEN_UP = 16  # failed shots that a late file can still belong to
 FOLLOWING = 4096  # the same for shots whose file stays at the camera; `geotag` tags the frames of older ones
 _LOOK_S = 0.1
@@ -158,9 +163,10 @@ class PendingShots:
         with self._changed:
             return self._changed.wait_for(lambda: all(one.tag is None for one in self._in_hand.values()), timeout_s)
 
-    def camera_sentence(self) -> str:
-        """The camera's state and its reason: "the camera is absent: …"."""
-        return f"the camera is {self.state}" + (f": {self.reason}" if self.reason else "")
+    def without_camera(self) -> Finding | None:
+        """Why there is no camera to fire; None where there is one."""
+        code = _WITHOUT_CAMERA.get(self.state)
+        return None if code is None else finding(code, Subject("camera"), reason=self.reason)
 
     def add(self, pending: PendingShot) -> None:
         """Take in a shot whose file came after its end."""

@@ -37,6 +37,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from dappled.drivers.mavlink import Framed, Packet
+from dappled.findings import Finding
 
 SAME_LINK_NS = 500_000_000
 OTHER_LINK_NS = 2_500_000_000  # a radio may be seconds behind a cable
@@ -166,7 +167,7 @@ class _Unpaired:
     at_ns: int
     autopilot: bool
     index: int | None = None
-    refused: str = ""
+    refused: Finding | None = None
 
 
 class ForwardedRequests:
@@ -183,12 +184,12 @@ class ForwardedRequests:
         found = _pair(self._shots, request, now_ns)
         return None if found is None else found.index
 
-    def refusal(self, request: CaptureRequest, now_ns: int) -> str | None:
+    def refusal(self, request: CaptureRequest, now_ns: int) -> Finding | None:
         """Why the other side's message was refused; None where none was. It has its partner then."""
         found = _pair(self._refused, request, now_ns)
         return None if found is None else found.refused
 
-    def refuse(self, request: CaptureRequest, now_ns: int, reason: str) -> None:
+    def refuse(self, request: CaptureRequest, now_ns: int, reason: Finding) -> None:
         """A request was refused; so is its partner, which is not counted."""
         if request.autopilot or request.broadcast:
             self._refused.append(_Unpaired(now_ns, request.autopilot, refused=reason))

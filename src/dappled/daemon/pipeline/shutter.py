@@ -8,17 +8,20 @@ import threading
 from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
+from dappled import findings
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import FORWARDED_NS, CaptureRequest, ForwardedRequests, RecentRequests
-from dappled.errors import counted, report
+from dappled.errors import report
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Cause, FlightError, Shot
-from dappled.refusals import RefusalLog, Refusals
+from dappled.refusals import RefusalLog
 from dappled.workers import Loop
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 
 log = logging.getLogger(__name__)
-CANNOT_FIRE = 'this camera can\'t be fired from here: something else fires it (camera.shutter = "outside")'
+CANNOT_FIRE = finding(Code.CAMERA_FIRED_OUTSIDE, Subject("camera"))
+_LONGEST_S = 86400
 _IDLE_S = 60.0
 _SHORTEST_S = 0.05
 _AGAIN_S = 1.0
@@ -28,16 +31,23 @@ IntervalEnd = Literal["stopped", "none ran", "began later"]
 
 @dataclass(frozen=True, slots=True)
 class ShotDecision:
-    """What became of a request: a new shot, a message more of a known shot, or nothing. `reason` is a sentence."""
+    """What became of a request: a new shot, a message more of a known shot, or nothing, for a `reason`."""
 
     outcome: Literal["shot", "duplicate", "refused"]
     index: int | None = None
-    reason: str | None = None
+    reason: Finding | None = None
 
     @property
     def accepted(self) -> bool:
         """Whether there is a shot for the request."""
         return self.outcome != "refused"
+
+    @property
+    def words(self) -> str:
+        """It as a person reads it."""
+        if self.reason is not None:
+            return f"no photo: {findings.text(self.reason)}"
+        return f"{'already ' if self.outcome == 'duplicate' else ''}shot {self.index}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +91,8 @@ class _Interval:
 class ShotSink(Protocol):
     """What the shutter does with a capture request. Every method returns within a millisecond."""
 
-    def obstacle(self) -> str | None:
-        """Why no shot can be taken now (no camera, disk full), in a sentence; None where one can."""
+    def obstacle(self) -> Finding | None:
+        """Why no shot can be taken now (no camera, disk full); None where one can."""
 
     def note(self, shot: Shot) -> None:
         """Write a shot down before the camera is touched. Raises FlightError or OSError, which refuses the request."""
@@ -90,8 +100,8 @@ class ShotSink(Protocol):
     def fire(self, shot: Shot) -> None:
         """Hand a noted shot to the camera."""
 
-    def refused(self, refusals: Refusals) -> None:
-        """Requests became no shots: the first of a sender for a reason, later how many more."""
+    def refused(self, why: Finding) -> None:
+        """Requests became no shots: the first of a source for a reason, later how many more. See `RefusalLog`."""
 
 
 class Shutter:
@@ -150,9 +160,10 @@ class Shutter:
         request on these are the interval's shots where they come within 0.25 s of their time; one that is later is
         taken without it. That holds for intervals of 0.5 s and more.
         """
-        if not (math.isfinite(interval_s) and 0 <= interval_s <= 86400) or count < 0:
+        if not (math.isfinite(interval_s) and 0 <= interval_s <= _LONGEST_S) or count < 0:
             with self._lock:
-                return self._refuse(request, "an interval must be 0 to 86400 s, and a count 0 or more")
+                bounds = finding(Code.SHOT_INTERVAL_BOUNDS, Subject("shot"), longest_s=_LONGEST_S)
+                return self._refuse(request, bounds)
         request = replace(request, series=(interval_s, float(count)))
         with self._lock:
             now_ns = self._clock.monotonic_ns()
@@ -274,7 +285,7 @@ class Shutter:
             try:
                 self._sink.note(shot)
             except (OSError, FlightError) as error:
-                reason = f"the request could not be written down: {error}"
+                reason = finding(Code.SHOT_NOT_NOTED, Subject("shot", shot.index), why=str(error))
         if reason is not None:
             self._forwarded.refuse(request, now_ns, reason)
             self._follow_autopilot(request, now_ns, new=True)
@@ -314,21 +325,22 @@ class Shutter:
             self._interval = None
         interval.due_ns = now_ns + interval.interval_ns + FORWARDED_NS
 
-    def _refuse(self, request: CaptureRequest, reason: str) -> ShotDecision:
+    def _refuse(self, request: CaptureRequest, reason: Finding) -> ShotDecision:
         self._refused += 1
-        for one in self._refusals.refused(f"{request.kind} from {request.source}", reason):
+        asked = replace(reason.with_facts(request=request.kind), subject=Subject("source", request.source))
+        for one in self._refusals.refused(asked):
             self._sink.refused(one)
         return ShotDecision("refused", reason=reason)
 
-    def _why_not(self, *, happened: bool) -> str | None:
+    def _why_not(self, *, happened: bool) -> Finding | None:
         if self._stopped:
-            return "the daemon is stopping"
+            return finding(Code.SERVICE_STOPPING, Subject("service"))
         if happened:
             return None
         if not self.fires:
             return CANNOT_FIRE
         if len(self._pending) >= self._capacity:
-            return f"{counted(len(self._pending), 'shot')} waiting for the camera already"
+            return finding(Code.CAMERA_SHOTS_WAITING, Subject("camera"), pending=len(self._pending))
         return self._sink.obstacle()
 
     def _run(self) -> None:

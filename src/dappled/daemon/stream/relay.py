@@ -20,6 +20,7 @@ from dappled.config import settings as configuration
 from dappled.daemon.stream.wire import WireError
 from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess
 from dappled.drivers.child_process import ChannelMessage, ProcessChannel
+from dappled.findings import Code, Subject, finding
 from dappled.refusals import RefusalLog
 
 _BACKLOG = 128
@@ -81,7 +82,7 @@ class _RefusalReports:
         """See ProcessPeer."""
         self.refusals.settle()
         for address, reason, count in message.body.get("refused", ()) if message is not None else ():
-            self.refusals.refused(str(address), str(reason), int(count))
+            self.refusals.refused(finding(Code(reason), Subject("peer", str(address))), int(count))
 
 
 def tcp_address(endpoint: str) -> tuple[str, int]:

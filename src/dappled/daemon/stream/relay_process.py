@@ -22,6 +22,7 @@ from dappled.clock import Clock, SystemClock
 from dappled.daemon.stream import admission
 from dappled.daemon.stream.admission import ConnectionLimits, Handshake, OpeningConnection
 from dappled.drivers.child_process import CONSOLE_GOES, ChannelError, ProcessChannel, goes_first
+from dappled.findings import Code
 from dappled.shown import guard_output
 
 NICENESS = 12  # as ZeroMQ's own thread in the daemon
@@ -35,15 +36,6 @@ _DRAIN_NS = 2 * 10**9
 _TURN_S = 0.2
 _USER_TIMEOUT_MS = 30_000
 _FULL = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
-
-SILENT = "it sent no ZeroMQ greeting"
-UNFINISHED = "its handshake was not completed in time"
-DISPLACED = "more connections waited for their handshake than are kept"
-TOO_MANY = "as many connections are open as may be"
-NOT_ZEROMQ = "it does not speak ZeroMQ"
-NOT_TAKEN = "the daemon takes no more connections now"
-HANDSHAKE = "its handshake failed (a wrong key, or it went away)"
-UNREAD = "it reads nothing"
 
 
 class Flow:
@@ -101,27 +93,27 @@ class ViewerConnection:
             return None
         return OpeningConnection(self.number, self.network, self.daemon is not None)
 
-    def greet(self) -> str:
-        """Connect to the daemon when the viewer's ZeroMQ signature has come. Returns why it is refused, or "". Raises
+    def greet(self) -> Code | None:
+        """Connect to the daemon when the viewer's ZeroMQ signature has come. Returns why it is refused. Raises
         OSError."""
         read = self.viewer.recv(admission.SIGNATURE_BYTES - len(self._begin))
         self._begin += read
         if not read:
-            return SILENT
+            return Code.PEER_SILENT
         if len(self._begin) < admission.SIGNATURE_BYTES:
-            return ""
+            return None
         if not admission.is_zeromq(self._begin):
-            return NOT_ZEROMQ
+            return Code.PEER_NOT_ZEROMQ
         daemon = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             daemon.setblocking(False)
             daemon.connect(self.path)
         except OSError:  # it ends, or takes no more connections now: the viewer tries again by itself
             daemon.close()
-            return NOT_TAKEN
+            return Code.PEER_NOT_TAKEN
         self.daemon = daemon
         self.inward, self.outward = Flow(self.viewer, daemon, self._begin), Flow(daemon, self.viewer)
-        return ""
+        return None
 
     def close(self) -> None:
         """Close both ends."""
@@ -144,7 +136,7 @@ class Relay:
         self._number = 0
         self._paused_until_ns: int | None = None
         self._scratch = memoryview(bytearray(_CHUNK_BYTES))
-        self._refused: Counter[tuple[str, str]] = Counter()
+        self._refused: Counter[tuple[str, Code]] = Counter()
         for listener in self._routes:
             listener.setblocking(False)
         self._listen(True)
@@ -215,14 +207,14 @@ class Relay:
         self._number += 1
         one = ViewerConnection(self._number, viewer, path, address, self._clock.monotonic_ns())
         if self._is_full(one.network):
-            self._refused[address, TOO_MANY] += 1
+            self._refused[address, Code.PEER_TOO_MANY] += 1
             viewer.close()
             return
         self._kept[one.number] = one
         self._ready.register(viewer, selectors.EVENT_READ, one.number)
         opening = [each for other in self._kept.values() if (each := other.opening) is not None]
         if (victim := admission.surplus(opening, self._limits)) is not None:
-            self._close(self._kept[victim.number], DISPLACED)
+            self._close(self._kept[victim.number], Code.PEER_DISPLACED)
 
     def _is_full(self, network: str) -> bool:
         networks = [one.network for one in self._kept.values() if one.opening is None]
@@ -230,7 +222,7 @@ class Relay:
 
     def _serve(self, one: ViewerConnection) -> None:
         try:
-            reason = one.greet() if one.daemon is None else ""
+            reason = one.greet() if one.daemon is None else None
             if reason:
                 self._close(one, reason)
             elif one.inward is not None and one.outward is not None:
@@ -238,7 +230,7 @@ class Relay:
         except BlockingIOError:  # nothing has come after all
             return
         except OSError:
-            self._close(one, "" if one.handshake.complete else HANDSHAKE)
+            self._close(one, None if one.handshake.complete else Code.PEER_HANDSHAKE_FAILED)
 
     def _relay(self, one: ViewerConnection, inward: Flow, outward: Flow) -> None:
         was_open, was_waiting = one.handshake.complete, bool(outward.waiting)
@@ -247,9 +239,9 @@ class Relay:
         if moved or not was_waiting:
             one.read_ns = self._clock.monotonic_ns()
         if inward.ended or (outward.ended and not outward.waiting):
-            self._close(one, "" if one.handshake.complete else HANDSHAKE)
+            self._close(one, None if one.handshake.complete else Code.PEER_HANDSHAKE_FAILED)
         elif one.handshake.complete and not was_open and self._is_over(one.network):
-            self._close(one, TOO_MANY)
+            self._close(one, Code.PEER_TOO_MANY)
         else:
             self._await(one, inward, outward)
 
@@ -270,7 +262,7 @@ class Relay:
             elif key.events != wanted:
                 self._ready.modify(sock, wanted, one.number)
 
-    def _close(self, one: ViewerConnection, reason: str = "") -> None:
+    def _close(self, one: ViewerConnection, reason: Code | None = None) -> None:
         if reason:
             self._refused[one.address, reason] += 1
         del self._kept[one.number]
@@ -286,9 +278,9 @@ class Relay:
             self._listen(True)
         for one in list(self._kept.values()):
             if one.opening is not None and now_ns - one.began_ns > limits.handshake_s * 1e9:
-                self._close(one, UNFINISHED if one.daemon is not None else SILENT)
+                self._close(one, Code.PEER_HANDSHAKE_SLOW if one.daemon is not None else Code.PEER_SILENT)
             elif one.outward is not None and one.outward.waiting and now_ns - one.read_ns > limits.unread_s * 1e9:
-                self._close(one, UNREAD)
+                self._close(one, Code.PEER_READS_NOTHING)
 
 
 def main() -> int:

@@ -21,6 +21,7 @@ from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.relay import TcpRelay, tcp_address
 from dappled.daemon.stream.wire import WireError
+from dappled.findings import Code, Subject, finding
 from dappled.refusals import RefusalLog
 from dappled.workers import Loop
 
@@ -116,7 +117,7 @@ class Sockets:
                 log.info("%s connected with its key", name)
                 continue
             self.wrong_keys += 1
-            self._refusals.refused("a viewer", "its key is not in publish.clients")
+            self._refusals.refused(finding(Code.PEER_KEY_UNLISTED, Subject("peer", "a viewer")))
 
     def close(self, linger_s: float) -> None:
         """Close all; messages already sent have this long to go out."""
