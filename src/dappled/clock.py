@@ -22,9 +22,11 @@ class Clock(Protocol):
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
         """Until the event is set (True) or this clock has gone on by `timeout_s` (False)."""
 
+    def pause(self, event: threading.Event, timeout_s: float | None) -> bool:
+        """As `wait`, in the machine's time even where this clock stands still; None: without end."""
+
     def wait_for(self, changed: threading.Condition, holds: Callable[[], object], timeout_s: float | None) -> bool:
-        """As `changed.wait_for`, whose lock is held: patience with another thread, in the machine's time (None: without
-        end)."""
+        """As `changed.wait_for`, whose lock is held, in the machine's time; None: without end."""
 
     def start(self, run: Callable[[], None], name: str) -> threading.Thread:
         """Start a daemon thread."""
@@ -35,6 +37,10 @@ class Clock(Protocol):
 
 class _MachineThreads:
     """Threads that the machine runs."""
+
+    def pause(self, event: threading.Event, timeout_s: float | None) -> bool:
+        """See Clock."""
+        return event.wait(timeout_s)
 
     def wait_for(self, changed: threading.Condition, holds: Callable[[], object], timeout_s: float | None) -> bool:
         """See Clock."""

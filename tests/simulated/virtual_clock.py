@@ -61,10 +61,12 @@ class VirtualClock:
         """See Clock."""
         return self._now_ns + self._utc_minus_monotonic_ns
 
-    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+    def wait(self, event: threading.Event, timeout_s: float | None) -> bool:
         """See Clock."""
         self._pause(event.is_set, timeout_s)
         return event.is_set()
+
+    pause = wait
 
     def wait_for(self, changed: threading.Condition, holds: Callable[[], object], timeout_s: float | None) -> bool:
         """See Clock."""
@@ -75,6 +77,11 @@ class VirtualClock:
             self._pause(holds, timeout_s)
         finally:
             changed.acquire()
+        return bool(holds())
+
+    def until(self, holds: Callable[[], object], timeout_s: float) -> bool:
+        """Let the others run until this holds (True) or so much time has gone on (False)."""
+        self._pause(holds, timeout_s)
         return bool(holds())
 
     def sleep(self, seconds: float) -> None:

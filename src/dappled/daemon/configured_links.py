@@ -8,13 +8,15 @@ from typing import cast
 from dappled.clock import Clock
 from dappled.config.schema import ConfigError
 from dappled.config.settings import Settings
-from dappled.drivers.mavlink import MavlinkLinks, Signing, Unsigned, open_signing
+from dappled.drivers.mavlink import MavlinkLinks, Signing, Transport, Unsigned, open_signing
 
 SIGNING_TIME_FILE = ".mavlink-signing"
 
 
-def configured_links(settings: Settings, clock: Clock) -> MavlinkLinks:
-    """All MAVLink links of the settings, not open yet. Raises ConfigError, LinkError, SigningError."""
+def configured_links(settings: Settings, clock: Clock, transport: Transport | None = None) -> MavlinkLinks:
+    """All MAVLink links of the settings, not open yet. Without a `transport`: over the machine's sockets.
+
+    Raises ConfigError, LinkError, SigningError."""
     wanted = settings.mavlink
     return MavlinkLinks(
         wanted.url,
@@ -22,6 +24,7 @@ def configured_links(settings: Settings, clock: Clock) -> MavlinkLinks:
         component_id=wanted.component_id,
         clock=clock,
         signing=_signing(settings, clock),
+        transport=transport,
     )
 
 

@@ -12,7 +12,7 @@ import shutil
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -53,11 +53,12 @@ from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
-from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.publisher import Publisher, Stream
 from dappled.daemon.survey_facts import LiveSurvey, distance_trigger
 from dappled.drivers.camera import Camera
 from dappled.drivers.gnss.port import gnss_port
 from dappled.drivers.gnss.recorded import TelemetryNotebook
+from dappled.drivers.mavlink import Transport
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
@@ -80,12 +81,22 @@ class HasThreads(Protocol):
         """The threads that have ended without having been stopped."""
 
 
+@dataclass(frozen=True, slots=True)
+class StandIns:
+    """Parts of a daemon in place of those that its settings name; None: as they name it."""
+
+    camera: Camera | None = None
+    transport: Transport | None = None
+    stream: Stream | None = None
+
+
 class Service:
     """One flight, from `start` to `stop`. `run` is the working loop between them.
 
     `observer` follows the pipeline; `after` takes what the next flight is to be flown with, where there may be one.
     `start` raises DappledError when a part can't be had, and closes what it has opened. A camera that isn't there, a
-    link without an autopilot and a recipe without a mask are no such failures: health reports them.
+    link without an autopilot and a recipe without a mask are no such failures: health reports them. `instead` stands
+    in for parts of the world.
     """
 
     def __init__(
@@ -95,11 +106,13 @@ class Service:
         observer: Observer | None = None,
         clock: Clock | None = None,
         after: FlightHandover | None = None,
+        instead: StandIns | None = None,
     ) -> None:
         self.console_url = ""
         self._console: Console | None = None
         self._settings = LiveSettings(settings)
         self._outside, self._after = observer or Observer(), after
+        self._instead = instead or StandIns()
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock)
@@ -115,12 +128,14 @@ class Service:
         settings = self._settings.now
         with ExitStack() as stack:
             names, recipe = recipes.recipe(settings)
-            camera = open_camera(settings.camera)
+            camera = self._instead.camera or open_camera(settings.camera)
             listener = console_process.open_listener(settings, stack)
             private = listener.private if listener else ""
-            self._publisher = Publisher.of(settings.publish, private=private, clock=self._clock)
+            self._publisher: Stream = self._instead.stream or Publisher.of(
+                settings.publish, private=private, clock=self._clock
+            )
             stack.callback(self._publisher.stop)
-            self.links = configured_links(settings, self._clock)
+            self.links = configured_links(settings, self._clock, self._instead.transport)
             self.links.open()
             stack.callback(self.links.stop)
             recipe = self._begin_recording(names, recipe, stack)
@@ -166,7 +181,7 @@ class Service:
     def _build(self, camera: Camera, names: Names, recipe: Recipe | None) -> None:
         """Build the parts, each from parts built before it. None of them runs yet."""
         settings, clock, recording = self._settings.now, self._clock, self._recording
-        self._shots = shots = PendingShots(camera)
+        self._shots = shots = PendingShots(camera, clock)
         self._writer = writer = LedgerWriter(recording, clock)
         self.navigation = Navigation(self._settings, clock, recording, utc_known=self._utc_known)
         reported, sender = ReportedCamera(settings), self.links.sender
@@ -246,7 +261,7 @@ class Service:
             judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal, plan=self._body),
             preview_interval_s=settings.publish.preview_interval_s,
         )
-        self._answers = Answers(writer, self._decoder, shots)
+        self._answers = Answers(writer, self._decoder, shots, clock=clock)
         driver = tuple(part for part in (camera, self._gnss) if isinstance(part, HasThreads))
         self._vital: tuple[HasThreads, ...] = (self._pipeline, self.links, self.shutter, self._distance, *driver)
         self._tasks = self._periodic_tasks()
@@ -338,7 +353,7 @@ class Service:
         flight is flown with, or `until()` is true."""
         while not (self._stopping.is_set() or self._next_is_set() or until()):
             self.step()
-            self._stopping.wait(_LOOK_S)
+            self._clock.wait(self._stopping, _LOOK_S)
 
     def step(self) -> None:
         """Do once what is due."""

@@ -12,11 +12,13 @@ from __future__ import annotations
 
 import mmap
 import os
-import queue
+import threading
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol, runtime_checkable
 
+from dappled.clock import Clock, SystemClock
 from dappled.errors import DappledError
 from dappled.findings import Finding
 
@@ -319,19 +321,23 @@ class LiveView(Protocol):
 class QueuedCamera:
     """Base class with the receiver's half of `Arrivals`: any thread puts events, the receiver takes them."""
 
-    def __init__(self) -> None:
-        self._events: queue.SimpleQueue[CameraEvent] = queue.SimpleQueue()
+    def __init__(self, clock: Clock | None = None) -> None:
+        self._patience = clock or SystemClock()
+        self._reported = threading.Condition()
+        self._events: deque[CameraEvent] = deque()
 
     def report(self, event: CameraEvent) -> None:
         """Queue an event for the receiver. Any thread may call this; it never waits."""
-        self._events.put(event)
+        with self._reported:
+            self._events.append(event)
+            self._reported.notify()
 
     def next_event(self, timeout_s: float) -> CameraEvent | None:
         """See Camera. After `stop` it still returns the events that are left."""
-        try:
-            return self._events.get(timeout=timeout_s) if timeout_s > 0 else self._events.get_nowait()
-        except queue.Empty:
-            return None
+        with self._reported:
+            if timeout_s > 0:
+                self._patience.wait_for(self._reported, lambda: self._events, timeout_s)
+            return self._events.popleft() if self._events else None
 
 
 class PlainCamera(QueuedCamera):

@@ -19,6 +19,7 @@ import threading
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from dappled.clock import Clock, SystemClock
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.records import Shot
 from dappled.workers import Loop
@@ -30,7 +31,7 @@ class AppendedFile:
     Writes after `shut` are refused: they could reach another file that was opened since with the same descriptor.
     """
 
-    def __init__(self, path: Path, what: str, flush_interval_s: float, *, new: bool) -> None:
+    def __init__(self, path: Path, what: str, flush_interval_s: float, *, new: bool, clock: Clock | None) -> None:
         """Open or make the file. `new`: it must not exist yet. `what` is its name in sentences. Raises FlightError."""
         self.path, self._what = path, what
         doing = f"{'make' if new else 'open'} {what}"
@@ -45,7 +46,7 @@ class AppendedFile:
         except OSError as error:
             os.close(self._fd)
             raise disk_error(doing, path, error) from error
-        self._flusher = Flusher(self._fd, flush_interval_s)
+        self._flusher = Flusher(self._fd, flush_interval_s, clock)
         self._closed = False
 
     def append(self, data: bytes, doing: str) -> int:
@@ -99,13 +100,14 @@ class Flusher:
     bytes. A failed one stays in `error`: what was written before it may not survive a power cut.
     """
 
-    def __init__(self, fd: int, interval_s: float = 0.5) -> None:
+    def __init__(self, fd: int, interval_s: float = 0.5, clock: Clock | None = None) -> None:
         self._fd = fd
         self._interval_s = interval_s
         self._dirty = threading.Event()
         self.error: OSError | None = None
         self.synced = 0
-        self._loop = Loop("flusher", self._run)
+        self._clock = clock or SystemClock()
+        self._loop = Loop("flusher", self._run, clock=self._clock)
         self._loop.start()
 
     def poke(self) -> None:
@@ -122,8 +124,8 @@ class Flusher:
 
     def _run(self) -> None:
         while not self._loop.stopping.is_set():
-            self._dirty.wait()
-            self._loop.stopping.wait(self._interval_s)
+            self._clock.pause(self._dirty, None)
+            self._clock.pause(self._loop.stopping, self._interval_s)
             self._sync()
         if self._dirty.is_set():
             self._sync()  # written, then closed, while the last one ran
@@ -142,10 +144,10 @@ class Flusher:
 class ShotJournal:
     """The open journal of one flight; owns its descriptor and its flusher. `note` may be called by any thread."""
 
-    def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
+    def __init__(self, path: Path, flush_interval_s: float = 0.5, clock: Clock | None = None) -> None:
         """Open or make the journal. After a torn last line the next note begins on a new line. Raises FlightError."""
         self.path = path
-        self._file = AppendedFile(path, "the shot journal", flush_interval_s, new=False)
+        self._file = AppendedFile(path, "the shot journal", flush_interval_s, new=False, clock=clock)
         self._lock = threading.Lock()
         self._torn = self._file.last not in (b"", b"\n")  # the last write ended within a line
 
@@ -216,7 +218,7 @@ def packet_length(data: _Bytes, at: int = 0) -> int | None:
 class TelemetryLog:
     """The open log of one flight; owns its descriptor and its flusher. Any thread may call `append`."""
 
-    def __init__(self, path: Path, flush_interval_s: float = 0.5) -> None:
+    def __init__(self, path: Path, flush_interval_s: float = 0.5, clock: Clock | None = None) -> None:
         """Make the log. Raises FlightError, also when the file exists."""
         self.path = path
         self._lock = threading.Lock()
@@ -224,7 +226,7 @@ class TelemetryLog:
         self._blocks: list[TelemetryBlock] = []
         self._packets = self._size = self._block_start = 0
         self._torn = False  # the last write ended within a record
-        self._file = AppendedFile(path, "the telemetry log", flush_interval_s, new=True)
+        self._file = AppendedFile(path, "the telemetry log", flush_interval_s, new=True, clock=clock)
 
     def append(self, stamp_us: int, raw: bytes) -> int:
         """Log one packet; returns its running number, from 0. On disk within a second.

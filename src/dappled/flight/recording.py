@@ -275,7 +275,7 @@ def begin(
         start_utc_ns = began_utc_ns if utc_known else None
         folder = layout.create(root, start_utc_ns, facts)
         stack.callback(shutil.rmtree, folder.path, ignore_errors=True)  # a flight that could not begin
-        telemetry = TelemetryLog(folder.telemetry)
+        telemetry = TelemetryLog(folder.telemetry, clock=clock)
         stack.callback(telemetry.close)
         ledger = Ledger(folder.ledger, clock, telemetry)
         stack.callback(ledger.close)
@@ -283,7 +283,7 @@ def begin(
         ledger.set_fact("utc_known", utc_known)
         provenance.note(folder, ledger, folder.settings.name)
         index.add_flight(folder.name, start_utc_ns)
-        journal = ShotJournal(folder.journal)
+        journal = ShotJournal(folder.journal, clock=clock)
         stack.callback(journal.close)
         _sync_names(folder)
         for text in recovered:

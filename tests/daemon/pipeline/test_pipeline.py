@@ -172,7 +172,7 @@ def test_a_shot_that_brings_nothing_fails_when_the_flight_ends(tmp_path: Path) -
 def test_a_file_that_comes_as_the_camera_is_let_go_of_is_taken_though_the_driver_raises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(capture, "_LAST_EVENTS_S", 20.0)
+    monkeypatch.setattr(capture, "_LAST_EVENTS_NS", 20 * 10**9)
 
     class Late(FakeCamera):
         """Finishes its last file when it is stopped, with a bug on the way."""

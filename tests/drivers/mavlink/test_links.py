@@ -14,8 +14,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.clock import SystemClock
-from dappled.drivers.mavlink import links as mavlink_links
+from dappled.clock import Clock, SystemClock
+from dappled.drivers.mavlink import channels
 from dappled.drivers.mavlink.channels import Address, ByteStream
 from dappled.drivers.mavlink.links import Framer, LinkError, MavlinkLinks, Packet, PacketParser, mavlink, pack
 from tests.needs import without
@@ -155,7 +155,7 @@ def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.Mo
     near, far = socket.socketpair()
     asked, answered = threading.Event(), threading.Event()
 
-    def late(_: Address) -> ByteStream:
+    def late(_: Address, __: Clock) -> ByteStream:
         asked.set()
         assert answered.wait(20)
         return ByteStream(near.fileno(), near.close)
@@ -164,7 +164,7 @@ def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.Mo
         port = gone.getsockname()[1]
     side = Side(f"tcp:127.0.0.1:{port}")
     side.links.open()  # no server is there yet
-    monkeypatch.setattr(mavlink_links, "open_channel", late)
+    monkeypatch.setattr(channels, "open_channel", late)
     side.start()
     assert asked.wait(20)
     side.links.stop()

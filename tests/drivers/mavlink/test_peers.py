@@ -175,7 +175,7 @@ def test_a_known_peer_that_floods_keeps_no_newcomer_waiting() -> None:
     known, newcomer, at = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(3))
     with known, newcomer, at:
         at.bind(("127.0.0.1", 0))
-        port = UdpIn(at)
+        port = UdpIn(at, SystemClock())
         known.sendto(b"k", at.getsockname())
         assert port.read() == b"k"
         port.shown("sound")
@@ -194,7 +194,7 @@ def test_a_datagram_without_bytes_leaves_nobody_waiting() -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as at,
     ):
         at.bind(("127.0.0.1", 0))
-        port = UdpIn(at)
+        port = UdpIn(at, SystemClock())
         for data in (b"a", b"", b"b"):
             one.sendto(data, at.getsockname())
         assert [port.read(), port.read(), port.read()] == [b"a", b"b", b""]

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.clock import SystemClock
-from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, mavlink, open_signing
+from dappled.clock import Clock, SystemClock
+from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Transport, mavlink, open_signing
 from dappled.errors import DappledError
 from dappled.workers import Loop
 
@@ -47,20 +47,28 @@ class GroundClient:
     """
 
     def __init__(
-        self, url: str, *, system_id: int = 255, component_id: int = 190, key_file: Path | None = None
+        self,
+        url: str,
+        *,
+        system_id: int = 255,
+        component_id: int = 190,
+        key_file: Path | None = None,
+        clock: Clock | None = None,
+        transport: Transport | None = None,
     ) -> None:
-        self._clock = clock = SystemClock()
+        self._clock = clock = clock or SystemClock()
         self._links = MavlinkLinks(
             [url],
             system_id=system_id,
             component_id=component_id,
             clock=clock,
             signing=open_signing([key_file], key_file.with_name(f"{key_file.name}.time"), clock) if key_file else None,
+            transport=transport,
         )
         self._changed = threading.Condition()
         self._heard: deque[MavlinkMessage] = deque(maxlen=_KEPT)
         self._camera: tuple[int, int] | None = None
-        self._heart = Loop("ground heartbeat", self._beat)
+        self._heart = Loop("ground heartbeat", self._beat, clock=clock)
         self._sequence = clock.utc_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
 
     def __enter__(self) -> GroundClient:
@@ -83,7 +91,7 @@ class GroundClient:
         if failed:  # a person waits: the link can't be opened now
             raise GroundStationError(failed)
         with self._changed:
-            if not self._changed.wait_for(lambda: self._camera is not None, timeout_s):
+            if not self._clock.wait_for(self._changed, lambda: self._camera is not None, timeout_s):
                 raise GroundStationError(
                     f"no camera was heard on {url} for {timeout_s:g} s; is the daemon running there?"
                 )
@@ -180,7 +188,7 @@ class GroundClient:
         return message.target_system in (0, own.system_id) and message.target_component in (0, own.component_id)
 
     def _listening(self) -> _Listening:
-        return _Listening(self._changed, self._heard)
+        return _Listening(self._changed, self._heard, self._clock)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
         """See `PacketLog`: a ground client keeps no log."""
@@ -205,7 +213,7 @@ class GroundClient:
                     mavlink.MAV_TYPE_GCS, mavlink.MAV_AUTOPILOT_INVALID, 0, 0, mavlink.MAV_STATE_ACTIVE, 3
                 )
             )
-            self._heart.stopping.wait(1.0)
+            self._clock.wait(self._heart.stopping, 1.0)
 
 
 def _refusal(
@@ -221,8 +229,8 @@ def _refusal(
 class _Listening:
     """A context in which no message is missed: it searches those that arrived since `with`."""
 
-    def __init__(self, changed: threading.Condition, heard: deque[MavlinkMessage]) -> None:
-        self._changed = changed
+    def __init__(self, changed: threading.Condition, heard: deque[MavlinkMessage], clock: Clock) -> None:
+        self._changed, self._clock = changed, clock
         self._heard = heard
 
     def __enter__(self) -> Callable[[Callable[[MavlinkMessage], bool], float], MavlinkMessage | None]:
@@ -239,5 +247,5 @@ class _Listening:
             return (m for m in self._heard if id(m) not in self._known and wanted(m))
 
         with self._changed:
-            self._changed.wait_for(lambda: next(newer(), None) is not None, timeout_s)
+            self._clock.wait_for(self._changed, lambda: next(newer(), None) is not None, timeout_s)
             return next(newer(), None)

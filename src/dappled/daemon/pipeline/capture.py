@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from dappled import findings
+from dappled.clock import Clock, SystemClock
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import FlightWriter
@@ -44,7 +44,7 @@ _WITHOUT_CAMERA = {
 GIVEN_UP = 16  # failed shots that a late file can still belong to
 FOLLOWING = 4096  # the same for shots whose file stays at the camera; `geotag` tags the frames of older ones
 _LOOK_S = 0.1
-_LAST_EVENTS_S = 1.0
+_LAST_EVENTS_NS = 10**9
 
 
 @dataclass(slots=True)
@@ -105,10 +105,11 @@ class PendingShots:
     """The shots under way at one camera, and the state of that camera. Any thread may ask, add and remove.
 
     A shot that failed, or whose file stays at the camera, is kept for a while after its end: its file may still come.
-    `decoding`: whether safe frames are decoded in flight.
+    `decoding`: whether safe frames are decoded in flight. `clock` measures the stages of the pipeline too.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, clock: Clock | None = None) -> None:
+        self.clock = clock or SystemClock()
         self.state: BodyState = "starting"
         self.reason = ""
         self.decoding = True
@@ -127,7 +128,7 @@ class PendingShots:
             self._camera.fire(shot.index)
         except Exception as error:  # noqa: BLE001  # any driver's; the shot is noted and must come to an end
             reason = f"the camera driver did not take the shot: {sentence(error)}"
-            self._unfired.append(ShotFailed(shot.index, reason, time.monotonic_ns()))
+            self._unfired.append(ShotFailed(shot.index, reason, self.clock.monotonic_ns()))
 
     def unfired(self) -> ShotFailed | None:
         """The next shot that the driver refused."""
@@ -161,7 +162,9 @@ class PendingShots:
     def wait_decoded(self, timeout_s: float = 5.0) -> bool:
         """Wait until no tagged frame is to be decoded. False if that takes longer than `timeout_s`."""
         with self._changed:
-            return self._changed.wait_for(lambda: all(one.tag is None for one in self._in_hand.values()), timeout_s)
+            return self.clock.wait_for(
+                self._changed, lambda: all(one.tag is None for one in self._in_hand.values()), timeout_s
+            )
 
     def without_camera(self) -> Finding | None:
         """Why there is no camera to fire; None where there is one."""
@@ -283,8 +286,10 @@ class Capture:
     def __init__(self, camera: Camera, ends: ShotEnds, following: NextStage) -> None:
         self._camera, self._ends, self._following = camera, ends, following
         self._shots, self._writer, self._observer = ends.shots, ends.writer, ends.observer
-        self._give_up_at = 0.0
-        self._loop = Loop("capture", self._run)
+        self._clock = ends.shots.clock
+        self._give_up_ns = 0
+        self._never = threading.Event()
+        self._loop = Loop("capture", self._run, clock=self._clock)
 
     def start(self) -> None:
         """Start the camera, then the thread."""
@@ -293,7 +298,7 @@ class Capture:
 
     def stop(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` for what is with the camera, then release it. Shots without a file have failed."""
-        self._give_up_at = time.monotonic() + timeout_s
+        self._give_up_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         ended = self._loop.stop(timeout_s + 1)
         self._ends.tell(self._camera.stop)
         if ended:
@@ -308,15 +313,15 @@ class Capture:
             self._take(_LOOK_S)
 
     def _worth_waiting(self) -> bool:
-        return time.monotonic() < self._give_up_at and bool(self._shots.open())
+        return self._clock.monotonic_ns() < self._give_up_ns and bool(self._shots.open())
 
     def _last_events(self) -> None:
         """Take what came while the camera was released; then every shot that is still open has failed."""
-        until = time.monotonic() + _LAST_EVENTS_S
-        while time.monotonic() < until and self._take(0.0):
+        until_ns = self._clock.monotonic_ns() + _LAST_EVENTS_NS
+        while self._clock.monotonic_ns() < until_ns and self._take(0.0):
             pass
         for index in self._shots.open():
-            self._handle(ShotFailed(index, "the flight ended before its file came", time.monotonic_ns()))
+            self._handle(ShotFailed(index, "the flight ended before its file came", self._clock.monotonic_ns()))
 
     def _take(self, timeout_s: float) -> bool:
         """Pull one event and act on it; False where none came in time."""
@@ -324,7 +329,7 @@ class Capture:
             event = self._shots.unfired() or self._camera.next_event(timeout_s)
         except Exception as error:  # noqa: BLE001  # any driver's; go on, slowly enough for other threads
             report(log, "the camera driver", error)
-            time.sleep(_LOOK_S)
+            self._clock.pause(self._never, _LOOK_S)
             return True
         if event is None:
             return False
@@ -393,7 +398,7 @@ class Capture:
                 self._ends.fail(pending, reason)
 
     def _arrived(self, arrival: Arrival) -> None:
-        began = time.monotonic_ns()
+        began = self._clock.monotonic_ns()
         pending = None if arrival.shot is None else self._shots.of_file(arrival.shot)
         try:
             self._enter(arrival.shot)
@@ -414,7 +419,7 @@ class Capture:
             self._ends.note(DOUBT, pending.doubt, frame.index)
         if pending.fired:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
-        pending.ms["record"] = (time.monotonic_ns() - began) / 1e6
+        pending.ms["record"] = (self._clock.monotonic_ns() - began) / 1e6
         self._ends.tell(self._observer.settled, frame.index, True)
         self._following.take(pending)
 

@@ -9,7 +9,7 @@ from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import FrameDepth
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.stream import wire
-from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.publisher import Stream
 from dappled.workers import Worker
 
 
@@ -42,7 +42,7 @@ class LiveDepth:
         maker: DepthMaker,
         writer: FlightWriter,
         shots: PendingShots,
-        publisher: Publisher,
+        publisher: Stream,
         *,
         method: str,
         interval_s: float,
@@ -52,7 +52,7 @@ class LiveDepth:
         self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
         self._method, self._interval_s, self._clock, self._nearest = method, interval_s, clock, nearest
         self._last_ns: int | None = None
-        self._worker: Worker[PendingShot] = Worker("depth", self._work, capacity=1, policy="drop oldest")
+        self._worker: Worker[PendingShot] = Worker("depth", self._work, capacity=1, policy="drop oldest", clock=clock)
 
     def start(self) -> None:
         """Start the thread."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 import logging
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -21,7 +20,7 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.tagging import PoseSource, Tagging
 from dappled.daemon.pipeline.verdicts import Judge, Verdict, VerdictCounts
 from dappled.daemon.stream import wire
-from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.publisher import Stream
 from dappled.drivers.camera import Camera
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import report, sentence
@@ -53,7 +52,7 @@ class Pipeline:
         poses: PoseSource,
         *,
         decoder: FrameDecoder | None,
-        publisher: Publisher | None,
+        publisher: Stream | None,
         latency: BodyLatency,
         names: Names,
         observer: Observer,
@@ -62,6 +61,7 @@ class Pipeline:
         preview_interval_s: float = 0.0,
     ) -> None:
         shots.decoding = decoder is not None
+        self._clock = shots.clock
         ends = ShotEnds(shots, writer, observer)
         self._decoding = Decoding(
             ends, decoder, publisher, capacity=decode_queue, judge=judge, preview_interval_s=preview_interval_s
@@ -78,10 +78,10 @@ class Pipeline:
     def stop(self, timeout_s: float) -> None:
         """Finish what is in hand, at most `timeout_s`, and release the camera. What is left stays in the record, and a
         shot without a file has failed."""
-        until = time.monotonic() + timeout_s
+        until_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         self._capture.stop(timeout_s)
         for stage in (self._tagging, self._decoding):
-            stage.worker.stop(max(1.0, until - time.monotonic()))
+            stage.worker.stop(max(1.0, (until_ns - self._clock.monotonic_ns()) / 1e9))
 
     def dead_threads(self) -> list[str]:
         """The threads that have ended without having been stopped: none, unless there is a bug."""
@@ -116,19 +116,25 @@ class Decoding:
         self,
         ends: ShotEnds,
         decoder: FrameDecoder | None,
-        publisher: Publisher | None,
+        publisher: Stream | None,
         *,
         capacity: int,
         judge: Judge,
         preview_interval_s: float,
     ) -> None:
         self._ends, self._decoder, self._publisher = ends, decoder, publisher
+        self._clock = ends.shots.clock
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
         self.failures = DecodeFailures()
         self.judge = judge
         self._unrecorded: LawDecision | None = None
         self.worker: Worker[PendingShot] = Worker(
-            "decode", self._work, capacity=capacity, on_failure=self._failed, on_drop=self._dropped
+            "decode",
+            self._work,
+            capacity=capacity,
+            on_failure=self._failed,
+            on_drop=self._dropped,
+            clock=self._clock,
         )
 
     def take(self, pending: PendingShot) -> None:
@@ -148,7 +154,7 @@ class Decoding:
         assert frame is not None
         assert tag is not None
         assert self._decoder is not None
-        began = time.monotonic_ns()
+        began = self._clock.monotonic_ns()
         writer = self._ends.writer
         decoded = self._decoder.decode(
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
@@ -162,11 +168,11 @@ class Decoding:
             self._unrecorded = None
         pending.verdict = self._judged(pending, tag, decoded)
         judged = pending.verdict.values()
-        writer.decoded(decoded.result(frame.index, (time.monotonic_ns() - began) / 1e6, judged=judged))
-        pending.ms["decode"] = (time.monotonic_ns() - began) / 1e6
-        began = time.monotonic_ns()
+        writer.decoded(decoded.result(frame.index, (self._clock.monotonic_ns() - began) / 1e6, judged=judged))
+        pending.ms["decode"] = (self._clock.monotonic_ns() - began) / 1e6
+        began = self._clock.monotonic_ns()
         self._publish(tag, decoded, judged)
-        pending.ms["publish"] = (time.monotonic_ns() - began) / 1e6
+        pending.ms["publish"] = (self._clock.monotonic_ns() - began) / 1e6
         self._ends.finish(pending)
 
     def _judged(self, pending: PendingShot, tag: Tag, decoded: DecodedFrame) -> Verdict:
@@ -182,12 +188,12 @@ class Decoding:
         except Exception as error:  # noqa: BLE001  # a decoded frame must not be lost with its verdict
             report(log, "verdict", error)
             found = Verdict("unknown", (f"it could not be judged: {sentence(error)}",))
-        return self.judge.count(tag.index, found, time.monotonic_ns(), (tag.focal_length_mm, tag.f_number))
+        return self.judge.count(tag.index, found, self._clock.monotonic_ns(), (tag.focal_length_mm, tag.f_number))
 
     def _unjudged(self, pending: PendingShot, why: str) -> None:
         if pending.verdict is None:
             found = Verdict("unknown", (why,))
-            pending.verdict = self.judge.count(pending.shot.index, found, time.monotonic_ns())
+            pending.verdict = self.judge.count(pending.shot.index, found, self._clock.monotonic_ns())
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         before = self.failures
@@ -203,7 +209,7 @@ class Decoding:
         if self._publisher is None:
             return
         self._publisher.publish("slices", {**wire.slices_header(tag, decoded), "verdict": judged}, decoded.body)
-        now_s = time.monotonic()
+        now_s = self._clock.monotonic_ns() / 1e9
         if decoded.preview and now_s - self._last_preview_s >= self._preview_interval_s:
             self._last_preview_s = now_s
             facts = wire.frame_facts(tag, decoded.law)

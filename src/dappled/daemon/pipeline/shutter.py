@@ -125,7 +125,7 @@ class Shutter:
         self._shots = self._refused = self._succeeded = self._failed = 0
         self._wake = threading.Event()
         self._stopped = False
-        self._loop = Loop("shutter intervals", self._run)
+        self._loop = Loop("shutter intervals", self._run, clock=clock)
 
     def start(self) -> None:
         """Begin to serve intervals. Single shots need no thread."""

@@ -130,7 +130,7 @@ class DistanceTrigger:
         self._lock = threading.Lock()
         self._way: _Way | None = None
         self._wake = threading.Event()
-        self._loop = Loop("distance trigger", self._run)
+        self._loop = Loop("distance trigger", self._run, clock=clock)
 
     def start(self) -> None:
         """Begin to serve series."""

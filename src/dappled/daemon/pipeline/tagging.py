@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import logging
-import time
 from dataclasses import dataclass
 from typing import Protocol, Self
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, clocks
 from dappled.daemon.pipeline.capture import NextStage, PendingShot, ShotEnds
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.publisher import Stream
 from dappled.daemon.stream.wire import frame_header
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.raw import reading
@@ -110,7 +109,7 @@ class Tagging:
         self,
         ends: ShotEnds,
         poses: PoseSource,
-        publisher: Publisher | None,
+        publisher: Stream | None,
         *,
         latency: BodyLatency,
         names: Names,
@@ -118,10 +117,16 @@ class Tagging:
     ) -> None:
         self._ends, self._poses, self._publisher = ends, poses, publisher
         self._latency, self._names, self._following = latency, names, following
+        self._clock = ends.shots.clock
         self._zoom = Zoom()
         self._camera_clock = CameraClock()
         self.worker: Worker[PendingShot] = Worker(
-            "tag", self._work, capacity=_QUEUE, on_failure=self._failed, on_drop=self._dropped
+            "tag",
+            self._work,
+            capacity=_QUEUE,
+            on_failure=self._failed,
+            on_drop=self._dropped,
+            clock=self._clock,
         )
 
     def take(self, pending: PendingShot) -> None:
@@ -147,7 +152,7 @@ class Tagging:
         self._ends.drop(pending, "not tagged")
 
     def _tag(self, pending: PendingShot, frame: Frame) -> None:
-        began = time.monotonic_ns()
+        began = self._clock.monotonic_ns()
         settings = self._settings(frame)
         if zoomed := self._zoom.look(frame.index, settings.focal_length_mm):
             log.warning("zoom: %s", zoomed)
@@ -162,7 +167,7 @@ class Tagging:
         self._ends.writer.tagged(pending.tag)
         pending.body_c = settings.temperature_c
         pending.rates_rad_s = self._rates(pose)
-        pending.ms["tag"] = (time.monotonic_ns() - began) / 1e6
+        pending.ms["tag"] = (self._clock.monotonic_ns() - began) / 1e6
         self._ends.tell(self._ends.observer.tagged, pending)
         if self._publisher:
             self._publisher.publish("frame", frame_header(pending.tag, frame, self._names.law or None))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Protocol
 
+from dappled.clock import Clock
 from dappled.daemon.stream.publisher import Reply
 from dappled.daemon.stream.wire import DecodedSlices, Message, WireError, frame_header, slices_header
 from dappled.errors import sentence
@@ -55,12 +56,17 @@ class Answers:
     """Answers questions one by one, behind a bounded queue; a question that finds it full is refused."""
 
     def __init__(
-        self, record: FrameRecord, decoder: SlicesDecoder | None, flight: FlightDecoding | None = None
+        self,
+        record: FrameRecord,
+        decoder: SlicesDecoder | None,
+        flight: FlightDecoding | None = None,
+        *,
+        clock: Clock | None = None,
     ) -> None:
         """`flight`, where given, decodes its own frames before a frame is decoded for an answer."""
         self._record, self._decoder, self._flight = record, decoder, flight
         self._worker: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
-            "answers", self._work, capacity=WAITING, on_failure=self._failed
+            "answers", self._work, capacity=WAITING, on_failure=self._failed, clock=clock
         )
 
     def start(self) -> None:

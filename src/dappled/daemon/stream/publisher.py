@@ -17,7 +17,7 @@ import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
 import zmq
 
@@ -52,6 +52,31 @@ class PublisherStatistics:
     questions: int
     refused: int
     wrong_keys: int = 0
+
+
+class Stream(Protocol):
+    """Where the messages of a flight go."""
+
+    def start(self, flight: str, answer: Answer) -> None:
+        """Start to send and to listen. `flight` is the name in the headers.
+
+        Questions are passed to `answer(request, reply)`, which replies once, from any thread.
+        """
+
+    def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
+        """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent. Never waits.
+
+        `body` must not be changed afterwards: it is sent without a copy.
+        """
+
+    def statistics(self) -> PublisherStatistics:
+        """Counters, taken together."""
+
+    def dead_threads(self) -> list[str]:
+        """The threads that have ended without having been stopped: never, unless there is a bug."""
+
+    def stop(self) -> None:
+        """Send what waits, and close."""
 
 
 class InFlightLimit:
@@ -132,23 +157,17 @@ class Publisher:
         )
 
     def start(self, flight: str, answer: Answer) -> None:
-        """Start to send and to listen. `flight` is the name in the headers.
-
-        Questions are passed to `answer(request, reply)`, which replies once, from any thread.
-        """
+        """See Stream."""
         self._flight, self._answer = flight, answer
         self._loop.start()
         self._sockets.start()
 
     def dead_threads(self) -> list[str]:
-        """The threads that have ended without having been stopped: never, unless there is a bug."""
+        """See Stream."""
         return [*self._loop.dead_threads(), *self._sockets.dead_threads()]
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
-        """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent. Never waits.
-
-        `body` must not be changed afterwards: it is sent without a copy.
-        """
+        """See Stream."""
         with self._lock:
             self._waiting.append((b"", Message(topic, facts, body)))
             if sum(not peer for peer, _ in self._waiting) > self._capacity:
@@ -156,7 +175,7 @@ class Publisher:
         self._ring()
 
     def statistics(self) -> PublisherStatistics:
-        """Counters, taken together."""
+        """See Stream."""
         with self._lock:
             return PublisherStatistics(
                 dict(self._sent),

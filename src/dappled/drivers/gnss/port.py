@@ -46,7 +46,7 @@ class GnssPort:
 
     def __init__(self, at: Address, edge: Edge, notebook: Notebook, clock: Clock) -> None:
         self._at, self._edge, self._notebook, self._clock = at, edge, notebook, clock
-        self._loop = Loop("gnss", self._run)
+        self._loop = Loop("gnss", self._run, clock=clock)
         self._unlogged: str | None = None
         self._error: str | None = None
         self._began_ns = clock.monotonic_ns()

@@ -4,7 +4,7 @@
 into packets, `signing` signs and verifies.
 """
 
-from dappled.drivers.mavlink.channels import LinkError, parse
+from dappled.drivers.mavlink.channels import LinkError, Transport, parse
 from dappled.drivers.mavlink.framing import Framed
 from dappled.drivers.mavlink.links import (
     LinkStatistics,
@@ -42,6 +42,7 @@ __all__ = [
     "Signing",
     "SigningError",
     "SigningStatistics",
+    "Transport",
     "Unsigned",
     "make_key",
     "mavlink",

@@ -5,14 +5,17 @@ from __future__ import annotations
 import errno
 import ipaddress
 import os
+import select
 import socket
 import termios
-import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import or_
 from typing import Literal, Protocol
 
+from dappled.clock import Clock
 from dappled.drivers.mavlink.peers import Peers, Shown, Source
 from dappled.drivers.mavlink.streams import ByteStream, TcpServer, over_tcp
 from dappled.errors import DappledError
@@ -22,10 +25,11 @@ __all__ = [
     "ByteChannel",
     "ByteStream",
     "LinkError",
+    "MachineTransport",
     "TcpServer",
+    "Transport",
     "UdpIn",
     "UdpOut",
-    "open_channel",
     "over_serial",
     "over_tcp",
     "parse",
@@ -162,8 +166,37 @@ class ByteChannel(Protocol):
         """Close every descriptor."""
 
 
-def open_channel(address: Address) -> ByteChannel:
-    """Open the connection that `address` names. Raises LinkError, in words."""
+class Transport(Protocol):
+    """What opens channels, and waits for them."""
+
+    def open(self, address: Address) -> ByteChannel:
+        """Open the connection that `address` names. Raises LinkError, in words."""
+
+    def wait(self, channel: ByteChannel, timeout_s: float) -> tuple[bool, bool]:
+        """Until there is something to read, or room to write what waits: whether each is so."""
+
+
+class MachineTransport:
+    """The machine's sockets and serial devices."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+
+    def open(self, address: Address) -> ByteChannel:
+        """See Transport."""
+        return open_channel(address, self._clock)
+
+    def wait(self, channel: ByteChannel, timeout_s: float) -> tuple[bool, bool]:
+        """See Transport. poll takes descriptors above 1023, select does not."""
+        poll = select.poll()
+        for descriptor in channel.descriptors():
+            poll.register(descriptor, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
+        ready = reduce(or_, (events for _, events in poll.poll(timeout_s * 1e3)), 0)
+        return bool(ready & ~select.POLLOUT), bool(ready & select.POLLOUT)
+
+
+def open_channel(address: Address, clock: Clock) -> ByteChannel:
+    """See Transport."""
     try:
         if address.kind == "serial":
             return over_serial(address)
@@ -172,7 +205,7 @@ def open_channel(address: Address) -> ByteChannel:
         if address.kind == "tcpin":
             return TcpServer(_bound(address, socket.SOCK_STREAM))
         if address.kind == "udpin":
-            return UdpIn(_bound(address, socket.SOCK_DGRAM))
+            return UdpIn(_bound(address, socket.SOCK_DGRAM), clock)
         return UdpOut(address)
     except OSError as error:
         raise LinkError(_sentence(address, error), may_come=error.errno not in _FINAL) from error
@@ -276,9 +309,9 @@ class _Udp:
 class UdpIn(_Udp):
     """Listen, and send to the peers that have proven themselves. What they send is read before what strangers send."""
 
-    def __init__(self, sock: socket.socket) -> None:
+    def __init__(self, sock: socket.socket, clock: Clock) -> None:
         super().__init__(sock)
-        self._peers = Peers()
+        self._clock, self._peers = clock, Peers()
         self._known, self._strange = deque[tuple[bytes, Source]](), deque[tuple[bytes, Source]]()
         self._in_a_row = 0
         self._waiting = Counter[Source]()  # in `_strange`: a peer that proves itself meanwhile keeps its order
@@ -308,14 +341,14 @@ class UdpIn(_Udp):
     def shown(self, evidence: Shown) -> None:
         if self._last is not None:
             data, source = self._last
-            self._peers.shown(source, len(data), evidence, time.monotonic_ns())
+            self._peers.shown(source, len(data), evidence, self._clock.monotonic_ns())
 
     def write(self, data: bytes) -> bool:
-        sent = [self._send(data, source) for source in self._peers.receivers(len(data), time.monotonic_ns())]
+        sent = [self._send(data, source) for source in self._peers.receivers(len(data), self._clock.monotonic_ns())]
         return any(sent)
 
     def _drain(self) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns = self._clock.monotonic_ns()
         for _ in range(_DRAINED):
             received = self._receive()
             if received is None:

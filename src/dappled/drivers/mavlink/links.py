@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import logging
-import select
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial, reduce
-from operator import or_
+from functools import partial
 from typing import Protocol
 
 from dappled.clock import Clock
-from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, open_channel, parse
+from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, MachineTransport, Transport, parse
 from dappled.drivers.mavlink.framing import Framed, Framer, MavlinkMessage, PacketParser, is_signed, mavlink, pack
 from dappled.drivers.mavlink.log_budget import LogBudget
 from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningStatistics
@@ -110,8 +108,8 @@ class LinkStatistics:
 class Link:
     """One link's state. Its receiving thread writes it and, under the order lock, so do the senders."""
 
-    def __init__(self, number: int, address: Address, guard: SignatureGuard | None) -> None:
-        self.number = number
+    def __init__(self, number: int, address: Address, guard: SignatureGuard | None, transport: Transport) -> None:
+        self.number, self._transport = number, transport
         self.address = address
         self.guard = guard
         self.channel: ByteChannel | None = None
@@ -133,7 +131,7 @@ class Link:
 
     def opened(self) -> ByteChannel:
         """Open another channel. Raises LinkError."""
-        channel = open_channel(self.address)
+        channel = self._transport.open(self.address)
         if self.guard is not None:
             channel.ask_proof()
         return channel
@@ -290,15 +288,22 @@ class MavlinkLinks:
     """
 
     def __init__(
-        self, urls: Sequence[str], *, system_id: int, component_id: int, clock: Clock, signing: Signing | None = None
+        self,
+        urls: Sequence[str],
+        *,
+        system_id: int,
+        component_id: int,
+        clock: Clock,
+        signing: Signing | None = None,
+        transport: Transport | None = None,
     ) -> None:
-        self._clock = clock
+        self._clock, self._transport = clock, transport or MachineTransport(clock)
         self._stop = threading.Event()
         self._opened = False
         self._signing_time = signing.time if signing else None
         guards = signing.guards if signing else [None] * len(urls)
         pairs = zip(urls, guards, strict=True)
-        self._links = [Link(number, parse(url), guard) for number, (url, guard) in enumerate(pairs)]
+        self._links = [Link(number, parse(url), guard, self._transport) for number, (url, guard) in enumerate(pairs)]
         self.sender = PacketSender(self._links, clock, system_id=system_id, component_id=component_id)
         self._order = self.sender.order
         self._loops: list[Loop] = []
@@ -332,9 +337,11 @@ class MavlinkLinks:
         self.open()
         self.sender.start(packet_log)
         for link in self._links:
-            self._loops.append(Loop(f"mavlink {link.number}", partial(self._receive, link, receiver), self._stop))
+            receive = partial(self._receive, link, receiver)
+            self._loops.append(Loop(f"mavlink {link.number}", receive, self._stop, self._clock))
         if self._signing_time is not None:
-            self._loops.append(Loop("mavlink signing", partial(self._signing_time.run, self._stop), self._stop))
+            run = partial(self._signing_time.run, self._stop)
+            self._loops.append(Loop("mavlink signing", run, self._stop, self._clock))
         for loop in self._loops:
             loop.start()
 
@@ -413,16 +420,12 @@ class MavlinkLinks:
         link.packets_bad += framer.bad - bad
 
     def _wait(self, channel: ByteChannel) -> bool:
-        """Wait until there is something to read, and flush meanwhile. poll takes descriptors above 1023, select does
-        not."""
-        poll = select.poll()
-        for descriptor in channel.descriptors():
-            poll.register(descriptor, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
-        ready = reduce(or_, (events for _, events in poll.poll(_POLL_S * 1e3)), 0)
-        if ready & select.POLLOUT:
+        """Wait until there is something to read, and flush meanwhile."""
+        readable, writable = self._transport.wait(channel, _POLL_S)
+        if writable:
             with self._order:
                 channel.flush()
-        return bool(ready & ~select.POLLOUT)
+        return readable
 
     def _received(
         self, link: Link, channel: ByteChannel, stamp_us: int, framed: Framed, receiver: PacketReceiver | None
@@ -458,7 +461,7 @@ class MavlinkLinks:
     def _reopen(self, link: Link) -> None:
         with self._order:
             link.close()
-        if self._stop.wait(_REOPEN_S):
+        if self._clock.pause(self._stop, _REOPEN_S):
             return
         try:
             channel = link.opened()

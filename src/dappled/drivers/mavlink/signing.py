@@ -175,7 +175,7 @@ class SigningTime:
         """Keep the times until `stop` is set, and then exactly. A file that can't be written is logged once."""
         failed = False
         while True:
-            ending = stop.wait(_KEEP_S)
+            ending = self._clock.pause(stop, _KEEP_S)
             try:
                 self.keep(ending=ending)
                 failed = False

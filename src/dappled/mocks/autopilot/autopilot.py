@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled.clock import SystemClock
+from dappled.clock import Clock, SystemClock, TimeOfDayClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.drivers.reader_process import python_module
 from dappled.mocks.autopilot.on_request import OnRequest
@@ -37,7 +37,6 @@ RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
-_FASTEST_HZ = 100.0
 _LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
 
 
@@ -91,11 +90,6 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
         return heartbeat(armed=True)
     raise ValueError(f"the simulated autopilot has no message {message_id}")
-
-
-def utc_us(monotonic_ns: int) -> int:
-    """UTC at a moment of this machine's: an autopilot takes the UTC and the boot time of one message at one moment."""
-    return (time.time_ns() - time.monotonic_ns() + monotonic_ns) // 1000
 
 
 def heartbeat(*, armed: bool, personality: str = "ardupilot") -> MavlinkMessage:
@@ -160,7 +154,8 @@ class Flyer:
 
     `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras. `relay` sends
     what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `has` is what it sends
-    on request alone. It is armed from `arms_s` after the flight's beginning on.
+    on request alone. It is armed from `arms_s` after the flight's beginning on, and sends nothing more often than at
+    `fastest_hz`.
     """
 
     path: FlightPath
@@ -179,15 +174,21 @@ class Flyer:
     delayed: deque[tuple[int, MavlinkMessage]] = field(default_factory=deque)
     contacts: deque[int] = field(default_factory=deque)
     random: random.Random = field(default_factory=lambda: random.Random(0))  # noqa: S311 (a simulation)
+    clock: Clock = field(default_factory=TimeOfDayClock)
+    fastest_hz: float = 100.0
 
     def __post_init__(self) -> None:
         for message_id, rate in RATES_HZ.items():
-            self.interval_ns[message_id] = round(1e9 / rate)
+            self.interval_ns[message_id] = round(1e9 / min(rate, self.fastest_hz))
             self.due_ns[message_id] = 0
 
     def boot_ns(self, monotonic_ns: int) -> int:
         """The boot clock at a moment of this machine's."""
         return self.boot.ns((monotonic_ns - self.start_monotonic_ns) / 1e9)
+
+    def unix_us(self, monotonic_ns: int) -> int:
+        """UTC at a moment of this machine's: UTC and boot time of one message are of one moment."""
+        return (self.clock.utc_ns() - self.clock.monotonic_ns() + monotonic_ns) // 1000
 
     def step(self, now_ns: int) -> float:
         """Send what is due; returns the seconds until the next message."""
@@ -210,11 +211,11 @@ class Flyer:
                     armed=armed, personality="ardupilot" if self.cameras is None else self.cameras.personality
                 )
             else:
-                message = telemetry_message(number, pose, boot_ns, utc_us(now_ns))
+                message = telemetry_message(number, pose, boot_ns, self.unix_us(now_ns))
             self._later(message, now_ns)
         if self.cameras is not None:
             with self.lock:
-                triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, utc_us(now_ns))
+                triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, self.unix_us(now_ns))
             self._triggered(triggered, now_ns)
         while self.contacts and self.contacts[0] <= now_ns:
             assert self.cameras is not None
@@ -226,7 +227,7 @@ class Flyer:
             next_ns = min(self.due_ns.values())
         if self.delayed:
             next_ns = min(next_ns, self.delayed[0][0])
-        return max(0.0, (next_ns - time.monotonic_ns()) / 1e9)
+        return max(0.0, (next_ns - self.clock.monotonic_ns()) / 1e9)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
         """See `PacketLog`: the simulated autopilot keeps no log."""
@@ -240,12 +241,12 @@ class Flyer:
         if self.relay is not None and target != (self.system_id, 1) and message.get_type() != "TIMESYNC":
             self.relay(Forwarded(packet), packet.link)
         if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self._asks_us(packet.raw):
-            self.send(mavlink.MAVLink_timesync_message(self.boot_ns(time.monotonic_ns()), message.ts1))
+            self.send(mavlink.MAVLink_timesync_message(self.boot_ns(self.clock.monotonic_ns()), message.ts1))
         if message.get_type() == "COMMAND_LONG" and message.target_system in (0, self.system_id):
             if self.cameras is not None:
-                now_ns = time.monotonic_ns()
+                now_ns = self.clock.monotonic_ns()
                 with self.lock:
-                    triggered = self.cameras.command(message, self.boot_ns(now_ns) // 1000, utc_us(now_ns))
+                    triggered = self.cameras.command(message, self.boot_ns(now_ns) // 1000, self.unix_us(now_ns))
                 self._triggered(triggered, now_ns)
             if message.command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or message.target_component not in (0, 1):
                 return
@@ -266,7 +267,7 @@ class Flyer:
         if not (math.isfinite(interval_us) and interval_us > 0):
             return int(mavlink.MAV_RESULT_DENIED)
         with self.lock:
-            self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / _FASTEST_HZ))
+            self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / self.fastest_hz))
             self.due_ns.setdefault(int(number), 0)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 

@@ -1,0 +1,189 @@
+"""A whole flight in one process and in virtual time: the daemon, its links, its camera, an autopilot and a ground
+station. The seed decides what goes wrong, and which of several threads that can go on does so first."""
+
+from __future__ import annotations
+
+import random
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from dappled.config import settings as configuration
+from dappled.config.schema import TomlSource
+from dappled.config.settings import Settings
+from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
+from dappled.daemon.service import Service, StandIns
+from dappled.daemon.stream.publisher import Answer, PublisherStatistics
+from dappled.drivers.camera import Arrival, Blob, Fired, Identity, PlainCamera, ShotFailed, StateChanged
+from dappled.drivers.mavlink import MavlinkLinks
+from dappled.mocks.autopilot.autopilot import BootTime, Flyer
+from dappled.mocks.autopilot.path import FlightPath
+from dappled.workers import Loop
+from tests.simulated.bad_link import LinkFaults
+from tests.simulated.memory_links import MemoryNetwork
+from tests.simulated.virtual_clock import VirtualClock
+
+AUTOPILOT, GROUND = 14550, 14551
+_IDENTITY = Identity("dappled", "Virtual Camera", "SIM1", "memory")
+
+
+class MemoryCamera(PlainCamera):
+    """A camera whose shutter opens 45 to 75 ms after its trigger, and whose files come within a second. One shot in
+    `fails` fails, in place of its file."""
+
+    def __init__(self, clock: VirtualClock, seed: int, file: bytes, fails: int = 50) -> None:
+        super().__init__(clock)
+        self._clock, self._file, self._fails = clock, file, fails
+        self._random = random.Random(f"camera {seed}")  # noqa: S311  # a simulation
+        self._wanted: list[int] = []
+        self._stopping = threading.Event()
+        self._loop = Loop("camera", self._run, self._stopping, clock)
+
+    @property
+    def identity(self) -> Identity:
+        return _IDENTITY
+
+    def start(self) -> None:
+        self._loop.start()
+
+    def fire(self, shot: int) -> None:
+        self._wanted.append(shot)
+
+    def stop(self) -> None:
+        self._loop.stop(2.0)
+
+    def _run(self) -> None:
+        self._say("ready")
+        while self._clock.until(lambda: self._wanted or self._stopping.is_set(), 1e6) and not self._stopping.is_set():
+            self._say("busy")
+            self._expose(self._wanted.pop(0))
+            self._say("ready")
+
+    def _expose(self, shot: int) -> None:
+        called_ns = self._clock.monotonic_ns()
+        self._clock.sleep(self._random.uniform(0.045, 0.075))
+        self.report(Fired(shot, called_ns, self._clock.monotonic_ns()))
+        self._clock.sleep(self._random.uniform(0.3, 0.9))
+        if not self._random.randrange(self._fails):
+            self.report(ShotFailed(shot, "the mirror is stuck", self._clock.monotonic_ns()))
+            return
+        blob = Blob.of(self._file + b"shot %d" % shot)
+        self.report(Arrival(shot, f"VIR_{shot:04d}.DNG", blob, self._clock.monotonic_ns()))
+
+    def _say(self, state: Any) -> None:
+        self.report(StateChanged(state, "", self._clock.monotonic_ns(), _IDENTITY))
+
+
+class MemoryStream:
+    """A Stream that keeps its topics."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[str, Mapping[str, Any]]] = []
+
+    def start(self, flight: str, answer: Answer) -> None:
+        """Nobody asks."""
+
+    def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
+        self.messages.append((topic, facts))
+
+    def statistics(self) -> PublisherStatistics:
+        return PublisherStatistics({}, {}, 0, 0, 0)
+
+    def dead_threads(self) -> list[str]:
+        return []
+
+    def stop(self) -> None:
+        """Nothing waits."""
+
+
+class VirtualAutopilot:
+    """The simulated autopilot, its thread in the clock. Telemetry at `telemetry_hz`; its clock jumps as `boot` says."""
+
+    def __init__(self, clock: VirtualClock, network: MemoryNetwork, seed: int, hz: float, boot: BootTime) -> None:
+        self._clock = clock
+        url = f"udpout:127.0.0.1:{AUTOPILOT}"
+        self._links = MavlinkLinks([url], system_id=1, component_id=1, clock=clock, transport=network)
+        path, send = FlightPath(seed), self._links.sender.send
+        self._flyer = Flyer(path, clock.monotonic_ns(), boot, send, clock=clock, fastest_hz=hz)
+        self._loop = Loop("autopilot", self._run, clock=clock)
+
+    def start(self) -> None:
+        self._links.start(self._flyer)
+        self._loop.start()
+
+    def stop(self) -> None:
+        self._loop.stop(1.0)
+        self._links.stop()
+
+    def _run(self) -> None:
+        while not self._loop.stopping.is_set():
+            self._clock.wait(self._loop.stopping, self._flyer.step(self._clock.monotonic_ns()))
+
+
+@dataclass
+class VirtualFlight:
+    """What came of a flight."""
+
+    folder: Path
+    outcomes: list[Outcome] = field(default_factory=list)
+    sent: list[tuple[int, int, int, bytes]] = field(default_factory=list)
+    stream: list[tuple[str, Mapping[str, Any]]] = field(default_factory=list)
+    seconds: float = 0.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is flown: `frames` requests, `interval_s` apart, with telemetry at `hz`."""
+
+    seed: int
+    frames: int
+    interval_s: float
+    hz: float = 50.0
+    faults: LinkFaults = field(default_factory=partial(LinkFaults, loss=0.02, doubles=0.01, late_s=0.03))
+    cuts: tuple[tuple[float, float], ...] = ()
+    boot: BootTime = field(default_factory=BootTime)
+
+
+def settings(folder: Path) -> Settings:
+    ours = {
+        "record": {"directory": str(folder), "min_free_mb": 0},
+        "mavlink": {"url": [f"udpin:127.0.0.1:{port}" for port in (AUTOPILOT, GROUND)]},
+        "console": {"bind": ""},
+    }
+    return configuration.resolve(configuration.parse(ours, TomlSource("test")))
+
+
+@contextmanager
+def started(part: Any) -> Iterator[None]:
+    part.start()
+    try:
+        yield
+    finally:
+        part.stop()
+
+
+def fly(plan: Plan, folder: Path, file: bytes) -> VirtualFlight:
+    """Fly it, from the daemon's start to its end."""
+    with VirtualClock(plan.seed) as clock:
+        network, stream = MemoryNetwork(clock, plan.seed, plan.faults, plan.cuts), MemoryStream()
+        instead = StandIns(MemoryCamera(clock, plan.seed, file), network, stream)
+        service = Service(settings(folder), clock=clock, instead=instead)
+        autopilot = VirtualAutopilot(clock, network, plan.seed, plan.hz, plan.boot)
+        began_ns = clock.monotonic_ns()
+        with started(service):
+            flown = VirtualFlight(service.folder, sent=network.sent, stream=stream.messages)
+            loop = Loop("daemon", service.run, clock=clock)
+            loop.start()
+            with started(autopilot):
+                clock.sleep(5.0)
+                ground = GroundClient(f"udpout:127.0.0.1:{GROUND}", clock=clock, transport=network)
+                with ground:
+                    ground.capture(plan.frames, plan.interval_s, on_outcome=flown.outcomes.append)
+            service.ask_to_stop()
+            loop.stop(5.0)
+        flown.seconds = (clock.monotonic_ns() - began_ns) / 1e9
+    return flown
