@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow test-long both long mutations soak faults bench lock deb deb-trial arm64 install uninstall clean
+.PHONY: help setup everything peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow test-long both long mutations soak faults bench lock deb deb-trial arm64 install uninstall clean
 PREFIX ?= /usr/local
 # Tests start hundreds of processes: where no bytecode may be kept, each of them compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -15,6 +15,10 @@ help: ## show this list
 setup: ## create the environment in .venv (the other targets do it if needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py
+
+everything: ## .venv with all extras, and what slow tests and notebooks need (the targets that need it do it)
+	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
+	@$(PYTHON) tools/bootstrap.py everything
 
 peers: ## MAVSDK, MAVProxy and pycolmap, which long tests talk to, in .venv-peers (done by test-long when needed)
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
@@ -50,10 +54,10 @@ coverage: setup ## run the default tests and report which lines they reach (a th
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
-test-slow: setup ## the tests at real seams; those that watch a clock run with no other beside them
+test-slow: everything ## the tests at real seams; those that watch a clock run with no other beside them
 	@$(BUDGET) "make test-slow" 480 900 $(MAKE) -s both TIER="slow and not long"
 
-test-long: setup peers ## soaks, sweeps, matrices and benchmarks
+test-long: everything peers ## soaks, sweeps, matrices and benchmarks
 	@$(BUDGET) "make test-long" 2400 4800 $(MAKE) -s both TIER=long
 
 both:
@@ -83,7 +87,7 @@ docs: ## build the documents' site in build/site: strict, links checked, nothing
 	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build -q
 	@echo "build/site/index.html, $$(du -sh build/site | cut -f1)"
 
-notebooks: setup ## run the notebooks of docs/notebooks, and keep what they print and draw
+notebooks: everything ## run the notebooks of docs/notebooks, and keep what they print and draw
 	@$(BIN)/python tools/notebooks.py --write
 
 soak: setup ## fly half an hour in which something goes wrong every few seconds; MINUTES=n for another time
@@ -93,12 +97,14 @@ faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=
 	@for round in $$(seq $(or $(ROUNDS),20)); do echo "== round $$round"; \
 	  $(BIN)/pytest -q -p no:cacheprovider -m "" tests/system/test_camera_faults.py || exit 1; done
 
-bench: setup ## run the benchmarks, print one table with the limits, write docs/performance.md; REPEATS=n
+bench: everything ## run the benchmarks, print one table with the limits, write docs/performance.md; REPEATS=n
 	@$(BIN)/python benchmarks/table.py --page --repeats $(or $(REPEATS),1)
 
-lock: setup ## resolve the locks anew from pyproject.toml: everything, the peers of tests, the documents, what flies, what builds it, and uv
+lock: setup ## resolve the locks anew from pyproject.toml: everything, what demo and default tests need, the peers of tests, the documents, what flies, what builds it, and uv
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \
-	  --no-header --all-extras --group dev pyproject.toml -o requirements.lock; \
+	  --no-header --no-annotate --all-extras --group dev --group whole pyproject.toml -o requirements-everything.lock; \
+	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header -c requirements-everything.lock \
+	  --no-annotate --extra ground --extra ros --group dev pyproject.toml -o requirements.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group peers \
 	  -o requirements-peers.lock; \
 	$$uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate --group docs \

@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Set up .venv from requirements.lock: with the uv on PATH, or one fetched into .tools/. Touches nothing else.
 
-    python tools/bootstrap.py          the environment of the project, in .venv
-    python tools/bootstrap.py peers    that of MAVSDK, MAVProxy and pycolmap, for some tests, in .venv-peers
-    python tools/bootstrap.py docs     that of the programs that build the documents' site, in .venv-docs
+    python tools/bootstrap.py              what the demo and the default tests need, in .venv
+    python tools/bootstrap.py everything   there too: all extras, and what slow tests and notebooks need
+    python tools/bootstrap.py peers        MAVSDK, MAVProxy and pycolmap, for some tests, in .venv-peers
+    python tools/bootstrap.py docs         the programs that build the documents' site, in .venv-docs
 
 Runs on a bare Python >= 3.11 (no pip, no venv module needed). Says nothing when all is in place.
 """
@@ -15,6 +16,7 @@ import importlib.util
 import io
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -27,7 +29,12 @@ ROOT = Path(__file__).resolve().parents[1]
 TOOLS = ROOT / ".tools"
 VENV = ROOT / ".venv"
 APART = ("peers", "docs")
+LOCK, EVERYTHING = "requirements.lock", "requirements-everything.lock"
 STAMP = "dappled-set-up"
+# What packages bring and nothing here reads, a tenth of all: their own tests, and MAVLink's other dialects.
+UNREAD = re.compile(r"(^|/)tests$|^pymavlink/dialects/v\d+/(?!all\.|ardupilotmega\.|__)[^/]+$")
+# Large, and little of them is used: this gets its bytecode when it is first imported.
+UNCOMPILED = r"/site-packages/(scipy|fontTools|rasterio|matplotlib)/"
 # uv's own releases, for machines whose Python has neither pip nor ensurepip. DAPPLED_UV_RELEASES names a mirror.
 UV_LOCK = ROOT / "requirements-uv.lock"  # one version, with the hashes of its wheels
 RELEASES = "https://github.com/astral-sh/uv/releases/download"
@@ -116,7 +123,8 @@ def make(venv: Path, lock: str, *, project: bool) -> None:
     """Make an environment from a lock, with the project in it or without. Does nothing where it is made already."""
     stamp = venv / STAMP
     wanted = ingredients(lock, *(["pyproject.toml"] if project else []))
-    if stamp.is_file() and stamp.read_text() == wanted:
+    enough = {wanted, ingredients(EVERYTHING, "pyproject.toml")}
+    if stamp.is_file() and stamp.read_text() in enough:
         return
     uv = find_uv() or fetch_uv()
     python = str(venv / "bin" / "python")
@@ -127,21 +135,37 @@ def make(venv: Path, lock: str, *, project: bool) -> None:
 
     if not same_python(python):
         run("venv", "--quiet", "--clear", "--python", sys.executable, str(venv))
-    # Compiled once, here: without bytecode every process of the tests would compile MAVLink's dialect anew, in 100 MB.
-    run("pip", "sync", "--quiet", "--compile-bytecode", "--require-hashes", "--python", python, lock)
+    run("pip", "sync", "--quiet", "--require-hashes", "--python", python, lock)
     if project:
         run("pip", "install", "--quiet", "--no-deps", "--no-build-isolation", "--python", python, "--editable", ".")
+    if project:
+        for packages in venv.glob("lib/python*/site-packages"):
+            tidy(packages, python)
     stamp.write_text(wanted)
+
+
+def tidy(packages: Path, python: str) -> None:
+    """Remove what nothing reads, and compile the rest once: without bytecode each process of the tests would compile
+    MAVLink's dialect anew, in 100 MB."""
+    for path in sorted(packages.rglob("*")):
+        if UNREAD.search(path.relative_to(packages).as_posix()):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    compiling = [python, "-m", "compileall", "-qq", "-j", "0", "-x", UNCOMPILED, str(packages)]
+    subprocess.run(compiling, check=False)  # some packages bring files of other Pythons
 
 
 def main() -> None:
     match sys.argv[1:]:
         case []:
-            make(VENV, "requirements.lock", project=True)
+            make(VENV, LOCK, project=True)
+        case ["everything"]:
+            make(VENV, EVERYTHING, project=True)
         case [name] if name in APART:
             make(ROOT / f".venv-{name}", f"requirements-{name}.lock", project=False)
         case other:
-            raise SystemExit(f"there is no environment {' '.join(other)}: choose {' or '.join(APART)}, or none")
+            raise SystemExit(
+                f"there is no environment {' '.join(other)}: choose everything, {' or '.join(APART)}, or none"
+            )
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ def main() -> int:
 
 def run(path: Path, *, write: bool) -> str:
     """Run one notebook with this Python and the commands beside it. Returns what went wrong, or ""."""
-    notebook: Any = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]  # nbformat ships incomplete types
+    notebook: Any = nbformat.read(path, as_version=4)
     commands = Path(sys.executable).parent
     path_there = f"{commands}{os.pathsep}{os.environ['PATH']}"
     environment = {**os.environ, "PATH": path_there, "COLUMNS": "120", "MPLBACKEND": INLINE}
@@ -66,7 +66,7 @@ def run(path: Path, *, write: bool) -> str:
         except CellExecutionError as error:
             return f"a cell failed: {error}"
     if write:
-        nbformat.write(shrunk(notebook, folder), path)  # type: ignore[no-untyped-call]  # as above
+        nbformat.write(shrunk(notebook, folder), path)
     return ""
 
 

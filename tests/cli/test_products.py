@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -217,6 +219,40 @@ def test_every_form_is_written(field: str, kind: str, name: str, tmp_path: Path)
     assert any(tmp_path.iterdir())
 
 
+class Recording:
+    """Writes what is logged, as (name, kind), where Rerun's stream would write it."""
+
+    def __init__(self, application: str) -> None:
+        self.path, self.logged = Path(application), list[tuple[str, str]]()
+
+    def save(self, path: str) -> None:
+        self.path = Path(path)
+
+    def log(self, name: str, kind: str, *, static: bool) -> None:
+        assert static
+        self.logged.append((name, kind))
+
+    def flush(self) -> None:
+        self.path.write_text(json.dumps(self.logged))
+
+    def disconnect(self) -> None:
+        """There is no connection."""
+
+
+def test_a_rerun_recording_has_the_views_the_picture_and_the_depth(
+    field: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = {kind: lambda *_, kind=kind, **__: kind for kind in ("Image", "DepthImage", "Points3D")}
+    monkeypatch.setitem(sys.modules, "rerun", SimpleNamespace(RecordingStream=Recording, **kinds))
+    path = tmp_path / "a.rrd"
+    assert main(["export", field, "--as", "rerun", "--depth", "--focus", "inf", "-o", str(path)]) == 0
+    logged = dict(json.loads(path.read_text()))
+    assert logged["view/2/2"] == logged["picture"] == "Image"
+    assert logged["disparity"] == logged["sigma"] == "DepthImage"
+    assert logged["points"] == "Points3D"
+
+
+@pytest.mark.slow  # Rerun is not in the smaller environment
 def test_a_rerun_recording_is_written_and_can_be_read(field: str, tmp_path: Path) -> None:
     pytest.importorskip("rerun", reason="an extra")
     path = tmp_path / "a.rrd"

@@ -17,14 +17,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, Route, sync_playwright
 
 from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
@@ -32,6 +31,9 @@ from dappled.products import opened as opening
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFlight
 from tests.needs import without
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page, Route  # not in the smaller environment
 
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
@@ -106,6 +108,8 @@ def chromium() -> Iterator[Browser]:
     """Debian's Chromium without a window; skips where there is none."""
     if shutil.which(CHROMIUM) is None:
         without(f"no browser at {CHROMIUM}: apt install chromium, or set CHROMIUM")
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415  not in the smaller environment
+
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *GPU])
         yield browser
@@ -130,7 +134,7 @@ class Watched:
 
 def opened(browser: Browser, daemon: Daemon, viewport: dict[str, Any], *, log_in: bool = True, **more: Any) -> Watched:
     """The console in a browser profile of its own, until it has judged go or no-go."""
-    context = browser.new_context(viewport=viewport, **more)  # type: ignore[arg-type]  # a plain dict is its type
+    context = browser.new_context(viewport=viewport, **more)
     page = context.new_page()
     wrong: list[str] = []
     # A browser logs every refusal as an error: a 409 is an answer in words, which the page shows.
@@ -535,7 +539,7 @@ def test_without_webgl_the_vehicle_makes_the_picture(daemon: Daemon, chromium: B
     without += (
         "return kind === 'webgl2' ? null : of.call(this, kind, ...more); })(HTMLCanvasElement.prototype.getContext)"
     )
-    context = chromium.new_context(viewport=LAPTOP)  # type: ignore[arg-type]  # a plain dict is its type
+    context = chromium.new_context(viewport=LAPTOP)
     context.add_init_script(without)
     page = context.new_page()
     page.set_default_timeout(DEADLINE_MS)

@@ -11,9 +11,9 @@ import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-from playwright.sync_api import Browser, Page
 
 from tests.daemon.test_settings_check import calibration
 from tests.system.test_console import (
@@ -29,6 +29,9 @@ from tests.system.test_console import (
     until,
     until_flown,
 )
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 __all__ = ["chromium", "daemon", "leave"]  # fixtures
 
@@ -94,7 +97,7 @@ def page_of(browser: Browser, url: str, size: str, state: str = "") -> Page:
     """The page at a size, once it says go (with caution perhaps), or `state`."""
     width, height = SIZES[size]
     touch = {"is_mobile": True, "has_touch": True} if "phone" in size else {}
-    context = browser.new_context(viewport={"width": width, "height": height}, **touch)  # type: ignore[arg-type]  # a plain dict
+    context = browser.new_context(viewport={"width": width, "height": height}, **touch)
     page = context.new_page()
     page.set_default_timeout(45_000)
     page.goto(f"{url}#token={TOKEN}")
@@ -116,7 +119,7 @@ def requested(daemon: Daemon) -> int:
 
 
 def ticks(page: Page) -> int:
-    return page.locator('#checks svg:not([aria-label="unknown"])').count()
+    return int(page.locator('#checks svg:not([aria-label="unknown"])').count())
 
 
 def top_of_page(page: Page) -> float:

@@ -8,6 +8,7 @@ import importlib.util
 import io
 import platform
 import re
+import sys
 import tarfile
 import threading
 from collections.abc import Iterator
@@ -80,6 +81,29 @@ def test_what_the_environment_is_made_from_is_the_lock(bootstrap: ModuleType) ->
     assert len(whole) == 64
     assert whole == bootstrap.ingredients("requirements.lock", "pyproject.toml")
     assert whole != bootstrap.ingredients("requirements-peers.lock")
+
+
+def test_what_nothing_reads_is_removed_and_the_rest_compiled(bootstrap: ModuleType, tmp_path: Path) -> None:
+    packages = tmp_path / "site-packages"
+    kept = [
+        "a/b.py",
+        "tests.py",
+        *(f"pymavlink/dialects/v20/{name}.py" for name in ("__init__", "all", "ardupilotmega")),
+    ]
+    gone = ["a/b/tests/c.py", "tests/c.py", "pymavlink/dialects/v10/common.py"]
+    for name in (*kept, *gone):
+        (packages / name).parent.mkdir(parents=True, exist_ok=True)
+        (packages / name).write_text("")
+    bootstrap.tidy(packages, sys.executable)
+    assert sorted(str(one.relative_to(packages)) for one in packages.rglob("*.py")) == sorted(kept)
+    assert len(list(packages.rglob("*.pyc"))) == len(kept)
+
+
+def test_the_smaller_environment_is_part_of_the_whole_one(bootstrap: ModuleType) -> None:
+    def pinned(lock: str) -> set[str]:
+        return set(re.findall(r"^[\w.-]+==\S+", (bootstrap.ROOT / lock).read_text(encoding="utf-8"), re.MULTILINE))
+
+    assert pinned(bootstrap.LOCK) < pinned(bootstrap.EVERYTHING)
 
 
 def test_uv_is_one_version_by_its_hashes(bootstrap: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:

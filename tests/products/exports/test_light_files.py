@@ -10,7 +10,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import xarray
 import zarr
 
 from dappled.decode.lightfield.light_field import LightField
@@ -204,11 +203,13 @@ def test_a_file_that_lacks_an_array_is_told(tmp_path: Path, kind: str, monkeypat
         load(path)
 
 
+@pytest.mark.slow  # xarray is not in the smaller environment
 @pytest.mark.parametrize("colour", [False, True])
 def test_xarray_reads_the_axes_and_units(tmp_path: Path, colour: bool) -> None:
     path = tmp_path / "a.zarr"
     field = light_field(colour=colour)
     save(path, field)
+    xarray = pytest.importorskip("xarray")
     with xarray.open_zarr(path, consolidated=False, chunks=None) as found:
         assert found.views.dims == ("v", "u", "y", "x", "channel")[: field.views.ndim]
         assert found.slices.dims == ("slice", "y", "x")
@@ -226,10 +227,12 @@ def test_hdf5_has_the_axes_and_units_too(tmp_path: Path) -> None:
         assert found.attrs["focal_length_mm"] == 50.0
 
 
+@pytest.mark.slow  # as above
 def test_slices_of_another_size_have_axes_of_their_own(tmp_path: Path) -> None:
     field = replace(light_field(), slices=np.ones((3, 10, 20), dtype=np.complex64), carriers=np.zeros((3, 4)))
     path = tmp_path / "a.zarr"
     save(path, field)
+    xarray = pytest.importorskip("xarray")
     with xarray.open_zarr(path, consolidated=False, chunks=None) as found:
         assert dict(found.sizes) == {
             "slice": 3, "slice_y": 10, "slice_x": 20, "v": 3, "u": 3, "y": 4, "x": 6,
