@@ -45,14 +45,14 @@ def away_m(here: Pose, there: Pose) -> float:
     )
 
 
-def changed(log: Path, name: str, at: int, place: int, value: float) -> Path:
-    """The log with one other value: of the message `name` number `at`."""
+def changed(log: Path, name: str, at: int, place: int, value: float, *, in_a_row: int = 1) -> Path:
+    """The log with other values: of the messages `name` from number `at` on."""
     seen = 0
 
     def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
         nonlocal seen
         if kind == name and not (kind == "XKF1" and row[1]):
-            if seen == at:
+            if at <= seen < at + in_a_row:
                 row = (*row[:place], value, *row[place + 1 :])
             seen += 1
         return [(kind, row)]
@@ -83,6 +83,30 @@ def test_one_bad_value_is_missing_at_its_time_and_counted(
         assert here.attitude is not None
         assert there.attitude is not None
         assert turn_rad(here.attitude, there.attitude) < 0.02
+
+
+@pytest.mark.parametrize("in_a_row", [2, 3])
+@pytest.mark.parametrize("at", [0, 13, 25])
+@pytest.mark.parametrize(
+    ("name", "place", "value"),
+    [
+        ("XKF1", 3, -150.0), ("XKF1", 2, 290.0), ("XKF1", 2, NAN), ("POS", 1, 416_500_000), ("POS", 2, 0),
+        ("POS", 2, -1_799_000_000), ("POS", 3, 9e4), ("POS", 4, -5e3), ("ATT", 2, 179.0), ("ATT", 6, NAN),
+    ],
+)  # fmt: skip
+def test_bad_values_in_a_row_are_missing_ones(
+    tmp_path: Path, name: str, place: int, value: float, at: int, *, in_a_row: int
+) -> None:
+    log, _ = written(tmp_path)
+    good = poses(log)
+    told = found_in(changed(log, name, at, place, value, in_a_row=in_a_row))
+    assert [(one.code, one.level) for one in told] == [(Code.LOG_VALUES_MISSING, Level.NOTE)]
+    assert text(told[0]).endswith(f"{in_a_row} of {name}")
+    for here, there in zip(poses(log), good, strict=True):
+        assert away_m(here, there) < 0.5
+        assert here.attitude is not None
+        assert there.attitude is not None
+        assert turn_rad(here.attitude, there.attitude) < 0.1
 
 
 @pytest.mark.parametrize("name", ["POS", "XKF1", "ATT", "GPS", "GPA"])

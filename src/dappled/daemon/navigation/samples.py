@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 
 from dappled.decode.geometry import Gnss, Quaternion, Vector3, from_euler, normalised
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.drivers.mavlink.limits import FASTEST_M_S, HIGHEST_M
+from dappled.drivers.mavlink.sample_judge import FASTEST_M_S, HIGHEST_M
 
 HALF_MS_NS = 500_000  # time_boot_ms is cut to whole milliseconds: the middle is used
 GIMBAL_COMPONENTS = frozenset({1, 154, 171, 172, 173, 174, 175})  # an autopilot reports for a gimbal without MAVLink

@@ -9,7 +9,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.autopilot_utc import AutopilotUtc
@@ -42,6 +42,16 @@ from dappled.daemon.navigation.samples import (
 )
 from dappled.decode.geometry import norm
 from dappled.drivers.mavlink import MavlinkMessage
+from dappled.drivers.mavlink.sample_judge import (
+    OF_ATTITUDES,
+    OF_PLACES,
+    OF_VELOCITIES,
+    Motion,
+    Track,
+    Tracks,
+    point_m,
+    turned,
+)
 
 POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
 TIMESYNC_WINDOW_NS, ARRIVAL_WINDOW_NS = 120 * 10**9, 60 * 10**9
@@ -276,6 +286,38 @@ class Gimbals:
         prune(self._samples, before_ns)
 
 
+M = TypeVar("M", PositionSample, AttitudeSample)
+
+
+class Steady(Generic[M]):
+    """Holds back samples that leave those before them faster than any vehicle, until their track is certain.
+
+    They count from the packet that makes it so: a pose depends on the packets below its limit alone.
+    """
+
+    def __init__(self, counts: Counts, *motions: Motion) -> None:
+        self._counts, self._motions = counts, motions
+        self._tracks, self._first = Tracks(*motions), -1
+        self._begun: Track | None = None
+        self._held: dict[Track, list[M]] = {}
+
+    def take(self, sample: M, values: Sequence[Sequence[float]], first: int) -> list[M]:
+        """The samples that count now, in order. `first` is the first packet of this epoch of the autopilot's clock."""
+        if first != self._first:
+            self._tracks, self._first, self._begun, self._held = Tracks(*self._motions), first, None, {}
+        track = self._tracks.of(sample.boot_ns / 1e9, values)
+        self._begun = self._begun or track
+        if not (track is self._begun or track.certain):
+            self._held.setdefault(track, []).append(sample)
+            self._counts.refuse(sample.stamp_ns)
+            return []
+        held: list[M] = self._held.pop(track, [])
+        self._counts.impossible -= len(held)
+        self._held = {other: row for other, row in self._held.items() if other.last_s >= track.since_s}
+        held.append(sample)
+        return [replace(one, number=sample.number) for one in held]
+
+
 class VehicleHistory:
     """Samples of position, attitude, receiver, gimbal and hot shoe of one vehicle.
 
@@ -303,6 +345,8 @@ class VehicleHistory:
         self._feedbacks: list[Feedback] = []
         self._histories: tuple[list[Any], ...] = (self._positions, self._jumps, self._attitudes, self._receiver,
                                                   self._second, self._ground, self._feedbacks)  # fmt: skip
+        self._steady_positions = Steady[PositionSample](counts, OF_PLACES, OF_VELOCITIES)
+        self._steady_attitudes = Steady[AttitudeSample](counts, OF_ATTITUDES)
         self._attitude_sigma: tuple[float | None, int] = (None, 0)  # as the autopilot told it, and when
 
     def feed(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
@@ -365,10 +409,15 @@ class VehicleHistory:
 
     def _position(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         sample = None if self._refuses(stamp_ns, message) else telemetry_samples.position(number, stamp_ns, message)
-        if sample is not None and self._believed(sample, message, self._positions):
-            self.counts.positions += 1
-            keep(self._positions, sample)
-            jump = self._finder.jump(sample, self.time.first(number + 1))
+        if sample is None or not self._believed(sample, message, self._positions):
+            return
+        self.counts.positions += 1
+        first = self.time.first(number + 1)
+        for one in self._steady_positions.take(sample, _moving(sample), first):
+            if not _rises(self._positions, one, first):
+                continue
+            keep(self._positions, one)
+            jump = self._finder.jump(one, first)
             if jump is not None:
                 self.counts.jumped(stamp_ns, norm(jump.by_m))
                 keep(self._jumps, jump)
@@ -380,9 +429,13 @@ class VehicleHistory:
         told_rad, told_ns = self._attitude_sigma
         if sample is not None and sample.sigma_rad is None and stamp_ns - told_ns <= _ALIVE_NS:
             sample = replace(sample, sigma_rad=told_rad)
-        if sample is not None and self._believed(sample, message, self._attitudes):
-            self.counts.attitudes += 1
-            keep(self._attitudes, sample)
+        if sample is None or not self._believed(sample, message, self._attitudes):
+            return
+        self.counts.attitudes += 1
+        first, matrix = self.time.first(number + 1), turned(*sample.attitude)
+        for one in self._steady_attitudes.take(sample, (matrix,), first):
+            if _rises(self._attitudes, one, first):
+                keep(self._attitudes, one)
 
     def _odometry(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
@@ -457,6 +510,17 @@ class VehicleHistory:
             self.counts.out_of_order += sample.boot_ns < before_ns
             return sample.boot_ns > before_ns
         return True
+
+
+def _moving(sample: PositionSample) -> tuple[Sequence[float], Sequence[float]]:
+    """What of a position has to be steady: its place with the height above home (m), and its velocity (m/s)."""
+    point = point_m(sample.latitude_rad, sample.longitude_rad, sample.altitude_msl_m)
+    return (*point, sample.height_above_home_m), sample.velocity_ned_m_s
+
+
+def _rises(history: Sequence[Sample], sample: Sample, first: int) -> bool:
+    """Whether a sample is later than the last one of its epoch."""
+    return not history or history[-1].number < first or sample.boot_ns > history[-1].boot_ns
 
 
 def _fixed(sample: GnssSample) -> bool:

@@ -36,6 +36,7 @@ _GPS_EPOCH_US = 315_964_800 * 10**6
 _WEEK_US = 7 * 86400 * 10**6
 _MOST_WEEKS = 2**16
 _CORES_AGREE_M_S = 0.5
+_METRES_PER_DEG = 111_195.0
 
 
 class DataFlashError(AutopilotLogError):
@@ -245,10 +246,10 @@ def _off_m_s(places: LoggedPlaces, moving: list[Any]) -> float:
     if not good.any():
         return math.inf
     middle = places.boots_us[:-1] + np.diff(places.boots_us) // 2
-    per_deg = 111_320.0
     with np.errstate(divide="ignore", invalid="ignore"):
-        moved_n = np.diff(places.lat) * per_deg / span_s
-        moved_e = np.diff(places.lon) * per_deg * np.cos(np.radians(places.lat[:-1])) / span_s
+        moved_n = np.diff(places.lat) * _METRES_PER_DEG / span_s
+        turned_deg = np.remainder(np.diff(places.lon) + 180, 360) - 180
+        moved_e = turned_deg * _METRES_PER_DEG * np.cos(np.radians(places.lat[:-1])) / span_s
     off = np.hypot(
         moved_n - np.interp(middle, times[good], north[good]), moved_e - np.interp(middle, times[good], east[good])
     )

@@ -14,8 +14,17 @@ from numpy.typing import NDArray
 from dappled.clock import TimeOfDayClock
 from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import log_packets
-from dappled.drivers.mavlink.limits import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
+from dappled.drivers.mavlink.sample_judge import (
+    FASTEST_M_S,
+    HIGHEST_M,
+    OF_ATTITUDES,
+    OF_PLACES,
+    OF_VELOCITIES,
+    point_m,
+    steady,
+    turned,
+)
 from dappled.drivers.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
 from dappled.findings import Code, Finding, Subject, finding
 
@@ -23,9 +32,6 @@ BOOT_MAX_US = 2**32 * 1000  # MAVLink's milliseconds since boot
 _HIGHEST_DOP = 600.0
 _EXTRAPOLATED = 8  # of PX4; MAVLink's 8 is another
 _GAP_US = 1_000_000  # a velocity further away is not that of a position
-_MOST_M_S2, _STEP_M_S = 200.0, 5.0
-_STEP_M = 50.0
-_METRES_PER_DEG = 111_320.0
 _DAY_US = 86400 * 10**6
 Chosen = NDArray[np.bool_]
 
@@ -124,21 +130,6 @@ def placed(lat: Floats, lon: Floats, alt: Floats) -> Chosen:
     return np.asarray((np.abs(lat) <= 90) & (np.abs(lon) <= 180) & (np.abs(alt) < HIGHEST_M))
 
 
-def _spikes(times_us: NDArray[np.int64], values: Floats, per_s: float, floor: float) -> Chosen:
-    """Which of the values (k, n) leave both neighbours by more than `per_s` explains, while these agree (n,)."""
-    found = np.zeros(len(times_us), dtype=bool)
-    if len(times_us) > 2:
-        before, after = np.diff(times_us)[:-1] / 1e6, np.diff(times_us)[1:] / 1e6
-        steps = np.linalg.norm(np.diff(values, axis=1), axis=0)
-        across = np.linalg.norm(values[:, 2:] - values[:, :-2], axis=0)
-        found[1:-1] = (
-            (steps[:-1] > floor + per_s * before)
-            & (steps[1:] > floor + per_s * after)
-            & (across <= floor + per_s * (before + after))
-        )
-    return found
-
-
 def positions(
     places: LoggedPlaces, message: str, times_us: NDArray[np.int64], velocities: Floats, missing: Missing
 ) -> Iterator[Timed]:
@@ -146,15 +137,15 @@ def positions(
     good = missing.count(message, in_time(times_us) & (np.abs(velocities) < FASTEST_M_S).all(axis=0))
     order = np.argsort(times_us[good], kind="stable")
     times_us, velocities = times_us[good][order], velocities[:, good][:, order]
-    sound = missing.count(message, ~_spikes(times_us, velocities, _MOST_M_S2, _STEP_M_S))
+    sound = missing.count(message, steady(times_us, velocities, OF_VELOCITIES))
     times_us, velocities = times_us[sound], velocities[:, sound]
     at = places.boots_us
     here = placed(places.lat, places.lon, places.alt) & (np.abs(places.above) < HIGHEST_M)
     rows = np.flatnonzero(missing.count(places.message, in_time(at) & here))
     rows = rows[np.argsort(at[rows], kind="stable")]
-    metres = np.stack([places.lat * _METRES_PER_DEG, places.lon * _METRES_PER_DEG, places.alt])[:, rows]
-    metres[1] *= np.cos(np.radians(places.lat[rows]))
-    rows = rows[missing.count(places.message, ~_spikes(at[rows], metres, FASTEST_M_S, _STEP_M))]
+    here_m = np.stack(point_m(np.radians(places.lat[rows]), np.radians(places.lon[rows]), places.alt[rows]))
+    here_m = np.vstack([here_m, places.above[rows]])
+    rows = rows[missing.count(places.message, steady(at[rows], here_m, OF_PLACES))]
     if not times_us.size:
         return
     after = np.clip(np.searchsorted(times_us, at[rows]), 0, len(times_us) - 1)
@@ -165,11 +156,14 @@ def positions(
         yield log_packets.position(int(at[n]), place, float(places.above[n]), (north, east, down))
 
 
-def attitudes(message: str, boots_us: NDArray[np.int64], turned: Floats, missing: Missing) -> Iterator[Timed]:
+def attitudes(message: str, boots_us: NDArray[np.int64], attitude: Floats, missing: Missing) -> Iterator[Timed]:
     """The attitudes of quaternions (n, 4)."""
-    length = np.linalg.norm(turned, axis=1)
-    for n in np.flatnonzero(missing.count(message, in_time(boots_us) & (length > 0.5) & (length < 2.0))):
-        w, x, y, z = turned[n].tolist()
+    length = np.linalg.norm(attitude, axis=1)
+    rows = np.flatnonzero(missing.count(message, in_time(boots_us) & (length > 0.5) & (length < 2.0)))
+    rows = rows[np.argsort(boots_us[rows], kind="stable")]
+    matrices = np.stack(turned(*(attitude[rows] / length[rows, None]).T))
+    for n in rows[missing.count(message, steady(boots_us[rows], matrices, OF_ATTITUDES))]:
+        w, x, y, z = attitude[n].tolist()
         yield log_packets.attitude(int(boots_us[n]), (w, x, y, z))
 
 

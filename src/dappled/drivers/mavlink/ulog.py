@@ -19,7 +19,6 @@ import numpy as np
 from dappled.decode.array_types import Floats
 from dappled.drivers import reader_process
 from dappled.drivers.mavlink import log_evidence, log_packets
-from dappled.drivers.mavlink.limits import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.mavlink.log_evidence import (
     BOOT_MAX_US,
     Chosen,
@@ -28,6 +27,7 @@ from dappled.drivers.mavlink.log_evidence import (
     Receiver,
 )
 from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
+from dappled.drivers.mavlink.sample_judge import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import UtcBounds
 from dappled.errors import first_line, install_extra
