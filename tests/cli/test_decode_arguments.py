@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from dappled.cli import VERBS, completion, decode_arguments, main
+from dappled.cli import VERBS, decode_arguments, main
 from dappled.cli.arguments import refuse_existing
-from dappled.cli.command_line import parser
+from dappled.cli.command_line import options, parser
 from dappled.cli.verb import OutputExistsError
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
@@ -113,9 +113,9 @@ def test_a_flights_frames_are_decoded_by_its_own_recipe(tmp_path: Path) -> None:
 
 @pytest.mark.slow  # it loads every verb
 def test_every_verb_with_a_named_output_can_be_told_to_replace_it() -> None:
-    missing = set()
-    for verb in VERBS:
-        for words, options in completion.words(verb, completion.below(parser(verb))[verb]).items():
-            if {"--output", "--picture", "--index"} & set(options) and "--overwrite" not in options:
-                missing.add(words.replace("/", " "))
+    missing = {
+        path
+        for path in VERBS
+        if {"--output", "--picture", "--index"} & set(given := options(path)) and "--overwrite" not in given
+    }
     assert missing - FOLDERS == set()

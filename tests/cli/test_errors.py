@@ -54,12 +54,11 @@ def test_every_error_for_a_person_is_of_the_family() -> None:
 
 def ended(monkeypatch: pytest.MonkeyPatch, error: BaseException, *flags: str) -> int:
     """The exit code of `dappled profiles` when it meets the error."""
-    from dappled.cli import config  # noqa: PLC0415  # patched here
 
-    def run(_: object) -> int:
+    def run(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(config, "run", run)
+    monkeypatch.setattr("dappled.cli.config.ListProfiles.run", run)
     return cli.main([*flags, "profiles"])
 
 
@@ -101,12 +100,10 @@ def test_debug_shows_where_it_came_from(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_with_json_an_error_is_json_too(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
-    from dappled.cli import config  # noqa: PLC0415  # patched here
-
-    def run(_: object) -> int:
+    def run(*_: object) -> None:
         raise DappledError("the disk is full; free some space")
 
-    monkeypatch.setattr(config, "run", run)
+    monkeypatch.setattr("dappled.cli.config.ListProfiles.run", run)
     assert cli.main(["profiles", "--json"]) == 1
     out, err = capfd.readouterr()
     assert json.loads(out) == {"error": "the disk is full; free some space"}

@@ -20,9 +20,9 @@ def proposed(found: list[UsbBody], serial: list[str]) -> dict[str, str]:
 
 
 def test_what_is_plugged_in_is_proposed() -> None:
-    assert proposed([CANON_450D], ["/dev/ttyACM0,115200"])["--body"] == "canon-eos-450d"
-    assert proposed([S5200], [])["--body"] == ""  # any body of that make may be one: a person says
-    assert proposed([], [])["--body"] == "auto"
+    assert proposed([CANON_450D], ["/dev/ttyACM0,115200"])["--camera"] == "canon-eos-450d"
+    assert proposed([S5200], [])["--camera"] == ""  # any body of that make may be one: a person says
+    assert proposed([], [])["--camera"] == "auto"
     assert proposed([], ["/dev/ttyACM0,115200"])["--link"] == "/dev/ttyACM0,115200"
     assert proposed([], [])["--link"].startswith("udpin:")
     assert proposed([], [])["--folder"] == "~/flights"  # of who runs the daemon, which is not who runs this
@@ -39,7 +39,7 @@ def test_serial_devices_come_with_a_speed(tmp_path: Path) -> None:
 
 def test_an_empty_answer_takes_what_is_proposed_and_is_asked_again_without(capsys: pytest.CaptureFixture[str]) -> None:
     answers = iter(["", " ", "mask-2"])
-    assert init.ask(init.Question("--body", "which body", "auto"), lambda _: next(answers)) == "auto"
+    assert init.ask(init.Question("--camera", "which body", "auto"), lambda _: next(answers)) == "auto"
     assert init.ask(init.Question("--mask", "which mask", "", ["mask-2"]), lambda _: next(answers)) == "mask-2"
     assert "which body [auto]" in capsys.readouterr().err
 
@@ -51,7 +51,7 @@ def alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(init, "serial_devices", list)
 
 
-FLAGS = ["--body", "canon-eos-450d", "--mask", "mask-2", "--link", "/dev/ttyAMA0,921600"]
+FLAGS = ["--camera", "canon-eos-450d", "--mask", "mask-2", "--link", "/dev/ttyAMA0,921600"]
 
 
 @pytest.mark.usefixtures("alone")
@@ -75,7 +75,7 @@ def test_the_file_is_written_and_passes_config_check(tmp_path: Path, capsys: pyt
 @pytest.mark.usefixtures("alone")
 @pytest.mark.parametrize(
     ("flag", "value", "words"),
-    [("--mask", "mask-9", "mask-9"), ("--body", "canon-eos-9", "canon-eos-9"), ("--link", "what:ever", "what")],
+    [("--mask", "mask-9", "mask-9"), ("--camera", "canon-eos-9", "canon-eos-9"), ("--link", "what:ever", "what")],
 )
 def test_what_config_check_refuses_is_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], flag: str, value: str, words: str
@@ -114,7 +114,7 @@ def test_a_body_that_usb_can_t_fire_gets_its_driver_and_needs_a_shutter(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "x.toml"
-    words = ["init", str(file), "--body", "fujifilm-s5200", "--mask", "mask-2", "--link", "none"]
+    words = ["init", str(file), "--camera", "fujifilm-s5200", "--mask", "mask-2", "--link", "none"]
     assert main([*words, "--json"]) == 1
     assert "give --shutter" in capsys.readouterr().err
     assert main([*words, "--shutter", "autopilot", "--json"]) == 0

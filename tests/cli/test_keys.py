@@ -36,7 +36,7 @@ def test_a_token_is_made_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 def test_watch_wants_both_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["watch", "tcp://127.0.0.1:1", "--keys", str(tmp_path / "a")]) == 1
+    assert main(["watch", "tcp://127.0.0.1:1", "--keys", str(tmp_path / "a")]) == 2
     assert "go together" in capsys.readouterr().err
 
 

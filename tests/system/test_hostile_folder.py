@@ -126,7 +126,7 @@ def test_the_installed_command_takes_none_either(
 @pytest.mark.parametrize("verb", VERBS)
 def test_no_verb_takes_a_module_from_the_current_folder(hostile: HostileFolder, verb: str) -> None:
     with contextlib.suppress(subprocess.TimeoutExpired):  # `run` and `open` go on
-        hostile.call(COMMAND, verb, timeout_s=6)
+        hostile.call(COMMAND, *verb.split(), timeout_s=6)
     assert hostile.ran == ""
 
 

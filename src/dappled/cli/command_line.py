@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
 from types import NoneType, UnionType
-from typing import Any, NoReturn, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import dappled
 from dappled.cli.table import GROUPS, VERBS
@@ -133,6 +133,21 @@ def parser(path: str = "") -> CommandParser:
     return top
 
 
+def options(path: str) -> list[str]:
+    """What may come after a verb: its long options, actions, and the choices of its arguments."""
+    (leaf,) = _leaves(parser(path), path.split())
+    names = [name for action in leaf._actions for name in action.option_strings if name.startswith("--")]
+    return [*names, *(str(one) for action in leaf._actions for one in action.choices or ())]
+
+
+def _leaves(one: argparse.ArgumentParser, words: Sequence[str]) -> list[argparse.ArgumentParser]:
+    """The parser of a verb below another parser."""
+    if not words:
+        return [one]
+    below = [action.choices for action in one._actions if isinstance(action, argparse._SubParsersAction)]
+    return [leaf for choices in below for leaf in _leaves(choices[words[0]], words[1:])]
+
+
 def _described(line: str) -> dict[str, Any]:
     end = "" if line.endswith("?") else "."
     raw = argparse.RawDescriptionHelpFormatter
@@ -166,7 +181,7 @@ def _fill(one: CommandParser, made: type[Verb]) -> None:
 
 def _add(home: Any, spec: Field[Any], form: Argument, hint: Any) -> None:
     inner = [one for one in get_args(hint) if one is not NoneType] if get_origin(hint) in (Union, UnionType) else [hint]
-    kind, rule = inner[0], form.rule
+    kind, rule = str if get_origin(inner[0]) is Literal else inner[0], form.rule
     given: dict[str, Any] = {"help": _help(spec, form).replace("%", "%%")}
     default = None if spec.default is MISSING else spec.default
     if kind is bool:

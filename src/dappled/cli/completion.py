@@ -1,12 +1,13 @@
-"""`dappled completion`: print a completion script for bash, zsh or fish, made from the parsers of all verbs."""
+"""`dappled completion`: print a completion script for bash, zsh or fish, made from the arguments of all verbs."""
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
+from dataclasses import dataclass
 
-from dappled.cli.command_line import parser
+from dappled.cli.command_line import options
 from dappled.cli.table import VERBS
+from dappled.cli.verb import Output, Report, Verb, argument
 
 Words = Mapping[str, list[str]]  # by the words before it ("", "mask", "mask make"): what may come next
 
@@ -36,46 +37,35 @@ _WHERE = {
 }
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    lines = "\n".join(f"  {shell:5} {where}" for shell, where in _WHERE.items())
-    parser.epilog = f"example: dappled completion bash > {_WHERE['bash']}\n\nwhere it goes:\n{lines}"
-    parser.add_argument("shell", choices=tuple(_WHERE), help="the shell")
+@dataclass(frozen=True, kw_only=True)
+class PrintCompletion(Verb):
+    """Print a completion script."""
+
+    examples = (f"dappled completion bash > {_WHERE['bash']}",)
+    notes = "where it goes:\n" + "\n".join(f"  {shell:5} {where}" for shell, where in _WHERE.items())
+
+    shell: str = argument("SHELL", f"the shell: {', '.join(_WHERE)}", choices=tuple(_WHERE))
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        script = _fish(words()) if self.shell == "fish" else (_ZSH if self.shell == "zsh" else "") + _bash(words())
+        return Report({"shell": self.shell, "script": script}, script.splitlines())
 
 
-def run(arguments: argparse.Namespace) -> int:
-    found: dict[str, list[str]] = {"": [*VERBS, "--help", "--version", "--debug"]}
-    for verb in VERBS:
-        found |= words(verb, below(parser(verb))[verb])
-    print(
-        _fish(found) if arguments.shell == "fish" else (_ZSH if arguments.shell == "zsh" else "") + _bash(found), end=""
-    )
-    return 0
+CLASSES = {"completion": PrintCompletion}
 
 
-def words(path: str, parser: argparse.ArgumentParser) -> dict[str, list[str]]:
-    """What may come after `path` and after each action below it: actions, options, and the choices of arguments."""
-    options = [name for action in parser._actions for name in action.option_strings if name.startswith("--")]
-    choices = [
-        str(choice)
-        for action in parser._actions
-        if action.choices and not isinstance(action, argparse._SubParsersAction)
-        for choice in action.choices
-    ]
-    actions = below(parser)
-    found = {path: [*actions, *options, *choices]}
-    for name, one in actions.items():
-        found |= words(f"{path}/{name}", one)
-    return found
-
-
-def below(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
-    """The parsers of the actions of a parser, by name."""
-    return {
-        name: one
-        for action in parser._actions
-        if isinstance(action, argparse._SubParsersAction)
-        for name, one in action.choices.items()
+def words() -> dict[str, list[str]]:
+    """What may come after each path of words: verbs, actions, options, and the choices of arguments."""
+    found: dict[str, list[str]] = {
+        "": [*dict.fromkeys(path.split()[0] for path in VERBS), "--help", "--version", "--debug"]
     }
+    for path in VERBS:
+        group, _, action = path.rpartition(" ")
+        if group:
+            found.setdefault(group, ["--help"]).append(action)
+        found[path.replace(" ", "/")] = options(path)
+    return found
 
 
 def _bash(found: Words) -> str:
@@ -92,4 +82,4 @@ def _fish(found: Words) -> str:
         for name in names:
             kind = f"-l {name[2:]}" if name.startswith("--") else f"-a {name}"
             lines.append(f"complete -c dappled -n '{'; and '.join(inside)}' {kind}")
-    return "\n".join(lines) + "\n"
+    return "\n".join(lines)

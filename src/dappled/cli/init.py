@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,9 +11,9 @@ from typing import Any
 import tomli_w
 
 from dappled import durable
-from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, of_setting, option
 from dappled.config import profiles, settings
-from dappled.config.settings import RecordSettings
+from dappled.config.settings import CameraSettings, RecordSettings
 from dappled.daemon import settings_check
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import UsbBody
@@ -44,49 +42,54 @@ class Question:
     choices: Sequence[str] = ()
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled init dappled.toml\n"
-        "  dappled init dappled.toml --body canon-eos-450d --mask mask-2 --link /dev/ttyAMA0,921600 --folder ~/flights"
+@dataclass(frozen=True, kw_only=True)
+class InitSettings(Overwriting, Verb):
+    """Write a settings file."""
+
+    examples = (
+        "dappled init dappled.toml",
+        "dappled init dappled.toml --camera canon-eos-450d --mask mask-2 --link /dev/ttyAMA0,921600 --folder ~/flights",
     )
-    parser.add_argument(
-        "file", type=Path, nargs="?", default=Path("dappled.toml"), metavar="FILE",
-        help="settings file to write (default: dappled.toml)",
-    )  # fmt: skip
-    parser.add_argument("--body", metavar="P", help="camera profile or TOML file, or auto: the one that fits the body")
-    parser.add_argument("--shutter", metavar="LINE", help="Fujifilm: what fires it (camera.shutter)")
-    parser.add_argument("--mask", metavar="P", help="mask profile or TOML file, or none")
-    parser.add_argument("--link", metavar="URL", help="the autopilot's link, such as /dev/ttyAMA0,921600, or none")
-    parser.add_argument("--folder", metavar="DIR", help="folder for flights")
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON; asks nothing")
+
+    file: Path = argument("FILE", "settings file to write (default: dappled.toml)", default=Path("dappled.toml"))
+    camera: str | None = option("--camera", rule=of_setting(CameraSettings, "profile"), default=None)
+    shutter: str | None = option("--shutter", rule=of_setting(CameraSettings, "shutter"), default=None, metavar="LINE")
+    mask: str | None = option("--mask", help="mask profile or TOML file, or none", default=None)
+    link: str | None = option(
+        "--link", help="the autopilot's link, such as /dev/ttyAMA0,921600, or none", default=None, metavar="URL"
+    )
+    folder: str | None = option("--folder", rule=of_setting(RecordSettings, "directory"), default=None, metavar="DIR")
+
+    def check(self) -> None:
+        """See Verb."""
+        self.refuse_existing(self.file)
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        asks = sys.stdin.isatty() and sys.stderr.isatty() and not self.json
+        given = {"--camera": self.camera, "--shutter": self.shutter, "--mask": self.mask}
+        given |= {"--link": self.link, "--folder": self.folder}
+        found = bodies()
+        if asks:
+            output.remark(f"on the bus: {', '.join(_named(body) for body in found) or 'no camera'}")
+        answers: dict[str, str] = {}
+        for question in questions(found, serial_devices()):
+            if question.flag == "--shutter" and not answers["--camera"].startswith(WIRED):
+                continue
+            answer = given[question.flag]
+            if answer is None:
+                answer = ask(question, input) if asks else question.proposed
+            if not answer:
+                raise InitError(f"nobody is there to ask: give {question.flag} ({question.words})")
+            answers[question.flag] = answer
+        text = settings_text(answers)
+        write(self.file, text)
+        if not self.json:
+            output.remark(f"{self.file}: good; next: dappled doctor --config {self.file}")
+        return Report({"file": str(self.file), "settings": tables(answers)}, text.splitlines())
 
 
-def run(arguments: argparse.Namespace) -> int:
-    refuse_existing(arguments, arguments.file)
-    asks = sys.stdin.isatty() and sys.stderr.isatty() and not arguments.json
-    given = {f"--{name}": getattr(arguments, name) for name in ("body", "shutter", "mask", "link", "folder")}
-    found = bodies()
-    if asks:
-        print(f"on the bus: {', '.join(_named(body) for body in found) or 'no camera'}", file=sys.stderr)
-    answers: dict[str, str] = {}
-    for question in questions(found, serial_devices()):
-        if question.flag == "--shutter" and not answers["--body"].startswith(WIRED):
-            continue
-        answer = given[question.flag]
-        if answer is None:
-            answer = ask(question, input) if asks else question.proposed
-        if not answer:
-            raise InitError(f"nobody is there to ask: give {question.flag} ({question.words})")
-        answers[question.flag] = answer
-    text = settings_text(answers)
-    write(arguments.file, text)
-    if arguments.json:
-        print(json.dumps({"file": str(arguments.file), "settings": tables(answers)}))
-    else:
-        print(text, end="")
-        print(f"{arguments.file}: good; next: dappled doctor --config {arguments.file}", file=sys.stderr)
-    return 0
+CLASSES = {"init": InitSettings}
 
 
 def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]:
@@ -97,7 +100,7 @@ def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]
     body = fits[0] if fits else "" if strange else ANY
     link = serial[0] if serial else _DEFAULT_LINK
     return [
-        Question("--body", "which camera body", body, [ANY, *cameras]),
+        Question("--camera", "which camera body", body, [ANY, *cameras]),
         Question("--shutter", "how its shutter is fired: USB can't", "", ["outside", "autopilot"]),
         Question("--mask", "which mask is in it", "", [NONE, *masks]),
         Question("--link", "where the autopilot is", link, [*serial, _DEFAULT_LINK, NONE]),
@@ -124,7 +127,7 @@ def ask(question: Question, answer: Callable[[str], str]) -> str:
 
 def tables(answers: dict[str, str]) -> dict[str, dict[str, Any]]:
     """The settings file's tables. Only what differs from the built-in settings stands in it."""
-    body, mask, link = answers["--body"], answers["--mask"], answers["--link"]
+    body, mask, link = answers["--camera"], answers["--mask"], answers["--link"]
     found: dict[str, dict[str, Any]] = {}
     if body != ANY:
         found["camera"] = {"profile": body}

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 # What actions belong to, and its line in --help.
-GROUPS: dict[str, str] = {}
+GROUPS: dict[str, str] = {
+    "keys": "make keys for subscribers on the network, and the console's token",
+    "mavlink": "make keys for signed MAVLink links",
+    "mask": "the printed mask: make, table, diffraction, design, and plan a flight with it",
+    "config": "check or show settings",
+}
 
 # Words of a verb: (module below `dappled.cli`, whose CLASSES has the verb's class under these words, and its line).
 VERBS: dict[str, tuple[str, str]] = {
@@ -13,9 +18,12 @@ VERBS: dict[str, tuple[str, str]] = {
     "status": ("status", "show the state of the running daemon"),
     "open": ("open", "look at a recorded flight or a light field in the browser"),
     "watch": ("watch", "subscribe to the stream: show and save what arrives"),
-    "keys": ("keys", "make keys for subscribers on the network, and the console's token"),
+    "keys make": ("keys", "make a pair: NAME.key to give away, NAME.key_secret to keep"),
+    "keys show": ("keys", "show the public key in a file"),
+    "keys token": ("keys", "make a token for the console"),
+    "keys seal": ("keys", "make a key that signs the seals of flights"),
     "trigger": ("trigger", "ask for frames over MAVLink, as a ground station does"),
-    "mavlink": ("keys", "make keys for signed MAVLink links"),
+    "mavlink key": ("keys", "make a key file for a signed link (see mavlink.keys)"),
     "decode": ("decode", "decode frames to light fields"),
     "picture": ("picture", "make photographs without the mask's shadow, at the sensor's own resolution"),
     "carriers": ("carriers", "show the predicted and the measured carriers of a frame"),
@@ -24,14 +32,23 @@ VERBS: dict[str, tuple[str, str]] = {
     "refocus": ("refocus", "refocus a light field: by α, disparity or metres, on a plane, as a stereo pair"),
     "depth": ("depth", "measure disparities and distances with their uncertainty; write point clouds"),
     "export": ("export", "write light fields for other tools: hci, eslf, mat, quilt, h5 …"),
-    "mask": ("mask", "the printed mask: make, table, diffraction, design, and plan a flight with it"),
+    "mask make": ("mask.make", "write the image that goes on film, or a step wedge"),
+    "mask table": ("mask.table", "print where the carriers are over focal lengths (Tables 11 and 14)"),
+    "mask diffraction": ("mask.diffraction", "predict a laser's spots, and judge a print by the measured ones"),
+    "mask design": ("mask.design", "design mask, distance and film for an altitude"),
+    "mask plan": ("mask.plan", "plan a flight: interval, motion blur, frame rate and disk space"),
+    "mask kit": (
+        "mask.kit",
+        "write what to print and shoot to settle a camera's carrier law: masks, wedge, target, shot list",
+    ),
     "plan": ("mask.plan", "plan a flight: interval, motion blur, frame rate and disk space"),
     "flight": ("flight", "recorded flights: list, show, check, report, coverage, offload, pickup"),
     "geotag": ("geotag", "write positions and attitudes for other programs: XMP, geo.txt, CSV, GeoJSON"),
     "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
     "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),
     "hand-over": ("hand_over", "give pictures to OpenDroneMap (NodeODM), and fetch the model"),
-    "config": ("config", "check or show settings"),
+    "config check": ("config", "check a settings file"),
+    "config show": ("config", "show every setting with its value, unit and meaning"),
     "init": ("init", "write a settings file: finds what is plugged in, and asks"),
     "completion": ("completion", "print a completion script for bash, zsh or fish"),
     "profiles": ("config", "list the shipped camera and mask profiles"),

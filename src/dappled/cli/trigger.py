@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from dappled.cli.arguments import seconds, whole
 from dappled.cli.terminal import waiting_for
+from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import settings
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 from dappled.daemon.pipeline.spacing import MOST_M
@@ -43,75 +42,70 @@ def _distance(text: str) -> Distance:
     except ValueError:
         metres = math.nan
     if not 0 < metres <= MOST_M:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a distance of up to {MOST_M:g} m, nor settings, nor off")
+        raise ValueError(f"{text!r} is neither a distance of up to {MOST_M:g} m, nor settings, nor off")
     return Distance(metres)
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "example: dappled trigger --url udpout:127.0.0.1:14550 --count 3 --interval 2"
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument("--url", help=f"pymavlink connection string (default: {DEFAULT_URL})")
-    where.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="the daemon's settings file, which names its link",
+@dataclass(frozen=True, kw_only=True)
+class AskForPhotographs(Verb):
+    """Ask for photographs."""
+
+    examples = ("dappled trigger --url udpout:127.0.0.1:14550 --count 3 --interval 2",)
+
+    url: str | None = option(
+        "--url", help="pymavlink connection string", default=None, metavar="URL", otherwise=DEFAULT_URL, alone="where"
     )
-    parser.add_argument(
-        "--distance",
-        type=_distance,
-        metavar="M",
+    config: Path | None = option(
+        "--config", help="the daemon's settings file, which names its link", default=None, alone="where"
+    )
+    distance: Distance | None = option(
+        "--distance", default=None, parse=_distance, metavar="M",
         help="have the camera take a photograph every M metres over ground; settings: as its settings say, by distance "
         "or overlap; off: no more",
+    )  # fmt: skip
+    count: int = option("--count", help="number of photographs", default=1, low=1)
+    interval: float = option("--interval", help="least time between them", default=0.0, unit="s", low=0)
+    timeout: float = option(
+        "--timeout", help="how long to wait for the camera, and for each photograph", default=60.0, unit="s", low=0
     )
-    parser.add_argument("--count", type=whole, default=1, metavar="N", help="number of photographs (default: 1)")
-    parser.add_argument(
-        "--interval", type=seconds, default=0.0, metavar="S", help="least time between them (default: 0)"
-    )
-    parser.add_argument(
-        "--timeout",
-        type=seconds,
-        default=60.0,
-        metavar="S",
-        help="how long to wait for the camera, and for each photograph (default: 60)",
-    )
-    parser.add_argument("--key", type=Path, metavar="FILE", help="the link's signing key (dappled mavlink key)")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per photograph")
+    key: Path | None = option("--key", help="the link's signing key (dappled mavlink key)", default=None)
+    json: bool = flag("--json", "print one JSON object per photograph")
 
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        url, key = self._link()
+        with GroundClient(url, key_file=key) as client:
+            with waiting_for(f"a camera on {url}"):
+                client.find_camera(self.timeout)
+            if self.distance is not None:
+                client.by_distance(self.distance.metres)
+                return Report({"distance": str(self.distance)}, [self.distance.told])
+            outcomes = client.capture(
+                self.count,
+                self.interval,
+                timeout_s=self.timeout,
+                on_outcome=lambda one: output.row(_values(one), _line(one)),
+            )
+        return Report(failed=not all(one.ok for one in outcomes))
 
-def run(arguments: argparse.Namespace) -> int:
-    url, key = _link(arguments)
-    with GroundClient(url, key_file=key) as client:
-        with waiting_for(f"a camera on {url}"):
-            client.find_camera(arguments.timeout)
-        if arguments.distance is not None:
-            client.by_distance(arguments.distance.metres)
-            print(json.dumps({"distance": str(arguments.distance)}) if arguments.json else arguments.distance.told)
-            return 0
-        outcomes = client.capture(
-            arguments.count,
-            arguments.interval,
-            timeout_s=arguments.timeout,
-            on_outcome=lambda one: print(_json(one) if arguments.json else _line(one), flush=True),
+    def _link(self) -> tuple[str, Path | None]:
+        """The url to call at, and its key. Raises LinkError where the settings name no link that can be called."""
+        if self.config is None:
+            return self.url or DEFAULT_URL, self.key
+        mavlink = settings.load(self.config).mavlink
+        for number, url in enumerate(mavlink.url):
+            at = parse(url)
+            if at.kind in _CALLED_AT:
+                key = mavlink.link_keys[number]
+                host = "127.0.0.1" if at.host == "0.0.0.0" else at.host  # noqa: S104  # nothing is bound to it here
+                return f"{_CALLED_AT[at.kind]}:{host}:{at.port}", self.key or (Path(key) if key else None)
+        raise LinkError(
+            f"{self.config} names no link that listens: a ground station reaches the daemon by udpin: or tcpin: in "
+            "mavlink.url, or on the autopilot's network; give --url"
         )
-    return 0 if all(one.ok for one in outcomes) else 1
 
 
-def _link(arguments: argparse.Namespace) -> tuple[str, Path | None]:
-    """The url to call at, and its key. Raises LinkError where the settings file names no link that can be called."""
-    if arguments.config is None:
-        return arguments.url or DEFAULT_URL, arguments.key
-    mavlink = settings.load(arguments.config).mavlink
-    for number, url in enumerate(mavlink.url):
-        at = parse(url)
-        if at.kind in _CALLED_AT:
-            key = mavlink.link_keys[number]
-            host = "127.0.0.1" if at.host == "0.0.0.0" else at.host  # noqa: S104  # nothing is bound to it here
-            return f"{_CALLED_AT[at.kind]}:{host}:{at.port}", arguments.key or (Path(key) if key else None)
-    raise LinkError(
-        f"{arguments.config} names no link that listens: a ground station reaches the daemon by udpin: or tcpin: in "
-        "mavlink.url, or on the autopilot's network; give --url"
-    )
+CLASSES = {"trigger": AskForPhotographs}
 
 
 def _line(one: Outcome) -> str:
@@ -121,5 +115,5 @@ def _line(one: Outcome) -> str:
     return f"no image: {one.reason}{ack}"
 
 
-def _json(one: Outcome) -> str:
-    return json.dumps({"index": one.index, "ok": one.ok, "reason": one.reason, "ack_ms": one.ack_ms})
+def _values(one: Outcome) -> dict[str, Any]:
+    return {"index": one.index, "ok": one.ok, "reason": one.reason, "ack_ms": one.ack_ms}

@@ -53,9 +53,9 @@ class Argument:
     alone: str = ""
 
 
-def argument(metavar: str, help: str, default: Any = MISSING, **form: Any) -> Any:
+def argument(metavar: str, help: str, default: Any = MISSING, choices: Sequence[str] = (), **form: Any) -> Any:
     """Declare a positional argument."""
-    return field(default=default, metadata={"argument": Argument(Rule(help), metavar, **form)})
+    return field(default=default, metadata={"argument": Argument(Rule(help, choices=tuple(choices)), metavar, **form)})
 
 
 def option(
@@ -65,7 +65,7 @@ def option(
     unit: str = "",
     low: float = -math.inf,
     high: float = math.inf,
-    choices: Sequence[str] = (),
+    choices: Sequence[Any] = (),
     rule: Rule | None = None,
     **form: Any,
 ) -> Any:
@@ -161,6 +161,13 @@ class Doubtable:
     """--anyway, for verbs whose result can be in doubt."""
 
     anyway: bool = flag("--anyway", "exit with 0 although the result is in doubt (otherwise 1)")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingsArgument:
+    """--config, for verbs that read the settings."""
+
+    config: Path | None = option("--config", help="settings file", default=None, otherwise="the built-in settings")
 
 
 # Verbs that are functions of a Namespace still are called through this one.

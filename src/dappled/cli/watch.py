@@ -2,87 +2,95 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.cli.arguments import seconds, whole
 from dappled.cli.status import stream_endpoint
-from dappled.cli.terminal import remark, waiting_for
+from dappled.cli.terminal import waiting_for
+from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option
 from dappled.clock import SystemClock
 from dappled.daemon.stream import watch
 from dappled.daemon.stream.curve import ClientKeys, load_own, load_public
 from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
 from dappled.daemon.stream.wire import Message
-from dappled.errors import DappledError, counted
+from dappled.errors import counted
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "example: dappled watch --save slices/ --count 8\n\nexits 1 if slices were lost, or fewer than --count arrived"
+@dataclass(frozen=True, kw_only=True)
+class WatchStream(Verb):
+    """Subscribe to the stream."""
+
+    examples = ("dappled watch --save slices/ --count 8",)
+    notes = "exits 1 if slices were lost, or fewer than --count arrived"
+
+    endpoint: str | None = argument(
+        "ENDPOINT", "ZeroMQ endpoint of the stream (default: the daemon's on this machine)", default=None
     )
-    parser.add_argument(
-        "endpoint",
-        nargs="?",
-        metavar="ENDPOINT",
-        help="ZeroMQ endpoint of the stream (default: the daemon's on this machine)",
+    config: Path | None = option("--config", help="the daemon's settings file, which names the endpoint", default=None)
+    ask: str | None = option(
+        "--ask", help="endpoint that answers requests", default=None, metavar="ENDPOINT",
+        otherwise="the one beside an ipc stream",
+    )  # fmt: skip
+    save: Path | None = option(
+        "--save", help="save each frame's header, slices and mosaic here", default=None, metavar="DIR"
     )
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="the daemon's settings file, which names the endpoint"
+    from_start: bool = flag("--from-start", "also fetch what the flight has sent already")
+    count: int | None = option("--count", help="end after the slices of N frames", default=None, low=1)
+    timeout: float | None = option(
+        "--timeout", help="give up after this time in silence", default=None, unit="s", low=0
     )
-    parser.add_argument(
-        "--ask", metavar="ENDPOINT", help="endpoint that answers requests (default: the one beside an ipc stream)"
-    )
-    parser.add_argument("--save", type=Path, metavar="DIR", help="save each frame's header, slices and mosaic here")
-    parser.add_argument("--from-start", action="store_true", help="also fetch what the flight has sent already")
-    parser.add_argument("--count", type=whole, metavar="N", help="end after the slices of N frames")
-    parser.add_argument("--timeout", type=seconds, metavar="S", help="give up after S seconds without a message")
-    parser.add_argument("--keys", type=Path, metavar="FILE", help="your NAME.key_secret, for a tcp endpoint")
-    parser.add_argument("--server-key", type=Path, metavar="FILE", help="the vehicle's NAME.key")
-    parser.add_argument("--json", action="store_true", help="print one JSON object per line")
+    keys: Path | None = option("--keys", help="your NAME.key_secret, for a tcp endpoint", default=None)
+    server_key: Path | None = option("--server-key", help="the vehicle's NAME.key", default=None)
+    json: bool = flag("--json", "print one JSON object per line")
 
+    def check(self) -> None:
+        """See Verb."""
+        if bool(self.keys) != bool(self.server_key):
+            raise CallError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
 
-def run(arguments: argparse.Namespace) -> int:
-    endpoint = arguments.endpoint or stream_endpoint(arguments.config)
-    ask = arguments.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
-    if bool(arguments.keys) != bool(arguments.server_key):
-        raise DappledError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
-    keys = ClientKeys(load_own(arguments.keys), load_public(arguments.server_key)) if arguments.keys else None
-    if arguments.save:
-        arguments.save.mkdir(parents=True, exist_ok=True)
-    reuse_large_blocks()
-    with Subscriber(endpoint, ask, from_start=arguments.from_start, keys=keys) as subscriber, ExitStack() as silence:
-        silence.enter_context(waiting_for(f"a daemon on {endpoint}"))
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        endpoint = self.endpoint or stream_endpoint(self.config)
+        ask = self.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
+        keys = ClientKeys(load_own(self.keys), load_public(self.server_key)) if self.keys and self.server_key else None
+        if self.save:
+            self.save.mkdir(parents=True, exist_ok=True)
+        reuse_large_blocks()
+        with Subscriber(endpoint, ask, from_start=self.from_start, keys=keys) as subscriber, ExitStack() as silence:
+            silence.enter_context(waiting_for(f"a daemon on {endpoint}"))
 
-        def received(message: Message) -> None:
-            silence.close()
-            _show(message, arguments.json)
+            def received(message: Message) -> None:
+                silence.close()
+                _show(message, output)
 
-        seen = watch.watch(
-            subscriber,
-            received=received,
-            new_frame=lambda message: watch.save(message, arguments.save) if arguments.save else None,
-            count=arguments.count,
-            silence_s=arguments.timeout,
-            clock=SystemClock(),
-        )
-        if not arguments.json:
+            seen = watch.watch(
+                subscriber,
+                received=received,
+                new_frame=lambda message: watch.save(message, self.save) if self.save else None,
+                count=self.count,
+                silence_s=self.timeout,
+                clock=SystemClock(),
+            )
+            if not seen.messages:
+                output.remark(
+                    f"nothing came from {endpoint}: is a daemon running there? `dappled status {endpoint}` asks it"
+                )
+            elif seen.short_of(self.count):
+                output.remark(
+                    f"too few slices came from {endpoint}: `dappled status {endpoint}` tells whether it decodes"
+                )
             asked_again = f"{subscriber.recovered} after a repeated request"
-            print(f"{counted(seen.frames, 'frame')} received, {asked_again}, {subscriber.lost} lost")
-        if not seen.messages:
-            remark(f"nothing came from {endpoint}: is a daemon running there? `dappled status {endpoint}` asks it")
-        elif seen.short_of(arguments.count):
-            remark(f"too few slices came from {endpoint}: `dappled status {endpoint}` tells whether it decodes")
-        return 1 if seen.short_of(arguments.count) or subscriber.lost else 0
+            said = f"{counted(seen.frames, 'frame')} received, {asked_again}, {subscriber.lost} lost"
+            return Report(None, [said], failed=bool(seen.short_of(self.count) or subscriber.lost))
 
 
-def _show(message: Message, as_json: bool) -> None:
+CLASSES = {"watch": WatchStream}
+
+
+def _show(message: Message, output: Output) -> None:
     header = message.header
     size = memoryview(message.body).nbytes if message.body is not None else 0
-    if as_json:
-        print(json.dumps({"topic": message.topic, **header, "body_bytes": size}), flush=True)
-        return
     words = [f"{message.topic:8}", f"seq {header.get('seq')}"]
     if "frame" in header:
         words.append(f"frame {header['frame']}")
@@ -92,5 +100,5 @@ def _show(message: Message, as_json: bool) -> None:
         words.append(f"{size / 1e6:.1f} MB")
     if message.topic == "error":
         words.append(header.get("error", ""))
-    if message.topic != "health":
-        print("  ".join(words), flush=True)
+    values = {"topic": message.topic, **header, "body_bytes": size}
+    output.row(values, *([] if message.topic == "health" else ["  ".join(words)]))

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
 
-from dappled.cli import decode_arguments
-from dappled.cli.arguments import whole
+from dappled.cli.verb import option
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.config.schema import ConfigError
-from dappled.decode.optics import Mask, Sensor, lenses
+from dappled.decode.optics import LAWS, Mask, Sensor, lenses
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,71 +22,62 @@ class Installed:
     distance_mm: float
 
 
-def add_mask(parser: argparse.ArgumentParser) -> None:
-    """--mask."""
-    parser.add_argument("--mask", required=True, metavar="P", help="mask profile or TOML file")
-
-
-def add_sensor(parser: argparse.ArgumentParser) -> None:
+@dataclass(frozen=True, kw_only=True)
+class SensorArguments:
     """--camera and --shape."""
-    parser.add_argument("--camera", required=True, metavar="P", help="camera profile or TOML file")
-    parser.add_argument(
-        "--shape", type=whole, nargs=2, metavar=("H", "W"), help="raw shape (default: the camera's first)"
+
+    camera: str = option("--camera", help="camera profile or TOML file")
+    shape: tuple[int, int] | None = option(
+        "--shape", help="raw shape", default=None, low=1, metavar=("H", "W"), otherwise="the camera's first"
     )
 
-
-def add_installation(parser: argparse.ArgumentParser, *, free: bool = False) -> None:
-    """--law and --mask-distance; `free` where a design may choose the distance."""
-    decode_arguments.add_law(parser)
-    default = "default: free; with --mask the camera's" if free else "default: the camera's"
-    parser.add_argument("--mask-distance", type=float, metavar="MM", help=f"distance from mask to sensor ({default})")
+    def sensor(self) -> Sensor:
+        """The camera's sensor for --shape, or for its first raw shape. Raises ConfigError for a shape it hasn't."""
+        camera = profiles.camera(self.camera)
+        return camera.sensor(self.shape) if self.shape else camera.raw[0].sensor
 
 
-def add_altitude(parser: argparse.ArgumentParser) -> None:
+@dataclass(frozen=True, kw_only=True)
+class InstallationArguments(SensorArguments):
+    """--law and --mask-distance."""
+
+    law: str = option("--law", help="carrier law", default="", choices=tuple(LAWS), otherwise="the camera's")
+    mask_distance: float | None = option(
+        "--mask-distance", help="distance from mask to sensor", default=None, metavar="MM", otherwise="the camera's"
+    )
+
+    def installed(self, mask: str) -> Installed:
+        """What these arguments name with a mask. Raises ConfigError."""
+        camera = profiles.camera(self.camera)
+        distance = camera.mask_distance_mm if self.mask_distance is None else self.mask_distance
+        return Installed(camera, profiles.mask(mask).mask, self.sensor(), self.law or camera.law, distance)
+
+
+@dataclass(frozen=True, kw_only=True)
+class AltitudeArguments(SensorArguments):
     """--altitude, and the camera that is flown there."""
-    parser.add_argument("--altitude", type=float, required=True, metavar="M", help="height above ground")
-    add_sensor(parser)
-    parser.add_argument(
-        "--focal-length",
-        type=float,
-        metavar="MM",
-        help="focal length of the lens (default: the camera's, if it has only one)",
-    )
 
+    altitude: float = option("--altitude", help="height above ground", unit="m")
+    focal_length: float | None = option(
+        "--focal-length", help="focal length of the lens", default=None, metavar="MM",
+        otherwise="the camera's, if it has only one",
+    )  # fmt: skip
 
-def sensor(camera: CameraProfile, arguments: argparse.Namespace) -> Sensor:
-    """The camera's sensor for --shape, or for its first raw shape. Raises ConfigError for a shape it hasn't."""
-    shape = arguments.shape
-    return camera.sensor((shape[0], shape[1])) if shape else camera.raw[0].sensor
+    def camera_set(self) -> tuple[CameraProfile, Sensor, float]:
+        """The camera, its sensor, its focal length in mm. Raises ConfigError where that isn't known."""
+        camera = profiles.camera(self.camera)
+        length = only_length(camera) if self.focal_length is None else self.focal_length
+        if length is None:
+            raise ConfigError(
+                f"{camera.name} does not fix the focal length: give the lens' setting in mm with --focal-length"
+            )
+        return camera, self.sensor(), lenses.focal_length(length)
 
 
 def only_length(camera: CameraProfile) -> float | None:
     """The focal length of a lens that can't zoom; None for others."""
     known = camera.focal_length_mm
     return known[0] if known is not None and known[0] == known[1] else None
-
-
-def camera_set(arguments: argparse.Namespace) -> tuple[CameraProfile, Sensor, float]:
-    """The camera of `add_altitude`, its sensor, its focal length in mm. Raises ConfigError where that isn't known."""
-    camera = profiles.camera(arguments.camera)
-    length = only_length(camera) if arguments.focal_length is None else arguments.focal_length
-    if length is None:
-        raise ConfigError(
-            f"{camera.name} does not fix the focal length: give the lens' setting in mm with --focal-length"
-        )
-    return camera, sensor(camera, arguments), lenses.focal_length(length)
-
-
-def installed(arguments: argparse.Namespace) -> Installed:
-    """What these arguments name. Raises ConfigError."""
-    camera = profiles.camera(arguments.camera)
-    return Installed(
-        camera,
-        profiles.mask(arguments.mask).mask,
-        sensor(camera, arguments),
-        arguments.law or camera.law,
-        camera.mask_distance_mm if arguments.mask_distance is None else arguments.mask_distance,
-    )
 
 
 def out_of_reach(camera: CameraProfile, ideal: float) -> str | None:

@@ -2,102 +2,95 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
-from dappled.cli.arguments import add_overwrite, refuse_existing
-from dappled.cli.mask import arguments as mask_arguments
+from dappled.cli.mask.arguments import AltitudeArguments, InstallationArguments, out_of_reach
+from dappled.cli.verb import Output, Overwriting, Report, Verb, option
+from dappled.config import profiles
 from dappled.decode.optics import carrier_tables
 from dappled.decode.optics.film import FILMS
 from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
 from dappled.decode.spectrum import pictures
 
-HELP = "design mask, distance and film for an altitude"
-EXAMPLE = "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-length 13 --f-number 3.5 --film 16k"
 
+@dataclass(frozen=True, kw_only=True)
+class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
+    """Design mask, distance and film."""
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    mask_arguments.add_altitude(parser)
-    parser.add_argument("--f-number", type=float, default=5.6, metavar="N", help="f-number of the lens (default: 5.6)")
-    parser.add_argument("--views", type=int, default=5, metavar="N", help="views per axis, odd (default: 5)")
-    parser.add_argument("--film", default="4k", choices=tuple(FILMS), help="film to print it on (default: 4k)")
-    mask_arguments.add_installation(parser, free=True)
-    parser.add_argument(
-        "--room", type=float, metavar="MM", help="largest distance of the mask from the sensor (default: 10)"
+    examples = (
+        "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-length 13 --f-number 3.5 --film 16k",
     )
-    parser.add_argument(
-        "--wavelength", type=float, default=550.0, metavar="NM", help="wavelength of the light (default: 550)"
+
+    f_number: float = option("--f-number", help="f-number of the lens", default=5.6, above=0.0)
+    views: int = option("--views", help="views per axis, odd", default=5, low=1)
+    film: str = option("--film", help="film to print it on", default="4k", choices=tuple(FILMS))
+    mask_distance: float | None = option(
+        "--mask-distance", help="distance from mask to sensor", default=None, metavar="MM",
+        otherwise="free; with --mask the camera's",
+    )  # fmt: skip
+    room: float | None = option(
+        "--room", help="largest distance of the mask from the sensor", default=None, metavar="MM", otherwise="10"
     )
-    parser.add_argument(
-        "--shift-error",
-        type=float,
-        default=0.02,
-        metavar="PX",
-        help="σ of a measured shift between views (default: 0.02)",
+    wavelength: float = option("--wavelength", help="wavelength of the light", default=550.0, unit="nm")
+    shift_error: float = option("--shift-error", help="σ of a measured shift between views", default=0.02, unit="px")
+    mask: str | None = option("--mask", help="print the best focal length of this installed mask instead", default=None)
+    picture: Path | None = option(
+        "--picture", help="draw the carriers on the spectrum", default=None, metavar="FILE.png"
     )
-    parser.add_argument("--mask", metavar="P", help="print the best focal length of this installed mask instead")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the carriers on the spectrum")
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
+    def check(self) -> None:
+        """See Verb."""
+        self.refuse_existing(self.picture)
+        profiles.camera(self.camera)
 
-def run(arguments: argparse.Namespace) -> int:
-    if arguments.picture:
-        refuse_existing(arguments, arguments.picture)
-    if arguments.mask:
-        return _best(arguments)
-    camera, sensor, length = mask_arguments.camera_set(arguments)
-    law = arguments.law or camera.law
-    wanted = DesignRequirements(
-        sensor=sensor,
-        focal_length_mm=length,
-        f_number=arguments.f_number,
-        altitude_m=arguments.altitude,
-        film=FILMS[arguments.film],
-        views=arguments.views,
-        wavelength_nm=arguments.wavelength,
-        shift_sigma_px=arguments.shift_error,
-        mask_distance_mm=arguments.mask_distance,
-        largest_distance_mm=min(10.0, length) if arguments.room is None else arguments.room,
-        least_distance_mm=camera.least_mask_distance_mm or 0.0,
-        f_numbers=camera.f_numbers,
-    )
-    made = DESIGNS[law](wanted)
-    instead = None if made.works else buildable(wanted, law)
-    if arguments.picture:
-        Image.fromarray(_picture(made)).save(arguments.picture)
-    if arguments.json:
-        print(json.dumps({**_as_json(made), "buildable": None if instead is None else _as_json(instead)}, indent=2))
-    else:
-        print(_as_text(made, instead))
-    return 0 if made.works else 1
-
-
-def _best(arguments: argparse.Namespace) -> int:
-    one = mask_arguments.installed(arguments)
-    best = carrier_tables.best_focal_length(one.mask, one.sensor, one.distance_mm, law=one.law)
-    if arguments.json:
-        print(json.dumps({"law": one.law, "mask_distance_mm": one.distance_mm, **asdict(best)}, indent=2))
-        return 0
-    if best.slices_mm is None or best.carriers_mm is None:
-        print(f"law {one.law}: no focal length brings the outer slices of {arguments.mask} to the edge of the spectrum")
-    else:
-        print(
-            f"law {one.law}: {arguments.mask} at {one.distance_mm:g} mm fills the spectrum at {best.slices_mm:.1f} mm "
-            f"(carriers alone at {best.carriers_mm:.1f} mm)"
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        if self.mask:
+            return self._best(self.mask)
+        camera, sensor, length = self.camera_set()
+        law = self.law or camera.law
+        wanted = DesignRequirements(
+            sensor=sensor,
+            focal_length_mm=length,
+            f_number=self.f_number,
+            altitude_m=self.altitude,
+            film=FILMS[self.film],
+            views=self.views,
+            wavelength_nm=self.wavelength,
+            shift_sigma_px=self.shift_error,
+            mask_distance_mm=self.mask_distance,
+            largest_distance_mm=min(10.0, length) if self.room is None else self.room,
+            least_distance_mm=camera.least_mask_distance_mm or 0.0,
+            f_numbers=camera.f_numbers,
         )
-    ideal = one.mask.frequency_per_mm * one.distance_mm
-    print(f"by geometry its views are separated at f/{ideal:.3g}, whatever the lens")
-    warning = mask_arguments.out_of_reach(one.camera, ideal)
-    if warning is not None:
-        print(f"warning: {warning}")
-    return 0
+        made = DESIGNS[law](wanted)
+        instead = None if made.works else buildable(wanted, law)
+        if self.picture:
+            Image.fromarray(_picture(made)).save(self.picture)
+        values = {**_as_json(made), "buildable": None if instead is None else _as_json(instead)}
+        return Report(values, _lines(made, instead), failed=not made.works)
+
+    def _best(self, mask: str) -> Report:
+        one = self.installed(mask)
+        best = carrier_tables.best_focal_length(one.mask, one.sensor, one.distance_mm, law=one.law)
+        lines = [f"law {one.law}: no focal length brings the outer slices of {mask} to the edge of the spectrum"]
+        if best.slices_mm is not None and best.carriers_mm is not None:
+            alone = f"(carriers alone at {best.carriers_mm:.1f} mm)"
+            at = f"{mask} at {one.distance_mm:g} mm fills the spectrum at {best.slices_mm:.1f} mm"
+            lines = [f"law {one.law}: {at} {alone}"]
+        ideal = one.mask.frequency_per_mm * one.distance_mm
+        lines.append(f"by geometry its views are separated at f/{ideal:.3g}, whatever the lens")
+        warning = out_of_reach(one.camera, ideal)
+        lines += [] if warning is None else [f"warning: {warning}"]
+        return Report({"law": one.law, "mask_distance_mm": one.distance_mm, **asdict(best)}, lines)
+
+
+CLASSES = {"mask design": DesignMask}
 
 
 def _picture(made: Design) -> Any:
@@ -124,7 +117,7 @@ def _as_json(made: Design) -> dict[str, Any]:
     }
 
 
-def _as_text(made: Design, instead: Design | None) -> str:
+def _lines(made: Design, instead: Design | None) -> list[str]:
     wanted = made.wanted
     rows, columns = made.view_shape
     lines = [
@@ -152,7 +145,7 @@ def _as_text(made: Design, instead: Design | None) -> str:
         lines.append(
             "this depth error is too large to measure depth: fly lower, or use a longer lens with a wider aperture"
         )
-    return "\n".join(lines)
+    return lines
 
 
 def _instead(made: Design | None) -> str:

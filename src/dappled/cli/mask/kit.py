@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -13,15 +11,13 @@ import tomli_w
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode.optics import Mask, film
+from dappled.decode.optics.carriers import Pattern
 from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
 from dappled.products.exports import mask_files
-
-HELP = "write what to print and shoot to settle a camera's carrier law: masks, wedge, target, shot list"
-EXAMPLE = "dappled mask kit kit --camera canon-eos-450d --film 8k"
 
 _WEDGE_STEPS = 21
 _PAGE_MM, _PAGE_PX_PER_MM = (297.0, 210.0), 12.0  # A4
@@ -29,44 +25,58 @@ _BAR_MM = 100
 _LENGTHS = 3  # focal lengths: with three, a law's second constant is fitted, too
 _STOPS = (11.0, 22.0, 32.0)
 KIT = "kit.toml"
+_MASKS: tuple[Pattern, ...] = ("full", "diagonal")
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="FOLDER", help="folder to write, made where it is missing")
-    parser.add_argument("--camera", required=True, metavar="P", help="camera profile or TOML file")
-    parser.add_argument("--film", default="8k", choices=tuple(FILMS), help="film of the mask (default: 8k)")
-    parser.add_argument("--frequency", type=float, default=11.38, metavar="1/MM",
-                        help="fundamental frequency of both masks (default: Mask 2's 11.38)")  # fmt: skip
-    parser.add_argument("--negative", action="store_true", help="write negatives (Eq 13), for negative film")
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print the files as JSON")
+@dataclass(frozen=True, kw_only=True)
+class WriteTestKit(Overwriting, Verb):
+    """Write what to print and shoot."""
+
+    examples = ("dappled mask kit kit --camera canon-eos-450d --film 8k",)
+
+    folder: Path = argument("FOLDER", "folder to write, made where it is missing")
+    camera: str = option("--camera", help="camera profile or TOML file")
+    film: str = option("--film", help="film of the mask", default="8k", choices=tuple(FILMS))
+    frequency: float = option(
+        "--frequency", help="fundamental frequency of both masks", default=11.38, metavar="1/MM", above=0.0,
+        otherwise="Mask 2's 11.38",
+    )  # fmt: skip
+    negative: bool = flag("--negative", "write negatives (Eq 13), for negative film")
+
+    def _files(self) -> list[Path]:
+        masks = [self.folder / f"{name}.{ending}" for name in _MASKS for ending in ("png", "toml")]
+        return masks + [self.folder / name for name in ("wedge.png", "target.png", "shots.txt", KIT)]
+
+    def check(self) -> None:
+        """See Verb."""
+        profiles.camera(self.camera)
+        self.refuse_existing(*self._files())
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        camera, chosen, folder = profiles.camera(self.camera), FILMS[self.film], self.folder
+        masks = {name: Mask(self.frequency, 2, name, "linear") for name in _MASKS}
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, mask in masks.items():
+            image = MaskImage(mask, chosen, period_on(chosen, mask), self.negative, 8, None, False)
+            for text in image.warnings():
+                output.warn(f"warning: {text}")
+            mask_files.write(folder / f"{name}.png", chosen.shape, 8, chosen.px_per_mm, image.levels)
+            (folder / f"{name}.toml").write_text(
+                f'p = 2\nfrequency_per_mm = {self.frequency}\npattern = "{name}"\nharmonics = "linear"\n'
+            )
+        mask_files.write(folder / "wedge.png", chosen.shape, 8, chosen.px_per_mm, _wedge(chosen))
+        Image.fromarray(_target()).save(folder / "target.png", dpi=(25.4 * _PAGE_PX_PER_MM,) * 2)
+        lengths, stops = shot_list(camera)
+        named = str(Path(self.camera).resolve()) if self.camera.endswith(".toml") else self.camera
+        asked = {"camera": named, "focal_lengths_mm": lengths, "f_numbers": stops}
+        (folder / KIT).write_text(tomli_w.dumps(asked))
+        (folder / "shots.txt").write_text(_shots(camera, named, chosen, folder))
+        files = [str(one) for one in self._files()]
+        return Report({"files": files}, files)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    camera, chosen = profiles.camera(arguments.camera), FILMS[arguments.film]
-    folder: Path = arguments.folder
-    masks = {name: Mask(arguments.frequency, 2, name, "linear") for name in ("full", "diagonal")}
-    files = [folder / f"{name}.{ending}" for name in masks for ending in ("png", "toml")]
-    files += [folder / name for name in ("wedge.png", "target.png", "shots.txt", KIT)]
-    refuse_existing(arguments, *files)
-    folder.mkdir(parents=True, exist_ok=True)
-    for name, mask in masks.items():
-        image = MaskImage(mask, chosen, period_on(chosen, mask), arguments.negative, 8, None, False)
-        for text in image.warnings():
-            print(f"dappled mask: warning: {text}", file=sys.stderr)
-        mask_files.write(folder / f"{name}.png", chosen.shape, 8, chosen.px_per_mm, image.levels)
-        (folder / f"{name}.toml").write_text(
-            f'p = 2\nfrequency_per_mm = {arguments.frequency}\npattern = "{name}"\nharmonics = "linear"\n'
-        )
-    mask_files.write(folder / "wedge.png", chosen.shape, 8, chosen.px_per_mm, _wedge(chosen))
-    Image.fromarray(_target()).save(folder / "target.png", dpi=(25.4 * _PAGE_PX_PER_MM,) * 2)
-    lengths, stops = shot_list(camera)
-    named = str(Path(arguments.camera).resolve()) if arguments.camera.endswith(".toml") else arguments.camera
-    asked = {"camera": named, "focal_lengths_mm": lengths, "f_numbers": stops}
-    (folder / KIT).write_text(tomli_w.dumps(asked))
-    (folder / "shots.txt").write_text(_shots(camera, named, chosen, folder))
-    print(json.dumps({"files": [str(one) for one in files]}) if arguments.json else "\n".join(map(str, files)))
-    return 0
+CLASSES = {"mask kit": WriteTestKit}
 
 
 def _wedge(chosen: Film) -> Callable[[slice, slice], NDArray[np.uint8]]:
