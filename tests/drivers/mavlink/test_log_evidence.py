@@ -15,7 +15,7 @@ from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, ulog
 from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds
 from dappled.findings import Code, Finding, Level, text
-from tests.drivers.mavlink.true_logs import UTC_US, Row, poses, rewritten, same_fix, ulog_written, written
+from tests.drivers.mavlink.true_logs import BOOT_US, UTC_US, Row, poses, rewritten, same_fix, ulog_written, written
 
 NAN, POSITION = math.nan, 33
 Change = Callable[[str, Row], Iterable[tuple[str, Row]]]
@@ -227,15 +227,75 @@ def test_the_leap_seconds_are_those_of_the_flight(tmp_path: Path) -> None:
     assert (in_week(1894) - in_week(1844)) % (7 * 86400) == 7 * 86400 - 1
 
 
-@pytest.mark.parametrize("how", ["blended", "unix"])
-def test_px4_logs_whose_utc_or_stamps_stand_elsewhere_give_the_same_poses(tmp_path: Path, how: str) -> None:
+UNIX_US = 1_790_000_000 * 10**6
+WRAP_US = 2**32 * 1000 - BOOT_US  # MAVLink's milliseconds since boot have 32 bits: 49.7 days
+
+
+@pytest.mark.parametrize(("blended", "on_for_us"), [(True, 0), (False, UNIX_US), (True, WRAP_US - 3_000_000)])
+def test_px4_logs_whose_utc_or_stamps_stand_elsewhere_give_the_same_poses(
+    tmp_path: Path, blended: bool, on_for_us: int
+) -> None:
     pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
     plain = poses(ulog_written(tmp_path))
-    log = ulog_written(tmp_path, blended=how == "blended", unix=how == "unix")
+    log = ulog_written(tmp_path, blended=blended, on_for_us=on_for_us)
     assert next(iter(ulog.packets(log)))[1] == UTC_US
     for here, there in zip(poses(log), plain, strict=True):
+        assert here.source == "interpolated"
         assert away_m(here, there) < 0.01
         assert same_fix(here, there)
+
+
+@pytest.mark.parametrize("wraps", [1, 407])
+@pytest.mark.parametrize("before_us", [1_000_000, 5_500_000])
+def test_a_log_of_ardupilot_may_pass_32_bits_of_milliseconds(tmp_path: Path, wraps: int, before_us: int) -> None:
+    later_us = wraps * 2**32 * 1000 - BOOT_US - before_us
+    log, link = written(tmp_path)
+    rewritten(log, lambda kind, row: [(kind, (row[0] + later_us, *row[1:]))])
+    assert found_in(log) == []
+    for here, there in zip(poses(log), poses(link), strict=True):
+        assert here.source == "interpolated"
+        assert away_m(here, there) < 0.01
+        assert same_fix(here, there)
+
+
+def in_weeks(weeks: Callable[[int], int]) -> Change:
+    """A change of records: GPS message n is `weeks(n)` weeks too early."""
+    count = 0
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        nonlocal count
+        if kind != "GPS":
+            return [(kind, row)]
+        count += 1
+        return [(kind, (*row[:4], row[4] - weeks(count), *row[5:]))]
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("weeks", "code", "off_weeks"),
+    [
+        (lambda n: 0 if n < 4 else 1024, Code.TIME_WEEK_MENDED, 0),  # it knew first, or knows later
+        (lambda n: 1024 if n < 40 else 0, Code.TIME_WEEK_MENDED, 0),
+        (lambda n: 500 if n == 7 else 1024, Code.TIME_WEEK_ROLLOVER, 1024),  # a damaged message, whose date is possible
+        (lambda n: 2048, Code.TIME_WEEK_ROLLOVER, 2048),  # the ten bits as they are sent
+        (lambda n: 2048 if n < 40 else 0, Code.TIME_WEEK_MENDED, 0),
+    ],
+)
+def test_what_most_dates_say_counts(tmp_path: Path, weeks: Callable[[int], int], code: Code, off_weeks: int) -> None:
+    log = rewritten(written(tmp_path)[0], in_weeks(weeks))
+    (told,) = found_in(log)
+    assert told.code is code
+    stamps = [stamp_us for _, stamp_us, _ in dataflash.packets(log, bounds=UtcBounds.of_log(NOW_NS))]
+    assert abs(stamps[0] - UTC_US + off_weeks * 7 * 86400 * 10**6) < 20 * 10**6
+
+
+def test_two_rollovers_are_mended_where_another_clock_agrees(tmp_path: Path) -> None:
+    log = rewritten(written(tmp_path)[0], in_weeks(lambda n: 2048))
+    bounds = UtcBounds.of_log(NOW_NS, [UTC_US * 1000])
+    (told,) = found_in(log, bounds)
+    assert (told.code, told.facts["weeks"]) == (Code.TIME_WEEK_MENDED, 2048)
+    assert abs(next(dataflash.packets(log, bounds=bounds))[1] - UTC_US) < 1000
 
 
 REPORTS = {

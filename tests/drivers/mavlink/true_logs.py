@@ -162,12 +162,12 @@ def ulog_written(
     invalid: bool = False,
     ahead_us: int = 0,
     blended: bool = False,
-    unix: bool = False,
+    on_for_us: int = 0,
 ) -> Path:
     """The same flight as `written`, as PX4's .ulg: https://docs.px4.io/main/en/dev_log/ulog_file_format.html. Estimates
     are published `late_us` after they hold; `older`: the receiver's places as integers, as before PX4 1.14; `invalid`:
     beside each estimate stands one that is wrong and says so; `blended`: the receiver that counts tells no UTC, only
-    `sensor_gps` does; `unix`: all stamps are Unix time; `ahead_us`: the receiver's UTC is that of a later time,
+    `sensor_gps` does; all stamps are later by `on_for_us`; `ahead_us`: the receiver's UTC is that of a later time,
     and its messages say which."""
     path, home_m = FlightPath(5), 0.0
     types = ULOG_TYPES | ({"vehicle_gps_position": OLDER_RECEIVER} if older else {})
@@ -178,7 +178,7 @@ def ulog_written(
         types["vehicle_local_position"] += "bool v_xy_valid;bool v_z_valid;bool z_valid;"
     if blended:
         types["sensor_gps"] = types["vehicle_gps_position"]
-    begins_us = BOOT_US + (1_790_000_000 * 10**6 if unix else 0)
+    begins_us = BOOT_US + on_for_us
     if ahead_us:
         types["vehicle_gps_position"] += "int32_t timestamp_time_relative;"
     log = [b"ULog\x01\x12\x35\x01" + struct.pack("<Q", begins_us), ulog_message("B", bytes(40))]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dappled.drivers.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
+from dappled.drivers.utc_choice import RELEASED_NS, ROLLOVER_NS, Date, UtcBounds, rolled_over, rollovers
 from dappled.findings import Finding, Subject
 
 _SAME_NS = 50_000_000  # offsets further apart are a step: crystals drift by less between two messages
@@ -27,7 +27,7 @@ class AutopilotUtc:
         self._rolled_ns = unix_ns if date is Date.ROLLED_OVER else None
         if date in (Date.ROLLED_OVER, Date.IMPOSSIBLE):
             return date is Date.ROLLED_OVER
-        offset_ns = unix_ns - boot_ns + (ROLLOVER_NS if date is Date.MENDED else 0)
+        offset_ns = (_later_ns(unix_ns) if date is Date.MENDED else unix_ns) - boot_ns
         if self.offset_ns is None or abs(offset_ns - self.offset_ns) <= _SAME_NS:
             self.offset_ns, self._said = offset_ns, 0
             return True
@@ -39,4 +39,9 @@ class AutopilotUtc:
 
     def doubt(self) -> Finding | None:
         """What is to be said of the last date."""
-        return None if self._rolled_ns is None else rolled_over(Subject("link"), self._rolled_ns)
+        early_ns = self._rolled_ns
+        return None if early_ns is None else rolled_over(Subject("link"), early_ns, _later_ns(early_ns))
+
+
+def _later_ns(unix_ns: int) -> int:
+    return unix_ns + rollovers(unix_ns, RELEASED_NS) * ROLLOVER_NS

@@ -26,7 +26,7 @@ from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
 from dappled.drivers.mavlink import log_evidence, log_packets
 from dappled.drivers.mavlink.log_evidence import Chosen, LoggedPlaces, Missing, Receiver
 from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
-from dappled.drivers.utc_choice import UtcBounds
+from dappled.drivers.utc_choice import UtcBounds, rollovers
 from dappled.errors import first_line
 from dappled.findings import Code, Finding, Subject, finding
 
@@ -131,6 +131,9 @@ def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
     try:
         while (message := log.recv_match(type=used)) is not None:
             rows[message.get_type()].append(message)
+        begins_us = log_evidence.begins_us([_times(of_type) for of_type in rows.values()])
+        for row in (row for of_type in rows.values() for row in of_type if begins_us):
+            row.TimeUS -= begins_us
         return rows, log.cut_short()
     finally:
         log.filehandle.close()
@@ -166,9 +169,10 @@ def _receivers(rows: dict[str, list[Any]]) -> Iterator[Receiver]:
         }
         weeks, ms = _column(mine, "GWk"), _column(mine, "GMS")
         sound = (weeks > 0) & (weeks < _MOST_WEEKS) & (ms >= 0) & (ms < _WEEK_US / 1000)
-        gps_us = np.where(sound, weeks, 0).astype(np.int64) * _WEEK_US + np.where(sound, ms, 0).astype(np.int64) * 1000
-        usual_us = int(np.median(gps_us[sound])) if sound.any() else 0
-        leap_us, later_leap_us = _leap_us(usual_us), _leap_us(usual_us + 1024 * _WEEK_US)
+        whole_weeks = np.where(sound, weeks, 0).astype(np.int64)
+        gps_us = whole_weeks * _WEEK_US + np.where(sound, ms, 0).astype(np.int64) * 1000
+        of_week = {week: _leaps_us(week) for week in set(whole_weeks.tolist())}
+        leap_us, later_us = np.array([of_week[week] for week in whole_weeks.tolist()], np.int64).reshape(-1, 2).T
         yield Receiver(
             number + 1,
             at,
@@ -181,15 +185,18 @@ def _receivers(rows: dict[str, list[Any]]) -> Iterator[Receiver]:
             _column(mine, "HDop"),
             known["VDop"],
             np.stack([known[name] for name in ("HAcc", "VAcc", "SAcc")]),
+            later_us,
             _column(mine, "U") > 0 if all(hasattr(row, "U") for row in mine) else None,
-            1024 * _WEEK_US - (later_leap_us - leap_us),
         )
 
 
-def _leap_us(gps_us: int) -> int:
-    """By how much GPS time is ahead of UTC."""
-    gps = GPS_EPOCH + timedelta(microseconds=gps_us)
-    return round((gps - gps_to_utc(gps)).total_seconds()) * 10**6
+def _leaps_us(week: int) -> tuple[int, int]:
+    """By how much GPS time is ahead of UTC in a week, and how much later in UTC the date is that its missing roll-overs
+    give."""
+    gps = GPS_EPOCH + timedelta(weeks=week)
+    later = gps + 1024 * rollovers((_GPS_EPOCH_US + week * _WEEK_US) * 1000) * timedelta(weeks=1)
+    leap_us, later_leap_us = (round((one - gps_to_utc(one)).total_seconds()) * 10**6 for one in (gps, later))
+    return leap_us, (later - gps) // timedelta(microseconds=1) - (later_leap_us - leap_us)
 
 
 def _positions(path: Path, rows: dict[str, list[Any]], missing: Missing, told: list[Finding]) -> Iterator[Timed]:

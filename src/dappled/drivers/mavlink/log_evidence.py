@@ -25,7 +25,7 @@ from dappled.drivers.mavlink.sample_judge import (
     steady,
     turned,
 )
-from dappled.drivers.utc_choice import ROLLOVER_NS, Date, UtcBounds, rolled_over
+from dappled.drivers.utc_choice import Date, UtcBounds, rolled_over
 from dappled.findings import Code, Finding, Subject, finding
 
 BOOT_MAX_US = 2**32 * 1000  # MAVLink's milliseconds since boot
@@ -84,8 +84,8 @@ class Receiver:
     hdop: Floats
     vdop: Floats
     accuracy: Floats
+    later_us: NDArray[np.int64]
     used: Chosen | None = None
-    later_us: int = ROLLOVER_NS // 1000
 
     @property
     def fixed(self) -> Chosen:
@@ -118,6 +118,15 @@ class Receiver:
             return 0.0, 0.0, 0.0, -self.number
         kind, satellites = float(np.median(self.fix_type[fixed])), float(np.nanmedian(self.satellites[fixed]))
         return round(float(fixed.mean()), 1), kind, satellites, -self.number
+
+
+def begins_us(times_us: Sequence[NDArray[Any]]) -> int:
+    """Since when a log's stamps (µs) are to be counted: 0, but where they pass MAVLink's 32 bits of milliseconds (a
+    vehicle that is on for weeks, a simulator whose stamps are Unix time): half of that before their median."""
+    stamps = np.concatenate([np.zeros(0, dtype=np.int64), *times_us])
+    stamps = stamps[(stamps >= 0) & (stamps < 2**53)]
+    usual = int(np.median(stamps)) if stamps.size else 0
+    return max(0, usual - BOOT_MAX_US // 2) // 10**6 * 10**6
 
 
 def in_time(boots_us: Any) -> Chosen:
@@ -202,22 +211,18 @@ def utc_clock(
             continue
         boots_us = np.concatenate([one.boots_us[which] for one, which in rows])
         utc_us = np.concatenate([one.utc_us[which] for one, which in rows])
-        later_us = np.concatenate([np.full(int(which.sum()), one.later_us) for one, which in rows])
-        dates = _dates(utc_us, bounds)
-        for wanted in (Date.TRUE, Date.MENDED, Date.ROLLED_OVER):
-            these = dates == wanted.value
-            if not these.any() or (wanted is Date.ROLLED_OVER and doubted is not None):
-                continue
-            true_us = utc_us + (later_us if wanted is Date.MENDED else 0)
-            try:
-                clock = log_packets.log_clock(boots_us[these], (true_us - boots_us)[these])
-            except AutopilotLogError as error:
-                raise AutopilotLogError(f"{path}: {error}") from None
-            first_ns = int(np.median(utc_us[these])) * 1000
-            told = rolled_over(Subject("log", str(path)), first_ns, mended=wanted is Date.MENDED)
-            if wanted is not Date.ROLLED_OVER:
-                return clock, [] if wanted is Date.TRUE else [told]
-            doubted = clock, [told]
+        later_us = np.concatenate([one.later_us[which] for one, which in rows])
+        wanted, true_us, told = _dated(path, utc_us - boots_us, utc_us, later_us, bounds)
+        if wanted is None:
+            continue
+        these = true_us > 0
+        try:
+            clock = log_packets.log_clock(boots_us[these], (true_us - boots_us)[these])
+        except AutopilotLogError as error:
+            raise AutopilotLogError(f"{path}: {error}") from None
+        if wanted is not Date.ROLLED_OVER:
+            return clock, told
+        doubted = doubted or (clock, told)
     if doubted is not None:
         return doubted
     if any_fix:
@@ -225,6 +230,40 @@ def utc_clock(
             f"{path} holds fixes of a satellite receiver, but no date that can be true: its time in UTC is not known"
         )
     raise AutopilotLogError(f"{path} holds no fix of a satellite receiver: its time in UTC is not known")
+
+
+def _dated(
+    path: Path, offsets_us: NDArray[np.int64], utc_us: NDArray[np.int64], later_us: NDArray[np.int64], bounds: UtcBounds
+) -> tuple[Date | None, NDArray[np.int64], list[Finding]]:
+    """What most of a receiver's dates that can be true are, the times that count (n,), 0 for the others, and what is to
+    be said of them. Dates that others of the same clock show to have rolled over are mended."""
+    dates = _dates(utc_us, bounds)
+    true, mended, rolled = (dates == one.value for one in (Date.TRUE, Date.MENDED, Date.ROLLED_OVER))
+    sure = true | mended
+    if sure.any() and rolled.any():
+        begun_us = np.median((offsets_us + np.where(mended, later_us, 0))[sure])
+        agrees = np.abs(offsets_us + later_us - begun_us) < _DAY_US
+        mended, rolled = mended | (rolled & agrees), rolled & ~agrees
+    counts = {Date.TRUE: int(true.sum()), Date.MENDED: int(mended.sum()), Date.ROLLED_OVER: int(rolled.sum())}
+    if not any(counts.values()):
+        return None, utc_us, []
+    early = rolled if counts[Date.ROLLED_OVER] > counts[Date.TRUE] + counts[Date.MENDED] else mended
+    subject, later = Subject("log", str(path)), np.where(early, utc_us + later_us, 0)
+    told = (
+        [
+            rolled_over(
+                subject,
+                int(np.median(utc_us[early])) * 1000,
+                int(np.median(later[early])) * 1000,
+                mended=early is mended,
+            )
+        ]
+        if early.any()
+        else []
+    )
+    if early is rolled:
+        return Date.ROLLED_OVER, np.where(rolled, utc_us, 0), told
+    return Date.TRUE, np.where(mended, later, np.where(true, utc_us, 0)), told
 
 
 def _dates(utc_us: NDArray[np.int64], bounds: UtcBounds) -> NDArray[np.int64]:

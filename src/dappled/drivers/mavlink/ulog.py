@@ -20,7 +20,6 @@ from dappled.decode.array_types import Floats
 from dappled.drivers import reader_process
 from dappled.drivers.mavlink import log_evidence, log_packets
 from dappled.drivers.mavlink.log_evidence import (
-    BOOT_MAX_US,
     Chosen,
     LoggedPlaces,
     Missing,
@@ -29,7 +28,7 @@ from dappled.drivers.mavlink.log_evidence import (
 from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
 from dappled.drivers.mavlink.sample_judge import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.reader_process import Budget
-from dappled.drivers.utc_choice import UtcBounds
+from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds, rollovers
 from dappled.errors import first_line, install_extra
 from dappled.findings import Finding
 
@@ -131,8 +130,8 @@ def _place_at(log: _Topics, boot_us: int) -> tuple[float, float] | None:
 
 @dataclass(frozen=True, slots=True)
 class _Topics:
-    """A log's topics: of the first instance each, and all of the receivers'. Stamps count from `begins_us`: 0, but for
-    a simulator whose stamps are Unix time."""
+    """A log's topics: of the first instance each, and all of the receivers'. Stamps count from
+    `begins_us` (see `log_evidence.begins_us`)."""
 
     first: Mapping[str, Columns]
     receivers: Mapping[str, Sequence[Columns]]
@@ -141,14 +140,11 @@ class _Topics:
     @classmethod
     def read(cls, path: Path, names: Sequence[str]) -> Self:
         """A log that was cut off is read up to there."""
-        topics = _opened(path, names)
-        first = {name: data for (name, instance), data in topics.items() if instance == 0}
-        receivers = {name: [topics[key] for key in sorted(topics) if key[0] == name] for name in _RECEIVERS}
-        stamps = [
-            topic["timestamp"] for topic in (*first.values(), *(one for each in receivers.values() for one in each))
-        ]
-        usual = int(np.median(np.concatenate(stamps))) if stamps else 0
-        begins_us = usual // BOOT_MAX_US * BOOT_MAX_US if usual < 2**53 else 0
+        opened = _opened(path, names)
+        first = {name: data for (name, instance), data in opened.items() if instance == 0}
+        receivers = {name: [opened[key] for key in sorted(opened) if key[0] == name] for name in _RECEIVERS}
+        topics = (*first.values(), *(one for each in receivers.values() for one in each))
+        begins_us = log_evidence.begins_us([topic["timestamp"].astype(np.float64) for topic in topics])
         return cls(first, receivers, begins_us)
 
     def times(self, topic: Columns, name: str) -> Any:
@@ -234,6 +230,7 @@ def _receiver(path: Path, log: _Topics, number: int, topic: Columns) -> Receiver
         _column(topic, "hdop"),
         _column(topic, "vdop"),
         np.stack([_column(topic, name) for name in ("eph", "epv", "s_variance_m_s")]),
+        np.array([rollovers(one * 1000) * ROLLOVER_NS // 1000 for one in utc_us.tolist()], dtype=np.int64),
     )
 
 
