@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, ulog
 from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds
 from dappled.findings import Code, Finding, Level, text
+from dappled.flight.log_reading import split
 from tests.drivers.mavlink.true_logs import BOOT_US, UTC_US, Row, poses, rewritten, same_fix, ulog_written, written
 
 NAN, POSITION = math.nan, 33
@@ -212,6 +214,39 @@ def test_a_week_that_rolled_over_costs_replay_its_good_face(tmp_path: Path, caps
     shown = capsys.readouterr()
     assert '"arrived_utc_ns": 1795256103' in shown.out
     assert "as another clock says" in shown.err
+
+
+@pytest.mark.parametrize("form", ["bin", "tlog"])
+@pytest.mark.parametrize(("interval_s", "code"), [(1, 0), (9, 1)])
+def test_a_log_that_was_cut_short_is_in_doubt_where_frames_need_the_rest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str, interval_s: int, code: int
+) -> None:
+    log = written(tmp_path)[form == "tlog"]
+    log.write_bytes(log.read_bytes()[:-3])
+    (tmp_path / "frames").mkdir()
+    for name in ("1.jpg", "2.jpg"):
+        Image.new("RGB", (16, 16)).save(tmp_path / "frames" / name)
+    call = ["replay", str(tmp_path / "frames"), "--telemetry", str(log), "--interval", str(interval_s)]
+    assert main(call) == code
+    said = capsys.readouterr().err
+    if form == "bin" or code:  # of a link's log no more is read than the frames need
+        assert f"{'caution' if code else 'note'}: log {log}: " in said
+    assert main([*call, "--anyway"]) == 0
+
+
+@pytest.mark.parametrize(("start_s", "code"), [(1.0, 0), (2.5, 1)])
+def test_a_hole_in_a_tlog_is_in_doubt_where_a_frame_lies_in_it(tmp_path: Path, start_s: float, code: int) -> None:
+    _, link = written(tmp_path)
+    data = bytearray(link.read_bytes())
+    stamps_us = [stamp_us for stamp_us, _ in split(bytes(data))]
+    begin, end = (data.find((stamps_us[0] + at_us).to_bytes(8, "big")) for at_us in (2_000_000, 3_000_000))
+    assert 0 < begin < end
+    data[begin:end] = bytes(end - begin)
+    link.write_bytes(data)
+    (tmp_path / "frames").mkdir()
+    Image.new("RGB", (16, 16)).save(tmp_path / "frames" / "1.jpg")
+    start = datetime.fromtimestamp(stamps_us[0] / 1e6 + start_s, UTC).isoformat()
+    assert main(["replay", str(tmp_path / "frames"), "--telemetry", str(link), "--start", start]) == code
 
 
 def test_the_leap_seconds_are_those_of_the_flight(tmp_path: Path) -> None:

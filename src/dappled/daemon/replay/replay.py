@@ -6,7 +6,7 @@ import math
 import threading
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import sleep
@@ -214,6 +214,22 @@ def _only_log(folder: Path) -> Path | None:
     return logs[0] if logs else None
 
 
+@dataclass(slots=True)
+class _Gap:
+    """What is missing in a log, after and before which stamps (None: not read yet, or to its end), and how many frames
+    were exposed there."""
+
+    told: Finding
+    after_ns: int | None = None
+    before_ns: int | None = None
+    frames: int = 0
+
+    def finding(self) -> Finding:
+        """It is no more than a note where no frame needs what is missing."""
+        level = self.told.level if self.frames else Level.NOTE
+        return replace(self.told, level=level, facts={**self.told.facts, "frames": self.frames})
+
+
 class RecordedTelemetry:
     """Poses from a telemetry file, fed packet by packet just as far as each frame's pose was made from."""
 
@@ -239,9 +255,10 @@ class RecordedTelemetry:
             cam_idx=cam_idx,
             attitude_sigma_rad=attitude_sigma_rad,
         )
-        self._path = path
-        self._packets = packets(path, report, bounds) if path else iter(())
-        self._fed = 0
+        self._path, self._report = path, report
+        self._packets = packets(path, self._found, bounds) if path else iter(())
+        self._fed = self._last_ns = 0
+        self._gaps: list[_Gap] = []
 
     @classmethod
     def flown(
@@ -275,12 +292,20 @@ class RecordedTelemetry:
                 break
             packet = next(self._packets, None)
             if packet is None:
+                for gap in self._gaps:
+                    gap.after_ns = self._last_ns if gap.after_ns is None else gap.after_ns
                 break
             number, stamp_us, message = packet
             self._telemetry.feed(number, stamp_us, message)
-            self._fed = number + 1
-            if horizon is None and stamp_us * 1000 > exposure.utc_ns + self._wait_ns:
+            self._fed, self._last_ns = number + 1, stamp_us * 1000
+            for gap in self._gaps:
+                if gap.after_ns is not None and gap.before_ns is None:
+                    gap.before_ns = self._last_ns
+            if horizon is None and self._last_ns > exposure.utc_ns + self._wait_ns:
                 break
+        for gap in self._gaps:
+            within = gap.after_ns is not None and gap.after_ns < exposure.utc_ns
+            gap.frames += within and (gap.before_ns is None or exposure.utc_ns < gap.before_ns)
         return self._telemetry.locate(exposure, upto_packet=horizon)
 
     def rates(self, pose: Pose) -> Vector3 | None:
@@ -288,11 +313,21 @@ class RecordedTelemetry:
         return self._telemetry.rates(pose)
 
     def findings(self) -> list[Finding]:
-        """What is to be said of what was fed."""
+        """What is to be said of what was fed, and of what is missing in the log."""
+        gaps = sorted((gap.finding() for gap in self._gaps), key=lambda one: -one.level)
         if not (count := self._telemetry.statistics().impossible):
-            return []
+            return gaps
         subject = Subject("log", str(self._path))
-        return [finding(Code.LOG_VALUES_MISSING, subject, values=f"{count} of its messages")]
+        return [*gaps, finding(Code.LOG_VALUES_MISSING, subject, values=f"{count} of its messages")]
+
+    def _found(self, one: Finding) -> None:
+        """Report what was found in the log; of a gap the frames decide how much it weighs."""
+        if one.code is Code.LOG_BYTES_SKIPPED:
+            self._gaps.append(_Gap(one, after_ns=self._last_ns))
+        elif one.code is Code.LOG_CUT_SHORT:
+            self._gaps.append(_Gap(one))
+        else:
+            self._report(one)
 
 
 class ReplayProgress(Observer):
