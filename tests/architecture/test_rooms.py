@@ -55,6 +55,26 @@ THREADS = {
     "mocks/scene/flyover.py": "the views of one picture are rendered side by side; the call waits for them",
 }
 
+# What of a flight's rooms reads or waits for the machine's time past the clock that it was given, and why.
+PAST_THE_CLOCK = {
+    "daemon/console/feed.py": "the console's own process: asyncio waits there",
+    "daemon/health/host_checks.py": "`doctor` looks at the machine's own camera, without a flight",
+    "daemon/pipeline/decode_process.py": "the turns of a process",
+    "daemon/pipeline/decode_worker.py": "the decoder's own process: how long it computed",
+    "daemon/replay/replay.py": "a replay's patience with processes that decode",
+    "daemon/stream/publisher.py": "ZeroMQ",
+    "daemon/stream/relay_process.py": "a process of its own, which waits for sockets",
+    "daemon/stream/sockets.py": "ZeroMQ",
+    "daemon/stream/subscriber.py": "ZeroMQ, in another process",
+    "drivers/child_process.py": "processes",
+    "drivers/gnss/port.py": "a serial device",
+    "drivers/gphoto2/client.py": "the process of libgphoto2",
+    "drivers/mavlink/channels.py": "sockets and serial devices",
+    "drivers/raw/darkroom.py": "how long a frame took to compute, in the decoder's process",
+    "drivers/reader_process.py": "processes",
+}
+CLOCKS = {"_clock", "clock", "_patience", "_transport"}
+
 # Assignments of benchmarks that change data, and nothing that ships.
 DATA = {"pose": ("setattr(message, ", "message.h_acc = ")}  # fields of MAVLink messages that it has just made
 
@@ -154,6 +174,28 @@ def test_threads_are_loops() -> None:
     made = {name(module) for module in MODULES if makers & _calls(module)}
     assert made - set(THREADS) == set()
     assert set(THREADS) - made == set(), "these make none by now: strike them from the list"
+
+
+def test_waits_of_a_flight_go_through_its_clock() -> None:
+    """So that a whole flight can run in virtual time, and nothing in it waits unseen."""
+    rooms = [SOURCE / room for room in ("daemon", "drivers", "flight")]
+    found = {name(module) for module in MODULES if set(rooms) & set(module.parents) and _past_the_clock(module)}
+    assert found - set(PAST_THE_CLOCK) == set()
+    assert set(PAST_THE_CLOCK) - found == set(), "these ask the clock by now: strike them from the list"
+
+
+def _past_the_clock(module: Path) -> list[str]:
+    """Calls that read the machine's time, or wait for something with its time."""
+    tree, found = ast.parse(module.read_text(encoding="utf-8")), list[str]()
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    for node in (one for one in ast.walk(tree) if isinstance(one, ast.Call)):
+        *of, called = ast.unparse(node.func).split(".")
+        bounded = any(word.arg in {"timeout", "timeout_s"} for word in node.keywords)
+        reads = of in (["time"], ["select"], ["selectors"]) and of[0] in imported
+        waits = called in {"wait", "wait_for", "poll"} or (called in {"acquire", "get", "run"} and bounded)
+        if reads or (waits and of and of[-1] not in CLOCKS):
+            found.append(ast.unparse(node))
+    return found
 
 
 def _calls(module: Path) -> set[str]:

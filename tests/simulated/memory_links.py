@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import heapq
 import random
+from collections.abc import Callable
 from math import inf
 from typing import cast
 
@@ -76,6 +77,7 @@ class MemoryNetwork:
         self._cuts = [(began_ns + round(start * 1e9), began_ns + round(end * 1e9)) for start, end in cuts]
         self.sockets: dict[int, MemorySocket] = {}
         self.sent: list[tuple[int, int, int, bytes]] = []
+        self.watch: Callable[[int, bytes], object] = lambda source, data: None
         self._order = 0
         self._next_port = _AWAY
 
@@ -100,6 +102,7 @@ class MemoryNetwork:
     def carry(self, source: int, to: int, data: bytes) -> None:
         """A datagram is sent."""
         now_ns = self.clock.monotonic_ns()
+        self.watch(source, data)
         self.sent.append((now_ns, source, to, data))
         chance, faults = self._random.random, self._faults
         if to not in self.sockets or any(start <= now_ns < end for start, end in self._cuts):

@@ -134,11 +134,13 @@ class VirtualClock:
         self._turns += 1
         if self._turns > _TURNS:
             return self._give_up(f"{_TURNS} turns at one moment")
-        while not (ready := [one for one in self._paused if one.until_ns <= self._now_ns or one.holds()]):
-            earliest_ns = min((one.until_ns for one in self._paused), default=inf)
+        paused = self._paused
+        if not (ready := [one for one in paused if one.until_ns <= self._now_ns or one.holds()]):
+            earliest_ns = min([one.until_ns for one in paused], default=inf)
             if earliest_ns == inf:
                 return self._give_up("all wait without end")
             self._now_ns, self._turns = int(earliest_ns), 0
+            ready = [one for one in paused if one.until_ns <= earliest_ns]  # time alone changes nothing else
         chosen = ready[0] if len(ready) == 1 else self._random.choice(ready)
         self._paused.remove(chosen)
         return chosen

@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import random
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
+
+import numpy as np
 
 from dappled.config import settings as configuration
 from dappled.config.schema import TomlSource
@@ -19,15 +22,20 @@ from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 from dappled.daemon.service import Service, StandIns
 from dappled.daemon.stream.publisher import Answer, PublisherStatistics
 from dappled.drivers.camera import Arrival, Blob, Fired, Identity, PlainCamera, ShotFailed, StateChanged
-from dappled.drivers.mavlink import MavlinkLinks
-from dappled.mocks.autopilot.autopilot import BootTime, Flyer
+from dappled.drivers.mavlink import MavlinkLinks, mavlink
+from dappled.flight import layout
+from dappled.flight.layout import DiskSpace
+from dappled.mocks.autopilot.autopilot import RATES_HZ, BootTime, Flyer
 from dappled.mocks.autopilot.path import FlightPath
+from dappled.mocks.scene import dng
+from dappled.mocks.scene.dng import Exif
 from dappled.workers import Loop
 from tests.simulated.bad_link import LinkFaults
 from tests.simulated.memory_links import MemoryNetwork
 from tests.simulated.virtual_clock import VirtualClock
 
 AUTOPILOT, GROUND = 14550, 14551
+_OTHERS_HZ = 10.0  # positions
 _IDENTITY = Identity("dappled", "Virtual Camera", "SIM1", "memory")
 
 
@@ -35,9 +43,9 @@ class MemoryCamera(PlainCamera):
     """A camera whose shutter opens 45 to 75 ms after its trigger, and whose files come within a second. One shot in
     `fails` fails, in place of its file."""
 
-    def __init__(self, clock: VirtualClock, seed: int, file: bytes, fails: int = 50) -> None:
+    def __init__(self, clock: VirtualClock, seed: int, fails: int = 50) -> None:
         super().__init__(clock)
-        self._clock, self._file, self._fails = clock, file, fails
+        self._clock, self._fails = clock, fails
         self._random = random.Random(f"camera {seed}")  # noqa: S311  # a simulation
         self._wanted: list[int] = []
         self._stopping = threading.Event()
@@ -71,7 +79,9 @@ class MemoryCamera(PlainCamera):
         if not self._random.randrange(self._fails):
             self.report(ShotFailed(shot, "the mirror is stuck", self._clock.monotonic_ns()))
             return
-        blob = Blob.of(self._file + b"shot %d" % shot)
+        exif = Exif("dappled", "Virtual Camera", "SIM1", 28.0, 8.0, 1e-3, 200, self._clock.utc_ns())
+        plane = np.full((32, 48), 256 + shot, np.uint16)
+        blob = Blob.of(dng.encode(plane, black=256, white=4095, exif=exif))
         self.report(Arrival(shot, f"VIR_{shot:04d}.DNG", blob, self._clock.monotonic_ns()))
 
     def _say(self, state: Any) -> None:
@@ -101,14 +111,15 @@ class MemoryStream:
 
 
 class VirtualAutopilot:
-    """The simulated autopilot, its thread in the clock. Telemetry at `telemetry_hz`; its clock jumps as `boot` says."""
+    """The simulated autopilot, its thread in the clock. Attitudes at `hz`, all else at most at 10 Hz."""
 
     def __init__(self, clock: VirtualClock, network: MemoryNetwork, seed: int, hz: float, boot: BootTime) -> None:
         self._clock = clock
         url = f"udpout:127.0.0.1:{AUTOPILOT}"
         self._links = MavlinkLinks([url], system_id=1, component_id=1, clock=clock, transport=network)
         path, send = FlightPath(seed), self._links.sender.send
-        self._flyer = Flyer(path, clock.monotonic_ns(), boot, send, clock=clock, fastest_hz=hz)
+        rates = dict.fromkeys(RATES_HZ, min(hz, _OTHERS_HZ)) | {mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: hz}
+        self._flyer = Flyer(path, clock.monotonic_ns(), boot, send, clock=clock, fastest_hz=rates)
         self._loop = Loop("autopilot", self._run, clock=clock)
 
     def start(self) -> None:
@@ -158,6 +169,18 @@ def settings(folder: Path) -> Settings:
 
 
 @contextmanager
+def memory_disk(seed: int) -> Iterator[None]:
+    """What the disk and chance would add to a record: free space, and the ends of the folders' names."""
+    chance = random.Random(f"names {seed}")  # noqa: S311  # a simulation
+    space = DiskSpace(10**11, 10**10, 9 * 10**10, 10**6)
+    with (
+        patch("secrets.token_hex", lambda size: chance.randbytes(size).hex()),
+        patch.object(layout, "disk_space", lambda _: space),
+    ):
+        yield
+
+
+@contextmanager
 def started(part: Any) -> Iterator[None]:
     part.start()
     try:
@@ -166,11 +189,14 @@ def started(part: Any) -> Iterator[None]:
         part.stop()
 
 
-def fly(plan: Plan, folder: Path, file: bytes) -> VirtualFlight:
-    """Fly it, from the daemon's start to its end."""
-    with VirtualClock(plan.seed) as clock:
+def fly(plan: Plan, folder: Path, watch: Callable[[bytes], object] | None = None) -> VirtualFlight:
+    """Fly it, from the daemon's start to its end. `watch` is shown each datagram of the daemon before it is on its
+    way."""
+    with VirtualClock(plan.seed) as clock, memory_disk(plan.seed):
         network, stream = MemoryNetwork(clock, plan.seed, plan.faults, plan.cuts), MemoryStream()
-        instead = StandIns(MemoryCamera(clock, plan.seed, file), network, stream)
+        if watch is not None:
+            network.watch = lambda source, data: watch(data) if source in (AUTOPILOT, GROUND) else None
+        instead = StandIns(MemoryCamera(clock, plan.seed), network, stream)
         service = Service(settings(folder), clock=clock, instead=instead)
         autopilot = VirtualAutopilot(clock, network, plan.seed, plan.hz, plan.boot)
         began_ns = clock.monotonic_ns()

@@ -2,13 +2,91 @@
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from tests.simulated.virtual_flight import Plan, fly
+from dappled.drivers.mavlink import PacketParser, mavlink
+from dappled.drivers.mavlink.framing import message_of
+from dappled.flight import LedgerReader
+from tests.simulated.virtual_flight import Plan, VirtualFlight, fly
 from tests.system.flying import assert_whole
 
+TEN_MINUTES = Plan(seed=1, frames=60, interval_s=9.8, hz=5.0, cuts=((100.0, 112.0), (400.0, 403.0)))
 
-def test_a_flight_over_a_bad_link_balances(tmp_path: Path) -> None:
-    flown = fly(Plan(seed=1, frames=3, interval_s=2.0, hz=2.0), tmp_path, b"frame")
-    assert len(flown.outcomes) == 3
+
+@dataclass
+class Announcements:
+    """Looks at the disk whenever the daemon announces a photograph: its frame must be safe by then."""
+
+    flights: Path
+    seen: int = 0
+    early: list[int] = field(default_factory=list)
+
+    def __call__(self, data: bytes) -> None:
+        if message_of(data) != mavlink.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED:
+            return
+        message = PacketParser()(data)
+        assert message is not None
+        if message.capture_result != 1:
+            return
+        self.seen += 1
+        (flight,) = (one.parent for one in self.flights.glob("*/flight.sqlite"))
+        with LedgerReader.open(flight / "flight.sqlite") as ledger:
+            frame, shot = ledger.frame(message.image_index), ledger.shot(message.image_index)
+        if shot is None or shot.state != "safe" or frame is None or not (flight / frame.name).exists():
+            self.early.append(message.image_index)
+
+
+def rows(flight: Path) -> Iterator[tuple[str, list[tuple[object, ...]]]]:
+    """Every row of the ledger, by table."""
+    ledger = sqlite3.connect(flight / "flight.sqlite")
+    for (table,) in ledger.execute("select name from sqlite_master where type = 'table' order by name").fetchall():
+        yield table, ledger.execute(f"select * from {table}").fetchall()  # noqa: S608  # its own names
+    ledger.close()
+
+
+def lawful(plan: Plan, folder: Path) -> VirtualFlight:
+    """Fly the plan; the laws of the pipeline must hold."""
+    announced = Announcements(folder)
+    flown = fly(plan, folder, announced)
+    assert announced.early == []
     assert_whole(flown.folder)
+    with LedgerReader.open(flown.folder / "flight.sqlite") as ledger:
+        states = {row.shot.index: row.state for row in ledger.shots()}
+    assert set(states.values()) <= {"safe", "failed"}
+    assert announced.seen >= list(states.values()).count("safe")
+    assert len(flown.outcomes) == plan.frames
+    for outcome in flown.outcomes:
+        if outcome.index is None:
+            assert outcome.reason, "a request without an end"
+        else:
+            assert states[outcome.index] == ("safe" if outcome.ok else "failed")
+    return flown
+
+
+def test_ten_minutes_over_a_bad_link_are_lawful(tmp_path: Path) -> None:
+    """60 requests, two cuts of the links, packets lost, doubled and late, and every fiftieth shot a failure."""
+    flown = lawful(TEN_MINUTES, tmp_path)
+    assert flown.seconds > 580
+    assert sum(one.ok for one in flown.outcomes) > 50
+
+
+def by_seed(plan: Plan, folder: Path) -> VirtualFlight:
+    """The plan's flight. A second one has every packet and every row of it."""
+    flights = folder / "flights"
+    first = lawful(plan, flights)
+    record = dict(rows(first.folder))
+    shutil.rmtree(flights)  # the same path again: sentences have it
+    second = lawful(plan, flights)
+    assert second.sent == first.sent
+    assert dict(rows(second.folder)) == record
+    return first
+
+
+def test_the_seed_gives_every_packet_and_every_row(tmp_path: Path) -> None:
+    minute = Plan(seed=1, frames=8, interval_s=5.0, hz=5.0, cuts=((20.0, 23.0),))
+    flown = by_seed(minute, tmp_path)
+    assert fly(replace(minute, seed=2), tmp_path / "other").sent != flown.sent

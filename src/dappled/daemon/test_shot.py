@@ -6,12 +6,12 @@ A daemon that runs at the same time is not disturbed, but only one of them can h
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from dappled.clock import Clock, SystemClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import clocks
 from dappled.daemon.pipeline.capture import Observer, PendingShot
@@ -50,13 +50,14 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[TestShot
         publish=replace(settings.publish, slices=f"ipc://{sockets}/s", ask=f"ipc://{sockets}/a"),
         console=replace(settings.console, bind=""),
     )
-    ended = EndedShots()
-    service = Service(ours, observer=ended)
+    clock = SystemClock()
+    ended = EndedShots(clock)
+    service = Service(ours, observer=ended, clock=clock)
     service.start()
-    loop = Loop("test shot", service.run)
+    loop = Loop("test shot", service.run, clock=clock)
     loop.start()
     try:
-        yield TestShot(service, ended)
+        yield TestShot(service, ended, clock)
     finally:
         service.ask_to_stop()
         loop.stop(5)
@@ -66,7 +67,8 @@ def daemon(settings: Settings, sockets: Path, record: Path) -> Iterator[TestShot
 class EndedShots(Observer):
     """Keeps the shots that have ended."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
         self._shots: dict[int, PendingShot] = {}
         self._changed = threading.Condition()
 
@@ -76,18 +78,19 @@ class EndedShots(Observer):
             self._shots[pending.shot.index] = pending
             self._changed.notify_all()
 
-    def wait_for(self, index: int, timeout_s: float) -> PendingShot | None:
+    def until_ended(self, index: int, timeout_s: float) -> PendingShot | None:
         """The shot once it has ended; None if that takes longer than `timeout_s`."""
         with self._changed:
-            self._changed.wait_for(lambda: index in self._shots, timeout_s)
+            self._clock.wait_for(self._changed, lambda: index in self._shots, timeout_s)
             return self._shots.get(index)
 
 
 class TestShot:
     """A running daemon to take shots with."""
 
-    def __init__(self, service: Service, ended: EndedShots) -> None:
-        self._service, self._ended = service, ended
+    def __init__(self, service: Service, ended: EndedShots, clock: Clock) -> None:
+        self._service, self._ended, self._clock = service, ended, clock
+        self._never = threading.Event()
         self._requests = 0
 
     @property
@@ -97,11 +100,11 @@ class TestShot:
 
     def until_ready(self, timeout_s: float = READY_S) -> None:
         """Wait for the camera. Raises DappledError with the camera's own reason."""
-        until = time.monotonic() + timeout_s
+        until_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
         while (state := self._service.health()["camera"])["state"] != "ready":
-            if time.monotonic() >= until:
+            if self._clock.monotonic_ns() >= until_ns:
                 raise DappledError(f"the camera is not ready after {timeout_s:g} s: {state['state']} {state['reason']}")
-            time.sleep(_LOOK_S)
+            self._clock.wait(self._never, _LOOK_S)
 
     def shoot(self, timeout_s: float = END_S) -> PendingShot:
         """Take one shot and wait for its end. Raises DappledError where it is refused, or does not end."""
@@ -110,7 +113,7 @@ class TestShot:
         decision = self._service.request(CaptureRequest("doctor", "test shot", self._requests, acknowledged=False))
         if decision.index is None or not decision.accepted:
             raise DappledError(f"the shot was refused: {decision.words}")
-        pending = self._ended.wait_for(decision.index, timeout_s)
+        pending = self._ended.until_ended(decision.index, timeout_s)
         if pending is None:
             raise DappledError(f"the shot did not end within {timeout_s:g} s")
         return pending

@@ -52,7 +52,8 @@ class JumpFinder:
         across_m_s, upright_m_s = _steady_m_s(last, sample)
         most, by_m = 0.0, (0.0, 0.0, 0.0)
         for one in self._sums:
-            north, east, down = (a - b for a, b in zip(found.metres, one.metres, strict=True))
+            then = one.metres
+            north, east, down = metres[0] - then[0], metres[1] - then[1], metres[2] - then[2]
             floor_m = _FLOOR_M + found.allowed_m - one.allowed_m
             across_m = math.hypot(north, east) - floor_m - _STALE_S * across_m_s
             upright_m = abs(down) - floor_m - _STALE_S * upright_m_s

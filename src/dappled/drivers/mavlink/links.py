@@ -110,7 +110,7 @@ class Link:
 
     def __init__(self, number: int, address: Address, guard: SignatureGuard | None, transport: Transport) -> None:
         self.number, self._transport = number, transport
-        self.address = address
+        self.address, self.exposed = address, address.exposed
         self.guard = guard
         self.channel: ByteChannel | None = None
         self.error: str | None = None
@@ -451,7 +451,7 @@ class MavlinkLinks:
                 link.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
-            exposed = link.address.exposed and not signed
+            exposed = link.exposed and not signed
             packet = self.sender.logged(link, stamp_us, framed, trusted=trusted, exposed=exposed)
             if self.sender.has_same_ids(framed):
                 packet = replace(packet, same_ids=f"{channel.source() or 'the other end'} of {link.address.url}")

@@ -5,8 +5,8 @@ Where files come only after the flight, each shot is deferred at once. `file_wat
 
 from __future__ import annotations
 
-import queue
 import threading
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -63,10 +63,10 @@ class ComposedCamera(PlainCamera):
         settings: ComposedSettings,
         clock: Clock | None = None,
     ) -> None:
-        super().__init__()
-        self._identity, self._line, self._settings = identity, line, settings
         self._clock = clock or TimeOfDayClock()
-        self._requested: queue.SimpleQueue[int] = queue.SimpleQueue()
+        super().__init__(self._clock)
+        self._identity, self._line, self._settings = identity, line, settings
+        self._requested, self._asked = deque[int](), threading.Event()
         self._lock = threading.Lock()
         self._open: dict[int, None] = {}  # shots that have not ended
         self._stopping = threading.Event()
@@ -85,9 +85,9 @@ class ComposedCamera(PlainCamera):
                 pair_s=settings.pair_s,
             )
         self._looked = threading.Event()  # the files from before the first shot are known, or there is no source
-        self._loops = [Loop("shutter line", self._fire_all, self._stopping)]
+        self._loops = [Loop("shutter line", self._fire_all, self._stopping, self._clock)]
         if self._watch is not None:
-            self._loops.append(Loop("pickup", self._pick_up, self._stopping))
+            self._loops.append(Loop("pickup", self._pick_up, self._stopping, self._clock))
 
     def use_autopilot(self, send: CommandSender) -> None:
         """See UsesAutopilot: hand it on to a line that is fired by the autopilot."""
@@ -110,7 +110,8 @@ class ComposedCamera(PlainCamera):
             ready = self._ready.is_set() and not self._stopping.is_set() and len(self._open) < _WAITING
             if ready:
                 self._open[shot] = None
-                self._requested.put(shot)
+                self._requested.append(shot)
+                self._asked.set()
                 return
             reason = "too many shots wait for their files" if self._ready.is_set() else self._line_fault
         if self._stopping.is_set():
@@ -126,7 +127,7 @@ class ComposedCamera(PlainCamera):
         """See Camera."""
         with self._lock:
             self._stopping.set()
-        self._requested.put(-1)
+        self._asked.set()
         self._shot_fired.set()
         self._looked.set()
         for loop in self._loops:
@@ -145,9 +146,10 @@ class ComposedCamera(PlainCamera):
     def _fire_all(self) -> None:
         opened = self._open_line()
         while opened and not self._stopping.is_set():
-            shot = self._requested.get()
-            if not self._stopping.is_set():
-                opened = self._fire_one(shot)
+            self._clock.pause(self._asked, None)
+            self._asked.clear()
+            while self._requested and opened and not self._stopping.is_set():
+                opened = self._fire_one(self._requested.popleft())
         if self._opened:
             self._tried(self._line.close)
 
@@ -178,7 +180,7 @@ class ComposedCamera(PlainCamera):
             if problem != said:
                 said = problem
                 self._line_lost(problem)
-            self._stopping.wait(self._settings.retry_s)
+            self._clock.pause(self._stopping, self._settings.retry_s)
             if self._opened:
                 self._tried(self._line.close)
         return False
@@ -189,7 +191,7 @@ class ComposedCamera(PlainCamera):
         Where files come later, a slow source does not hold up shooting for longer than `_FIRST_LOOK_S`.
         """
         in_flight = self._settings.follows is None
-        while not self._looked.wait(_FIRST_LOOK_S) and in_flight:
+        while not self._clock.pause(self._looked, _FIRST_LOOK_S) and in_flight:
             continue  # a source answers in the end, and `stop` sets the event too
 
     def _line_lost(self, problem: str) -> None:
@@ -198,11 +200,8 @@ class ComposedCamera(PlainCamera):
             self._ready.clear()
             self._line_fault = problem
             self.report(StateChanged("faulted", problem, self._clock.monotonic_ns()))
-        while True:
-            try:
-                shot = self._requested.get_nowait()
-            except queue.Empty:
-                return
+        while self._requested:
+            shot = self._requested.popleft()
             self._end(shot, ShotFailed(shot, problem, self._clock.monotonic_ns()))
 
     def _fire_one(self, shot: int) -> bool:
@@ -211,7 +210,7 @@ class ComposedCamera(PlainCamera):
         problem = ""
         if isinstance(self._line, HalfPressedLine):
             problem = self._tried(self._line.prepare)
-            if not problem and self._stopping.wait(self._line.lead_s):
+            if not problem and self._clock.pause(self._stopping, self._line.lead_s):
                 self._tried(self._line.let_go)
                 return False
         called_ns = self._clock.monotonic_ns()
@@ -228,14 +227,14 @@ class ComposedCamera(PlainCamera):
         if self._settings.follows is not None:
             self._end(shot, Deferred(shot, self._settings.follows, self._clock.monotonic_ns()))
         if not isinstance(self._line, OutsideLine):
-            self._stopping.wait(self._settings.hold_s)
+            self._clock.pause(self._stopping, self._settings.hold_s)
         problem = self._tried(self._line.let_go)
         if not problem:
             self._rest()
             return True
         problem = f"{_PRESSED}: {problem}"
         self._line_lost(problem)
-        self._stopping.wait(self._settings.retry_s)
+        self._clock.pause(self._stopping, self._settings.retry_s)
         return self._open_line(problem, pressed=True)
 
     def _rest(self) -> None:
@@ -272,9 +271,9 @@ class ComposedCamera(PlainCamera):
             if fault != self._files_fault:
                 self._files_fault = fault
                 self._rest()
-            self._shot_fired.wait(self._settings.poll_s)
+            self._clock.pause(self._shot_fired, self._settings.poll_s)
             self._shot_fired.clear()
-            self._stopping.wait(self._settings.poll_s / 4)
+            self._clock.pause(self._stopping, self._settings.poll_s / 4)
         for left in self._watch.left():
             self.report(left)
         self._watch.close()

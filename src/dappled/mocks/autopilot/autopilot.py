@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,6 +37,7 @@ RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
+_FASTEST_HZ = 100.0
 _LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
 
 
@@ -154,8 +155,8 @@ class Flyer:
 
     `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras. `relay` sends
     what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `has` is what it sends
-    on request alone. It is armed from `arms_s` after the flight's beginning on, and sends nothing more often than at
-    `fastest_hz`.
+    on request alone. It is armed from `arms_s` after the flight's beginning on, and sends a message no
+    more often than `fastest_hz` says.
     """
 
     path: FlightPath
@@ -175,11 +176,11 @@ class Flyer:
     contacts: deque[int] = field(default_factory=deque)
     random: random.Random = field(default_factory=lambda: random.Random(0))  # noqa: S311 (a simulation)
     clock: Clock = field(default_factory=TimeOfDayClock)
-    fastest_hz: float = 100.0
+    fastest_hz: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for message_id, rate in RATES_HZ.items():
-            self.interval_ns[message_id] = round(1e9 / min(rate, self.fastest_hz))
+            self.interval_ns[message_id] = round(1e9 / min(rate, self.fastest_hz.get(message_id, rate)))
             self.due_ns[message_id] = 0
 
     def boot_ns(self, monotonic_ns: int) -> int:
@@ -267,7 +268,9 @@ class Flyer:
         if not (math.isfinite(interval_us) and interval_us > 0):
             return int(mavlink.MAV_RESULT_DENIED)
         with self.lock:
-            self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / self.fastest_hz))
+            self.interval_ns[int(number)] = max(
+                round(interval_us * 1e3), round(1e9 / self.fastest_hz.get(int(number), _FASTEST_HZ))
+            )
             self.due_ns.setdefault(int(number), 0)
         return int(mavlink.MAV_RESULT_ACCEPTED)
 

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dappled.decode.geometry import Quaternion, Vector3
 
@@ -50,22 +49,33 @@ class FlightPath:
     radius_m: float = 25.0
 
     def pose(self, t_s: float) -> TruePose:
-        """The true pose at `t_s`. Velocity and body rates are derivatives of what position and attitude say."""
-        step = 1e-3
-        places, turns = self._places(t_s + step * np.array((-1.0, 0.0, 1.0)))
-        velocity = (places[2] - places[0]) / (2 * step)
-        before, _, after = turns.as_matrix()
-        turned = before.T @ after  # in body axes, over two steps: so little that its skew part says it all
-        rates = np.array((turned[2, 1], turned[0, 2], turned[1, 0])) / (2 * step)
-        x, y, z, w = turns.as_quat()[1].tolist()
-        north, east, down = places[1].tolist()
+        """The true pose at `t_s`. Velocity and body rates are the derivatives of position and attitude."""
+        phase = _phases(self.seed)
+        turn_rad_s = self.speed_m_s / self.radius_m
+        angle = turn_rad_s * t_s + phase[0]
+        cos, sin = math.cos(angle), math.sin(angle)
+        north, east = self.radius_m * cos, self.radius_m * sin
+        down = -self.height_m - 0.4 * math.sin(0.5 * t_s + phase[1])
+        velocity = (-self.speed_m_s * sin, self.speed_m_s * cos, -0.2 * math.cos(0.5 * t_s + phase[1]))
+        yaw, yaw_rad_s = _sway(4, 0.7, t_s, phase[2])
+        yaw, yaw_rad_s = angle + math.pi / 2 + yaw, turn_rad_s + yaw_rad_s
+        pitch, pitch_rad_s = _sway(2.5, 1.1, t_s, phase[3])
+        pitch += math.radians(-3)
+        roll, roll_rad_s = _sway(3, 0.9, t_s, phase[4])
+        roll += math.radians(4)
+        level, steep, right, left = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
+        rates = (
+            roll_rad_s - yaw_rad_s * steep,
+            pitch_rad_s * right + yaw_rad_s * left * level,
+            yaw_rad_s * right * level - pitch_rad_s * left,
+        )
         north_m, east_m = self._metres_per_radian()
         return TruePose(
             t_s=t_s,
             position_ned_m=(north, east, down),
-            velocity_ned_m_s=_vector(velocity),
-            attitude=(w, x, y, z),
-            rates_body_rad_s=_vector(rates),
+            velocity_ned_m_s=velocity,
+            attitude=_attitude(yaw, pitch, roll),
+            rates_body_rad_s=rates,
             latitude_deg=self.home_latitude_deg + math.degrees(north / north_m),
             longitude_deg=self.home_longitude_deg + math.degrees(east / east_m),
             altitude_msl_m=self.home_altitude_msl_m - down,
@@ -80,19 +90,24 @@ class FlightPath:
         height_m = self.home_altitude_msl_m
         return along_m + height_m, (across_m + height_m) * math.cos(latitude)
 
-    def _places(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], Rotation]:
-        """Positions (n, 3), north-east-down, and attitudes at n times."""
-        phase = np.random.default_rng(self.seed).uniform(0, 2 * math.pi, 6)
-        angle = self.speed_m_s / self.radius_m * t_s + phase[0]
-        north = self.radius_m * np.cos(angle)
-        east = self.radius_m * np.sin(angle)
-        down = -self.height_m - 0.4 * np.sin(0.5 * t_s + phase[1])
-        yaw = angle + math.pi / 2 + math.radians(4) * np.sin(0.7 * t_s + phase[2])
-        pitch = math.radians(-3) + math.radians(2.5) * np.sin(1.1 * t_s + phase[3])
-        roll = math.radians(4) + math.radians(3) * np.sin(0.9 * t_s + phase[4])
-        turns = Rotation.from_euler("ZYX", np.stack((yaw, pitch, roll), axis=-1))
-        return np.stack((north, east, down), axis=-1), turns
+
+@lru_cache
+def _phases(seed: int) -> tuple[float, ...]:
+    return tuple(np.random.default_rng(seed).uniform(0, 2 * math.pi, 6).tolist())
 
 
-def _vector(parts: NDArray[np.float64]) -> Vector3:
-    return float(parts[0]), float(parts[1]), float(parts[2])
+def _sway(size_deg: float, rad_s: float, t_s: float, phase: float) -> tuple[float, float]:
+    """An angle that swings, and its rate of change."""
+    size, at = math.radians(size_deg), rad_s * t_s + phase
+    return size * math.sin(at), size * rad_s * math.cos(at)
+
+
+def _attitude(yaw: float, pitch: float, roll: float) -> Quaternion:
+    """First the yaw about down, then the pitch, then the roll."""
+    (cy, sy), (cp, sp), (cr, sr) = ((math.cos(one / 2), math.sin(one / 2)) for one in (yaw, pitch, roll))
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
