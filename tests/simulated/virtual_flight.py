@@ -21,15 +21,17 @@ from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 from dappled.daemon.service import Service, StandIns
 from dappled.daemon.stream.publisher import Answer, PublisherStatistics
-from dappled.drivers.camera import Arrival, Blob, Fired, Identity, PlainCamera, ShotFailed, StateChanged
+from dappled.drivers.camera import Arrival, Blob, Camera, Fired, Identity, PlainCamera, ShotFailed, StateChanged
 from dappled.drivers.mavlink import MavlinkLinks, mavlink
+from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
+from dappled.drivers.wired.sources import FolderSource
 from dappled.flight import layout
 from dappled.flight.layout import DiskSpace
 from dappled.mocks.autopilot.autopilot import RATES_HZ, BootTime, Flyer
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.dng import Exif
-from dappled.workers import Loop
+from dappled.workers import Loop, Worker
 from tests.simulated.bad_link import LinkFaults
 from tests.simulated.memory_links import MemoryNetwork
 from tests.simulated.virtual_clock import VirtualClock
@@ -37,6 +39,12 @@ from tests.simulated.virtual_clock import VirtualClock
 AUTOPILOT, GROUND = 14550, 14551
 _OTHERS_HZ = 10.0  # positions
 _IDENTITY = Identity("dappled", "Virtual Camera", "SIM1", "memory")
+
+
+def picture(number: int, utc_ns: int) -> bytes:
+    """A raw file that no other number has."""
+    exif = Exif("dappled", "Virtual Camera", "SIM1", 28.0, 8.0, 1e-3, 200, utc_ns)
+    return dng.encode(np.full((32, 48), 256 + number, np.uint16), black=256, white=4095, exif=exif)
 
 
 class MemoryCamera(PlainCamera):
@@ -79,13 +87,42 @@ class MemoryCamera(PlainCamera):
         if not self._random.randrange(self._fails):
             self.report(ShotFailed(shot, "the mirror is stuck", self._clock.monotonic_ns()))
             return
-        exif = Exif("dappled", "Virtual Camera", "SIM1", 28.0, 8.0, 1e-3, 200, self._clock.utc_ns())
-        plane = np.full((32, 48), 256 + shot, np.uint16)
-        blob = Blob.of(dng.encode(plane, black=256, white=4095, exif=exif))
+        blob = Blob.of(picture(shot, self._clock.utc_ns()))
         self.report(Arrival(shot, f"VIR_{shot:04d}.DNG", blob, self._clock.monotonic_ns()))
 
     def _say(self, state: Any) -> None:
         self.report(StateChanged(state, "", self._clock.monotonic_ns(), _IDENTITY))
+
+
+class MemoryLine:
+    """A ShutterLine. Each press puts a file on the card within a second; one press in `fails` does not."""
+
+    def __init__(self, clock: VirtualClock, seed: int, card: Path, fails: int = 50) -> None:
+        self._clock, self._card, self._fails = clock, card, fails
+        self._random = random.Random(f"line {seed}")  # noqa: S311  # a simulation
+        self._exposures = Worker("exposure", self._expose, capacity=9, clock=clock)
+        self._taken = 0
+
+    def open(self) -> None:
+        self._exposures.start()
+
+    def press(self) -> None:
+        self._taken += 1
+        if self._random.randrange(self._fails):
+            self._exposures.put(self._taken)
+
+    def let_go(self) -> None:
+        """Nothing is held."""
+
+    def close(self) -> None:
+        self._exposures.stop(2.0)
+
+    def _expose(self, number: int) -> None:
+        data = picture(number, self._clock.utc_ns())
+        self._clock.sleep(self._random.uniform(0.3, 0.9))
+        part = self._card / f".{number}"
+        part.write_bytes(data)
+        part.rename(self._card / f"VIR_{number:04d}.DNG")
 
 
 class MemoryStream:
@@ -148,7 +185,8 @@ class VirtualFlight:
 
 @dataclass(frozen=True)
 class Plan:
-    """What is flown: `frames` requests, `interval_s` apart, with telemetry at `hz`."""
+    """What is flown: `frames` requests, `interval_s` apart, with telemetry at `hz`. `by_files`: the camera is composed
+    of a shutter line and a folder, in place of one that hands over its files itself."""
 
     seed: int
     frames: int
@@ -157,6 +195,15 @@ class Plan:
     faults: LinkFaults = field(default_factory=partial(LinkFaults, loss=0.02, doubles=0.01, late_s=0.03))
     cuts: tuple[tuple[float, float], ...] = ()
     boot: BootTime = field(default_factory=BootTime)
+    by_files: bool = False
+
+
+def camera(plan: Plan, clock: VirtualClock, card: Path) -> Camera:
+    if not plan.by_files:
+        return MemoryCamera(clock, plan.seed)
+    card.mkdir(parents=True)
+    line = MemoryLine(clock, plan.seed, card)
+    return ComposedCamera(_IDENTITY, line, FolderSource(card), ComposedSettings(file_s=10.0, hold_s=0.05), clock)
 
 
 def settings(folder: Path) -> Settings:
@@ -196,8 +243,8 @@ def fly(plan: Plan, folder: Path, watch: Callable[[bytes], object] | None = None
         network, stream = MemoryNetwork(clock, plan.seed, plan.faults, plan.cuts), MemoryStream()
         if watch is not None:
             network.watch = lambda source, data: watch(data) if source in (AUTOPILOT, GROUND) else None
-        instead = StandIns(MemoryCamera(clock, plan.seed), network, stream)
-        service = Service(settings(folder), clock=clock, instead=instead)
+        instead = StandIns(camera(plan, clock, folder / "card"), network, stream)
+        service = Service(settings(folder / "flights"), clock=clock, instead=instead)
         autopilot = VirtualAutopilot(clock, network, plan.seed, plan.hz, plan.boot)
         began_ns = clock.monotonic_ns()
         with started(service):

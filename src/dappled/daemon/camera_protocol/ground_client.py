@@ -15,6 +15,7 @@ from dappled.workers import Loop
 
 ACK_S = 0.5
 ACK_TRIES = 4
+_REQUESTS = 3  # of a message: it may be lost where its acknowledgement is not
 _ASK_AGAIN_S = 3.0
 _KEPT = 1000
 
@@ -99,10 +100,14 @@ class GroundClient:
             return self._camera
 
     def request(self, message_id: int, parameter: float = 0.0, timeout_s: float = 2.0) -> MavlinkMessage | None:
-        """One message of the camera, by MAV_CMD_REQUEST_MESSAGE; None where it didn't arrive."""
+        """One message of the camera, by MAV_CMD_REQUEST_MESSAGE, asked for three times; None where it didn't arrive."""
         with self._listening() as heard:
-            self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), parameter)
-            return heard(lambda m: m.get_msgId() == message_id, timeout_s)
+            for _ in range(_REQUESTS):
+                result, _ = self.command(mavlink.MAV_CMD_REQUEST_MESSAGE, float(message_id), parameter)
+                found = heard(lambda m: m.get_msgId() == message_id, timeout_s)
+                if found is not None or result not in (None, mavlink.MAV_RESULT_ACCEPTED):
+                    return found
+        return None
 
     def command(self, name: int, *parameters: float) -> tuple[int | None, float | None]:
         """Send a command until it is acknowledged (4 times, 0.5 s each): (MAV_RESULT, milliseconds), or Nones."""
