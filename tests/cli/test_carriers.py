@@ -77,7 +77,7 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-@pytest.mark.parametrize("stops", [8, 4, 2])
+@pytest.mark.parametrize("stops", [*(pytest.param(stops, marks=pytest.mark.slow) for stops in (8, 4)), 2])
 def test_stopped_down_carriers_are_measured_to_a_twentieth_of_a_bin(
     bench: Bench, stops: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -109,7 +109,7 @@ def test_a_mask_that_is_not_where_it_is_said_to_be_is_found_and_doubted(
     assert "they stand 8.7% farther out than predicted" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("stops", [8, 4, 2, 1.4, 1])
+@pytest.mark.parametrize("stops", [*(pytest.param(stops, marks=pytest.mark.slow) for stops in (8, 4, 1.4)), 2, 1])
 def test_over_all_apertures_the_calibrated_carriers_are_right_and_it_is_said_where_they_come_from(
     bench: Bench, stops: float, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

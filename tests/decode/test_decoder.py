@@ -102,7 +102,14 @@ def told_right(
     return request.param, known, _decoder(known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=FULL_F)
 
 
-@pytest.mark.parametrize("told", [*(pytest.param(told, marks=pytest.mark.long) for told in (0.67, 0.9)), 1.0, 1.5])
+@pytest.mark.parametrize(
+    "told",
+    [
+        *(pytest.param(told, marks=pytest.mark.long) for told in (0.67, 0.9)),
+        pytest.param(1.0, marks=pytest.mark.slow),
+        1.5,
+    ],
+)
 def test_an_f_number_told_wrong_costs_nothing_and_is_doubted(
     far_out: tuple[Camera, Calibration, Plane], told_right: tuple[bool, Calibration, Decoded], told: float
 ) -> None:

@@ -60,6 +60,7 @@ def run(package: Path, *words: str) -> str:
     return done.stdout
 
 
+@pytest.mark.slow
 def test_its_own_tests_pass_with_public_imports_alone(package: Path) -> None:
     count = sum(name.startswith("test_") for name in dir(CameraContract))
     printed = run(package, "pytest", "-q", "-p", "no:cacheprovider", "test_camera.py")

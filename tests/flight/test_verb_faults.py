@@ -60,7 +60,7 @@ def sweep(shim: Path, name: str, place: Path, step: int) -> dict[str, Any]:
     "name", ["offload", *(pytest.param(one, marks=pytest.mark.slow) for one in VERBS if one != "offload")]
 )
 def test_some_calls_that_fail_lose_no_frame(shim: Path, place: Path, name: str) -> None:
-    found = sweep(shim, name, place, 61)
+    found = sweep(shim, name, place, 151)
     assert found["wrong"] == []
     assert found["refused"] > 5
 

@@ -12,6 +12,7 @@ import dappled
 from dappled.products import opened
 
 
+@pytest.mark.slow
 def test_near_and_far_come_into_focus_where_depth_says(shared_data: Path) -> None:
     field = opened.light_field(shared_data / "views" / "lytro_2067")
     assert field.views.shape == (5, 5, 383, 552, 3)

@@ -153,6 +153,7 @@ def test_no_camera_on_the_bus(here: Path) -> None:
     assert not daemon.shots
 
 
+@pytest.mark.slow
 def test_without_a_camera_run_ends_0_when_its_time_is_over(here: Path, tmp_path: Path) -> None:
     file = tmp_path / "dappled.toml"
     file.write_text(
@@ -273,6 +274,7 @@ def test_a_good_frame_decodes(frame: Path, here: Path) -> None:
     assert pending.tag.pose.latitude_rad is None
 
 
+@pytest.mark.slow
 def test_a_raw_that_is_no_raw_is_kept_and_not_decoded(here: Path, caplog: pytest.LogCaptureFixture) -> None:
     daemon, flight = photographed("pattern:100000:dng", here)
     (pending,) = daemon.shots
@@ -296,6 +298,7 @@ def test_a_truncated_raw_is_kept_and_not_decoded(frame: Path, here: Path, tmp_pa
     assert any(line.startswith("not decoded: ") for line in told(flight))
 
 
+@pytest.mark.slow
 def test_a_frame_of_another_size_than_its_profile_s(here: Path, tmp_path: Path) -> None:
     small = tmp_path / "small.dng"
     small.write_bytes(reference_camera(1, scale=0.2, scene="white").bench_frame().file)
@@ -304,6 +307,7 @@ def test_a_frame_of_another_size_than_its_profile_s(here: Path, tmp_path: Path) 
         assert word in daemon.shots[0].problem
 
 
+@pytest.mark.slow
 def test_a_frame_without_its_focal_length(frame: Path, here: Path, tmp_path: Path) -> None:
     data = frame.read_bytes()
     assert data.count(FOCAL_LENGTH) == 1
@@ -318,6 +322,7 @@ def test_a_frame_without_its_focal_length(frame: Path, here: Path, tmp_path: Pat
     assert "focal length" in pending.problem
 
 
+@pytest.mark.slow
 def test_a_decoder_that_is_killed_loses_one_decode_at_most(frame: Path, here: Path) -> None:
     with SimulatedBody.start(BodyOptions(picture=str(frame))) as body, flying(before(body, here, **MASKED)) as daemon:
         assert daemon.shoot().decoded is not None
@@ -370,6 +375,7 @@ def test_a_mavlink_port_that_is_in_use(body: SimulatedBody, here: Path) -> None:
     assert issubclass(LinkError, DappledError)
 
 
+@pytest.mark.slow
 def test_a_subscriber_that_never_reads_costs_nothing(frame: Path, here: Path) -> None:
     context = zmq.Context()
     lazy = context.socket(zmq.SUB)
@@ -478,6 +484,7 @@ def test_a_read_only_disk(body: SimulatedBody, here: Path) -> None:
     assert "/proc/dappled" in sentence
 
 
+@pytest.mark.slow
 def test_a_decoder_s_input_that_vanishes_leaves_no_flight(body: SimulatedBody, here: Path, frame: Path) -> None:
     """The copy into the flight fails after the flight has begun."""
     white = here / "white.dng"
@@ -546,6 +553,7 @@ class Daemon:
         self.process.communicate(timeout=10)
 
 
+@pytest.mark.slow
 def test_sigterm_in_the_middle_of_a_shot_finishes_the_frame(here: Path) -> None:
     with (
         SimulatedBody.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.7)) as body,
@@ -565,6 +573,7 @@ def test_sigterm_in_the_middle_of_a_shot_finishes_the_frame(here: Path) -> None:
     assert flight_report.balance(flight).safe == 1
 
 
+@pytest.mark.slow
 def test_a_killed_daemon_is_put_in_order_by_the_next(here: Path) -> None:
     with SimulatedBody.start(BodyOptions(picture="pattern:100000:dng", delay_s=0.3)) as body:
         with Daemon(body, here) as daemon:

@@ -199,6 +199,7 @@ def test_busy_for_10_s(here: Path) -> None:
         back_in_service(daemon, body)
 
 
+@pytest.mark.slow
 def test_event_lost_though_the_file_is_on_the_card(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("no-event")
@@ -235,6 +236,7 @@ def test_the_body_comes_back_with_another_address(here: Path) -> None:
         back_in_service(daemon, body)
 
 
+@pytest.mark.slow
 def test_crash_of_the_camera_process(here: Path) -> None:
     with a_body(delay_s=0.7) as body, daemon_before(here, body) as daemon:
         index = wished(daemon)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import rawpy
 
+from dappled.cli import main
 from dappled.flight import LedgerReader, flight_report
 from dappled.flight.checks import flight_check
 from tests.schemas import schema
@@ -148,10 +149,9 @@ def test_a_changed_slices_hash_is_found(copied: Path) -> None:
     assert "frame 0: the slices came out different" in done.stderr
 
 
-def test_verify_needs_a_flight(tmp_path: Path) -> None:
-    done = dappled("replay", str(tmp_path), "--verify")
-    assert done.returncode == 1
-    assert "is not a recorded flight" in done.stderr
+def test_verify_needs_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["replay", str(tmp_path), "--verify"]) == 1
+    assert "is not a recorded flight" in capsys.readouterr().err
 
 
 @pytest.mark.slow

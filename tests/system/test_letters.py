@@ -11,6 +11,7 @@ import jsonschema
 import numpy as np
 import pytest
 
+from dappled.cli import main
 from tests.schemas import schema
 from tests.system.conftest import dappled
 
@@ -20,10 +21,9 @@ def letters(shared_data: Path) -> Path:
     return shared_data / "lenslet" / "ulf_letters"
 
 
-def test_carriers_finds_the_published_pitch_untold(letters: Path) -> None:
-    done = dappled("carriers", str(letters / "letters_ULF_M1.png"), "--mask", "lenslet", "--json")
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
+def test_carriers_finds_the_published_pitch_untold(letters: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["carriers", str(letters / "letters_ULF_M1.png"), "--mask", "lenslet", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
     assert found["pitch_px"] == pytest.approx([48.23, 48.23], abs=0.05)
     assert found["law"] == "found"
     orders = {(c["ky"], c["kx"]): c for c in found["carriers"]}

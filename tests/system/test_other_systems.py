@@ -43,7 +43,7 @@ def run(code: str, *words: str) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("suffix", [".npz", ".zarr", ".h5"])
+@pytest.mark.parametrize("suffix", [".npz", *(pytest.param(one, marks=pytest.mark.slow) for one in (".zarr", ".h5"))])
 def test_a_light_field_opens(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"a{suffix}"
     light_files.save(path, light_field())
@@ -57,6 +57,7 @@ found.save(sys.argv[1] + ".copy.npz")
     assert (tmp_path / f"a{suffix}.copy.npz").exists()
 
 
+@pytest.mark.slow
 def test_a_frame_is_decoded_from_python_and_at_a_prompt(tmp_path: Path) -> None:
     frame = tmp_path / "frame.dng"
     frame.write_bytes(reference_camera(1, scale=0.5).expose(1.0, 0).file)

@@ -111,6 +111,7 @@ def test_systemd_hears_of_a_whole_life(manager: socket.socket, served: subproces
     assert "reload: the settings stay as they are:" in said
 
 
+@pytest.mark.slow
 def test_a_stopped_process_is_not_fed(manager: socket.socket, served: subprocess.Popen[str]) -> None:
     until(manager, "WATCHDOG=1".__eq__)
     served.send_signal(signal.SIGSTOP)
@@ -122,6 +123,7 @@ def test_a_stopped_process_is_not_fed(manager: socket.socket, served: subprocess
     until(manager, "WATCHDOG=1".__eq__)
 
 
+@pytest.mark.slow
 def test_a_loop_that_hangs_is_not_fed_by_other_threads(manager: socket.socket, tmp_path: Path) -> None:
     flag = tmp_path / "hang"
     with serving(manager, tmp_path, program=("-c", HANGING, str(flag))):
@@ -216,6 +218,7 @@ def test_the_unit_leaves_the_daemon_what_tells_whether_its_clock_can_be_believed
     assert "ProtectClock=yes" in directives
 
 
+@pytest.mark.slow
 def test_the_service_s_settings_are_good() -> None:
     words = [sys.executable, "-m", "dappled", "config", "check", str(ROOT / "systemd/dappled.toml")]
     assert subprocess.run(words, capture_output=True, check=False).returncode == 0

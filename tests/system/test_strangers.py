@@ -107,7 +107,10 @@ def requests_page(port: int) -> int:
 
 @pytest.mark.parametrize(
     ("descriptors", "count", "requests"),
-    [(256, 400, 8), pytest.param(4096, 5000, 60, marks=[pytest.mark.long, pytest.mark.alone])],
+    [
+        pytest.param(256, 400, 8, marks=pytest.mark.slow),
+        pytest.param(4096, 5000, 60, marks=[pytest.mark.long, pytest.mark.alone]),
+    ],
 )
 def test_silent_strangers_cost_no_photograph_and_no_viewer(
     tmp_path: Path, descriptors: int, count: int, requests: int

@@ -296,6 +296,9 @@ def _survey(
 ) -> Survey:
     """Decode, place and refine a flight as the arguments say; `watch` gets each decoded frame. Adds what could
     not be done to `missing`."""
+    rasters = [Path(word) for word in arguments.refine if word != "neighbours"]
+    if len(rasters) > 1:
+        raise DappledError(f"--refine takes one base map, not {len(rasters)}")
     facts = layout.read_facts(layout.open_folder(flight))
     made = georeference.survey(
         flight, recipe(flight, facts, arguments), options(facts, arguments), progress, stack, watch=watch
@@ -303,9 +306,6 @@ def _survey(
     if arguments.solve_lens is not None:
         sigmas = _pose_sigmas(arguments)
         made = georeference.with_own_lens(made, control=arguments.gcp, sigmas=sigmas, progress=progress)
-    rasters = [Path(word) for word in arguments.refine if word != "neighbours"]
-    if len(rasters) > 1:
-        raise DappledError(f"--refine takes one base map, not {len(rasters)}")
     if rasters:
         try:
             return _refined(made, rasters[0], arguments, progress)

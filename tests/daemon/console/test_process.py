@@ -160,6 +160,7 @@ def test_a_console_that_keeps_dying_is_not_started_for_ever(
         console.stop()
 
 
+@pytest.mark.slow
 def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Path) -> None:
     begun: list[int] = []
 

@@ -245,7 +245,7 @@ def test_a_replay_that_read_on_past_a_jump_gets_the_pose_from_before_it() -> Non
     st.floats(0.0, 0.3),
     st.integers(0, 99),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_a_healthy_autopilot_has_no_jumps(
     rate_hz: float, speed_m_s: float, turn_m_s2: float, jitter_s: float, seed: int
 ) -> None:

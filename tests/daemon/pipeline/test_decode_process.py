@@ -87,6 +87,7 @@ def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
     decoder.close()
 
 
+@pytest.mark.slow
 def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> None:
     clock = RecordedClock(0)
     budget = RestartBudget(limit=2, window_s=60.0)
@@ -166,6 +167,7 @@ def starved(frame: str, code: str) -> None:
     subprocess.run(words, check=True, timeout=100)
 
 
+@pytest.mark.slow
 def test_without_descriptors_a_decoded_frame_waits_for_some(frame: str) -> None:
     starved(
         frame,

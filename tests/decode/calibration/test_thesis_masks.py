@@ -46,10 +46,10 @@ def _holds(shot: Shot) -> bool:
     ("name", "body", "f_number", "scene"),
     [
         ("mask-2", CANON, 22.0, "white"),
-        ("mask-2", CANON, 32.0, "texture"),
+        pytest.param("mask-2", CANON, 32.0, "texture", marks=pytest.mark.slow),
         ("mask-1", CANON, 11.0, "white"),
-        ("mask-3-octave", FUJI, 8.0, "texture"),
-        ("mask-4-linear", FUJI, 16.0, "boards"),
+        pytest.param("mask-3-octave", FUJI, 8.0, "texture", marks=pytest.mark.slow),
+        pytest.param("mask-4-linear", FUJI, 16.0, "boards", marks=pytest.mark.slow),
         ("mask-2-full", CANON, 22.0, "boards"),
     ],
 )

@@ -55,6 +55,7 @@ def test_the_same_map_for_any_number_of_workers(leaning: tuple[ViewStack, np.nda
     np.testing.assert_array_equal(one.disparity, two.disparity)
 
 
+@pytest.mark.slow
 def test_nine_by_nine_views_with_occlusions_and_three_pixels_a_view() -> None:
     """BadPix 0.07 below 15 % on clean views; the scene shows 12 boards before each other."""
     stack, truth = paint(boards(1, 256, 3.0), (256, 256), 9, seed=1)

@@ -132,6 +132,7 @@ def test_what_clipped_beside_the_masks_dark_places_is_told_by_these(half_open: H
     assert [field.attributes["views_unclipped"] for field in (whole, lost, told)] == [False, False, True]
 
 
+@pytest.mark.slow
 def test_a_wrong_f_number_is_told_of_frames_with_clipped_pixels_too(half_open: HalfOpen) -> None:
     _, knows = half_open.decoders()
     _, report = knows.decode_reported(
@@ -150,6 +151,7 @@ def test_a_mosaic_gives_the_same_as_its_plane(half_open: HalfOpen) -> None:
     np.testing.assert_allclose(knows.decode(rows, **given).views, knows.decode(rows.plane(), **given).views, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_places_without_a_sample_tell_nothing(half_open: HalfOpen) -> None:
     """A staggered sensor spread on a square: every other place holds a sample, twice as bright, the others nothing."""
     decoder, _ = half_open.decoders()

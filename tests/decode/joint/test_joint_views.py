@@ -55,6 +55,7 @@ def test_noise_is_kept_out_of_views_by_the_disparities_that_are_there() -> None:
     np.testing.assert_allclose(found.field.attributes["view_sigma"], rms, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "least"),
     [
@@ -105,6 +106,7 @@ def test_detail_that_folds_in_from_beyond_the_band_does_not_spoil_the_views() ->
     assert found.joint > max(found.quick + 4, found.mean + 4), found
 
 
+@pytest.mark.slow
 def test_a_frame_without_noise_or_folded_detail_is_inverted_as_before() -> None:
     scene = RaySum(finest=BAND)
     plane, true = scene.expose()

@@ -105,7 +105,7 @@ def _complex_normal(chance: np.random.Generator, shape: tuple[int, ...]) -> Comp
     return np.asarray(made / np.sqrt(2), dtype=np.complex64)
 
 
-@pytest.mark.parametrize("kind", [USUAL_KINDS[1], USUAL_KINDS[3]])
+@pytest.mark.parametrize("kind", [USUAL_KINDS[1], pytest.param(USUAL_KINDS[3], marks=pytest.mark.slow)])
 def test_errors_of_views_are_those_of_the_model_that_the_patches_were_drawn_from(kind: int) -> None:
     chance = np.random.default_rng(5)
     frame = _frame(1e-5)

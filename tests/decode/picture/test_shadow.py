@@ -34,17 +34,17 @@ def _picture(shot: Shot, mosaic: MosaicPlane | None = None) -> UnmaskedPicture:
 @pytest.mark.parametrize(
     ("shot", "least_db"),
     [
-        (Shot(disparity_px=0.03), 44),
+        pytest.param(Shot(disparity_px=0.03), 44, marks=pytest.mark.slow),
         (Shot(disparity_px=0.1), 43),
-        (Shot(disparity_px=0.1, exponent=1.5), 45),
-        (Shot(disparity_px=0.3), 37),
+        pytest.param(Shot(disparity_px=0.1, exponent=1.5), 45, marks=pytest.mark.slow),
+        pytest.param(Shot(disparity_px=0.3), 37, marks=pytest.mark.slow),
         (Shot(disparity_px=1.0, exponent=1.5), 37),
-        (Shot(snr=20), 32),
+        pytest.param(Shot(snr=20), 32, marks=pytest.mark.slow),
         (Shot(f_number=15.0), 42),
-        (Shot(f_number=25.0), 41),
-        (Shot(f_number=62.0), 39),
+        pytest.param(Shot(f_number=25.0), 41, marks=pytest.mark.slow),
+        pytest.param(Shot(f_number=62.0), 39, marks=pytest.mark.slow),
         (Shot(stop="square", f_number=9.9), 42),
-        (Shot(scale=1.003), 43),
+        pytest.param(Shot(scale=1.003), 43, marks=pytest.mark.slow),
         (Shot(scale=0.998, turn_deg=1.0, shift_mm=(0.05, -0.03), falloff=0.4), 43),
     ],
     ids=repr,
@@ -57,7 +57,13 @@ def test_raw_over_its_own_shadow_is_as_good_as_over_the_true_one(shot: Shot, lea
 
 
 @pytest.mark.parametrize(
-    ("disparity_px", "exponent", "least_db"), [(1.0, 1.1, 36), (1.0, 1.5, 42), (2.0, 1.1, 43), (3.3, 1.5, 55)]
+    ("disparity_px", "exponent", "least_db"),
+    [
+        (1.0, 1.1, 36),
+        pytest.param(1.0, 1.5, 42, marks=pytest.mark.slow),
+        (2.0, 1.1, 43),
+        pytest.param(3.3, 1.5, 55, marks=pytest.mark.slow),
+    ],
 )
 def test_out_of_focus_it_is_no_worse_than_sharp_picture_and_band(
     disparity_px: float, exponent: float, least_db: float

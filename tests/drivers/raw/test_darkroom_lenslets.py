@@ -28,6 +28,7 @@ def _recipe(folder: Path, *, colour: bool = False) -> Recipe:
     return Recipe("auto", "lenslet", white=white, cfa="BGGR", black=168, white_level=4095, workers=2, colour=colour)
 
 
+@pytest.mark.slow
 def test_views_beat_lftoolbox_s_at_every_offset(shared_data: Path) -> None:
     folder = shared_data / "lenslet/lytro_like"
     truth = np.load(folder / "truth.npz")

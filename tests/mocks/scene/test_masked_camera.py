@@ -156,6 +156,7 @@ def test_the_carriers_stand_at_the_true_lattice_and_not_at_the_nominal_one(bench
     assert missed[1:].max() < 0.5 * strengths(plane_of(bench, stopped), stopped.truth)[1:].max()
 
 
+@pytest.mark.slow
 def test_an_oracle_decodes_the_views_from_the_noisy_bench_frame(bench: MaskedCamera) -> None:
     shot = bench.expose(0.0, 1)
     truth = shot.truth

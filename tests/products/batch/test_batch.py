@@ -289,6 +289,7 @@ def test_a_frame_that_hangs_every_worker_is_given_up() -> None:
     assert "ended or held up 3 workers" in str(last.error)
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_one_who_asked(tmp_path: Path) -> None:
     answers = workers.in_processes([job(str(n)) for n in range(20)], answer, 2)
     next(answers)

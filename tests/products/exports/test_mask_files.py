@@ -45,6 +45,7 @@ def test_a_written_mask_propagated_lands_on_table_7(tmp_path: Path, name: str) -
         assert min(np.hypot(s.x_mm - x, s.y_mm - y) for s in seen[:9]) < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["big.png", pytest.param("big.tif", marks=pytest.mark.long)])
 def test_a_16k_mask_takes_less_than_200_mb(tmp_path: Path, name: str) -> None:
     code = (
