@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 import sys
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -54,19 +53,6 @@ def without_numbers(text: str) -> str:
     ('the disk is full: # frame, # MB', 'the disk is full: # frame, # MB')
     """
     return _NUMBER.sub(lambda found: f"#{found[1] or ''}", text)
-
-
-def doubts_of(frames: Iterable[tuple[str, Sequence[str]]]) -> list[str]:
-    """What is in doubt about frames, by their names: each kind of doubt once, as it was said of the first of them.
-
-    >>> doubts_of([("7", ["2 % clipped"]), ("8", ["3 % clipped", "it is a JPEG"])])
-    ['frame 7 is in doubt: 2 % clipped', 'frame 8 is in doubt: it is a JPEG']
-    """
-    first: dict[str, str] = {}
-    for name, doubts in frames:
-        for text in doubts:
-            first.setdefault(without_numbers(text), f"frame {name} is in doubt: {text}")
-    return list(first.values())
 
 
 def report(log: logging.Logger, what: str, error: BaseException) -> None:

@@ -36,6 +36,8 @@ class Level(IntEnum):
 class Code(StrEnum):
     """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""
 
+    APERTURE_DISAGREES = "aperture.disagrees"
+    APERTURE_UNEXPLAINED = "aperture.unexplained"
     CAMERA_ABSENT = "camera.absent"
     CAMERA_CLOCK_FAR = "camera.clock_far"
     CAMERA_FAULTED = "camera.faulted"
@@ -45,15 +47,54 @@ class Code(StrEnum):
     CARD_CHANGED = "card.changed"
     CARD_NOT_LISTED = "card.not_listed"
     CARD_PICTURES_LEFT = "card.pictures_left"
+    CARRIERS_DISPLACED = "carriers.displaced"
+    CARRIERS_ELSEWHERE = "carriers.elsewhere"
+    CARRIERS_FULL_MASK = "carriers.full_mask"
+    CARRIERS_HALF_WAY = "carriers.half_way"
+    CARRIERS_LACKING = "carriers.lacking"
+    CARRIERS_MISSING = "carriers.missing"
+    CARRIERS_OTHER_LAW = "carriers.other_law"
+    CARRIERS_OTHER_PEAKS = "carriers.other_peaks"
+    CARRIERS_OTHER_SIZE = "carriers.other_size"
+    CARRIERS_SOME_ABSENT = "carriers.some_absent"
+    CARRIERS_UNCONFIRMED = "carriers.unconfirmed"
+    CARRIERS_UNOBSERVABLE = "carriers.unobservable"
+    CARRIERS_UNSEARCHED = "carriers.unsearched"
+    CARRIERS_UNSEEN = "carriers.unseen"
     DISK_FEW_FILES = "disk.few_files"
     DISK_FULL = "disk.full"
     DISK_NEARLY_FULL = "disk.nearly_full"
     DISK_UNREADABLE = "disk.unreadable"
     FLIGHT_NEXT_BEGINS = "flight.next_begins"
+    FRAME_CLIPPED = "frame.clipped"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
+    FRAME_DEVELOPED = "frame.developed"
+    FRAME_REFUSED = "frame.refused"
     FRAME_RIVAL_PICTURE = "frame.rival_picture"
     FRAME_RIVAL_SHOTS = "frame.rival_shots"
     FRAME_UNCONFIRMED = "frame.unconfirmed"
+    FRAME_VIGNETTED = "frame.vignetted"
+    KIT_BLIND = "kit.blind"
+    KIT_DARK = "kit.dark"
+    KIT_DISTANCE_OPEN = "kit.distance_open"
+    KIT_DISTANCE_UNCERTAIN = "kit.distance_uncertain"
+    KIT_DISTANCES_DISAGREE = "kit.distances_disagree"
+    KIT_FILM_IN = "kit.film_in"
+    KIT_FULL_FILM_IN = "kit.full_film_in"
+    KIT_LAW_OPEN = "kit.law_open"
+    KIT_LAWS_DISAGREE = "kit.laws_disagree"
+    KIT_MIXED_UP = "kit.mixed_up"
+    KIT_NO_BARE = "kit.no_bare"
+    KIT_PRINT_SIZE = "kit.print_size"
+    KIT_PRINTS_DISAGREE = "kit.prints_disagree"
+    KIT_SHOTS_MISSING = "kit.shots_missing"
+    KIT_UNSEEN = "kit.unseen"
+    LATTICE_WEAK = "lattice.weak"
+    LAW_ASKED = "law.asked"
+    LAW_BOTH = "law.both"
+    LAW_EXPLAINS = "law.explains"
+    LAW_NEITHER = "law.neither"
+    LAW_ONLY = "law.only"
     LINK_CLOCK_AHEAD = "link.clock_ahead"
     LINK_CLOCK_BEHIND = "link.clock_behind"
     LINK_SAME_IDS = "link.same_ids"
@@ -67,6 +108,8 @@ class Code(StrEnum):
     LOG_VEHICLE = "log.vehicle"
     MACHINE_FEW_DESCRIPTORS = "machine.few_descriptors"
     MACHINE_LITTLE_MEMORY = "machine.little_memory"
+    MASK_SHIFTED = "mask.shifted"
+    MASK_TURNED = "mask.turned"
     PEER_DISPLACED = "peer.displaced"
     PEER_GUESS_BY_PAGE = "peer.guess_by_page"
     PEER_GUESS_WRONG = "peer.guess_wrong"
@@ -100,6 +143,8 @@ class Code(StrEnum):
     TIME_WEEK_ROLLOVER = "time.week_rollover"
     TRIGGER_JUMP = "trigger.jump"
     TRIGGER_LOST = "trigger.lost"
+    VIEWS_CONTRADICTED = "views.contradicted"
+    VIEWS_OUT_OF_REACH = "views.out_of_reach"
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -115,6 +160,9 @@ class Subject:
 
     def __str__(self) -> str:
         return f"{self.kind} {self.which}" if self.which != "" else self.kind
+
+
+FRAME = Subject("frame")  # the one whose light field, row or line the finding stands in
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,10 +286,36 @@ def text(one: Finding) -> str:
     return _filled(WORDS[one.code].sentence, one.facts)
 
 
-def told(one: Finding) -> str:
-    """What was found, of what, and what to do."""
+def told(one: Finding, under: Subject | None = None) -> str:
+    """What was found, of what, and what to do; what stands `under` its subject's name needs it not again."""
     remedy = _filled(WORDS[one.code].remedy, one.facts)
-    return f"{one.subject}: {text(one)}" + (f": {remedy}" if remedy else "")
+    whole = text(one) + (f": {remedy}" if remedy else "")
+    return whole if one.subject == under else f"{one.subject}: {whole}"
+
+
+def to_rows(found: Iterable[Finding]) -> list[dict[str, Any]]:
+    """Findings as JSON holds them."""
+    return [one.to_json() for one in found]
+
+
+def from_rows(rows: Iterable[Mapping[str, Any]]) -> tuple[Finding, ...]:
+    """What `to_rows` made. Raises KeyError, TypeError or ValueError."""
+    return tuple(Finding.from_json(row) for row in rows)
+
+
+def first_by_name(frames: Iterable[tuple[str, Iterable[Finding]]]) -> list[Finding]:
+    """What was found of frames, by their names: each code once, of the first of them.
+
+    >>> clipped = finding(Code.FRAME_CLIPPED, FRAME, share=0.02)
+    >>> [str(one.subject) for one in first_by_name([("7", [clipped]), ("8", [clipped])])]
+    ['frame 7']
+    """
+    first: dict[tuple[Code, str], Finding] = {}
+    for name, found in frames:
+        for one in found:
+            subject = Subject("frame", name) if one.subject == FRAME else one.subject
+            first.setdefault((one.code, subject.kind), replace(one, subject=subject))
+    return list(first.values())
 
 
 def _words() -> Mapping[Code, Wording]:

@@ -17,6 +17,7 @@ from dappled.cli import depth, main
 from dappled.clock import RecordedClock
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.geometry import camera_pose
+from dappled.findings import FRAME, Code, finding, to_rows, told
 from dappled.flight import recording
 from dappled.products import opened
 from dappled.products.exports import light_files
@@ -59,13 +60,16 @@ def test_views_that_the_model_did_not_make_are_told_with_the_reason(
 def test_what_is_made_of_a_light_field_in_doubt_is_in_doubt(
     verb: str, name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    plain, doubts = light_field(), ["3.0% of its pixels are clipped", "the mask lies 16 µm off"]
-    light_files.save(tmp_path / "f.npz", replace(plain, attributes={**plain.attributes, "doubts": doubts}))
+    plain, doubts = (
+        light_field(),
+        [finding(Code.FRAME_CLIPPED, FRAME, share=0.03), finding(Code.MASK_TURNED, FRAME, by_deg=0.1)],
+    )
+    light_files.save(tmp_path / "f.npz", replace(plain, attributes={**plain.attributes, "doubts": to_rows(doubts)}))
     words = [verb, str(tmp_path / "f.npz"), "-o", str(tmp_path / name), *(["--as", "mat"] if verb == "export" else [])]
     assert main([*words, "--json"]) == (1 if verb in ("views", "export") else 0)
     said = capsys.readouterr()
-    assert json.loads(said.out)["doubts"] == doubts
-    assert said.err == "".join(f"dappled {verb}: {words[1]} is in doubt: {doubt}\n" for doubt in doubts)
+    assert json.loads(said.out)["doubts"] == to_rows(doubts)
+    assert said.err == "".join(f"dappled {verb}: {words[1]} is in doubt: {told(doubt, FRAME)}\n" for doubt in doubts)
 
 
 @pytest.mark.parametrize("of", ["views", "slices", "shifts", "slice-shifts"])

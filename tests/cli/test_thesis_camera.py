@@ -12,6 +12,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.drivers.raw import calibration_files
+from dappled.findings import Code
 from dappled.mocks.scene import dng
 from dappled.products.exports import light_files
 from tests.decode.ray_frames import MASKS, Body, Shot
@@ -59,7 +60,8 @@ def test_the_readme_s_calibrate_command_works_on_a_450d_behind_mask_2(
     off = orders @ (found.fits[0].lattice.matrix() - shot.lattice) * FULL.shape
     assert np.sqrt((off**2).sum(axis=1).mean()) < 0.1
     assert found.law == "geometric"
-    assert "only geometric would do" in found.verdict
+    assert found.verdict is not None
+    assert (found.verdict.code, found.verdict.facts["law"]) == (Code.LAW_ONLY, "geometric")
 
 
 def test_calibrate_tells_which_orders_it_did_not_see(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -109,8 +111,8 @@ def test_a_frame_that_must_show_carriers_and_does_not_is_refused(
     capsys.readouterr()
     assert main(["decode", *words, "--anyway", "-o", str(tmp_path / "f.npz")]) == 0
     assert "should stand out at f/22" in capsys.readouterr().out
-    (doubt,) = light_files.load(tmp_path / "f.npz").attributes["doubts"]
-    assert "no lattice of this mask does" in doubt
+    (doubt,) = light_files.load(tmp_path / "f.npz").doubts
+    assert doubt.code is Code.CARRIERS_UNSEEN
 
 
 def test_where_no_carrier_can_be_seen_that_is_no_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -122,7 +124,7 @@ def test_where_no_carrier_can_be_seen_that_is_no_failure(tmp_path: Path, capsys:
     assert main(["carriers", *words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["observable"] is False
-    assert "averaged out over the stop" in told["reason"]
+    assert told["reason"]["code"] == "carriers.unobservable"
 
 
 TEXTURED = Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0, scene="texture", seed=2, finer=2)
@@ -146,9 +148,7 @@ def test_behind_a_lens_that_tells_no_f_number_the_carriers_are_found_or_nothing_
     assert main(["decode", bare, *_quarter(tmp_path), "-o", str(tmp_path / "b.npz")]) == 1
     made = light_files.load(tmp_path / "b.npz")
     assert made.attributes["carriers_found"] is None
-    (doubt,) = made.attributes["doubts"]
-    assert "the f-number is unknown" in doubt
-    assert "may stand or be averaged out" in doubt
+    assert [one.code for one in made.doubts] == [Code.CARRIERS_UNCONFIRMED]
     capsys.readouterr()
     assert main(["carriers", bare, *_quarter(tmp_path)]) == 0
     assert "the f-number is unknown" in capsys.readouterr().err

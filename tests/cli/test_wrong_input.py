@@ -13,6 +13,7 @@ from PIL import Image
 
 from dappled.cli import main
 from dappled.drivers.raw import calibration_files
+from dappled.findings import Code
 from dappled.products.exports import light_files
 from tests.cli.test_thesis_camera import QUARTER, dng_of
 from tests.cli.test_thesis_camera import _quarter as quarter
@@ -126,26 +127,27 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     kind: str, masked: NDArray[np.float32], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     if kind == "jpeg":
-        path, told = tmp_path / "f.jpg", "it is a JPEG: its tones are not linear"
+        path, told, code = tmp_path / "f.jpg", "it is a JPEG: its tones are not linear", Code.FRAME_DEVELOPED
         Image.fromarray((255 * (masked / masked.max()) ** (1 / 2.2)).astype(np.uint8)).save(path, quality=85)
     else:
-        path, told = dng_of(tmp_path / "f.dng", SHOT, np.clip(masked * 3.2, 0, 1.3)), "of its pixels are clipped"
+        path = dng_of(tmp_path / "f.dng", SHOT, np.clip(masked * 3.2, 0, 1.3))
+        told, code = "of its pixels are clipped", Code.FRAME_CLIPPED
     words = [str(path), *quarter(tmp_path), "--focal-length", "85", "--f-number", "22"]
     assert main(["calibrate", *words, "-o", str(tmp_path / "c.toml")]) == 1
     assert told in capsys.readouterr().err
     assert not (tmp_path / "c.toml").exists()
     assert main(["calibrate", *words, "--anyway", "-o", str(tmp_path / "c.toml")]) == 0
-    assert f"written with this doubt in it: {path.name}: " in capsys.readouterr().err
+    assert f"written with this doubt in it: calibration frame {path.name}: " in capsys.readouterr().err
     known = calibration_files.load(tmp_path / "c.toml")
-    assert told in known.doubts[0]
-    doubted = known.doubt or ""
-    assert known.doubts[0] in doubted
-    assert ("neither law" in doubted) == known.verdict.startswith("neither law")
+    assert known.overridden[0].code is code
+    assert known.overridden[0] in known.doubts
+    assert known.verdict is not None
+    assert (known.verdict in known.doubts) == (known.verdict.code is Code.LAW_NEITHER)
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 1
     said = capsys.readouterr()
     assert "in doubt: " in said.out
     assert said.err == "dappled decode: written, but in doubt: see above; --anyway accepts that\n"
-    assert any(told in doubt for doubt in light_files.load(tmp_path / "f.npz").attributes["doubts"])
+    assert code in {one.code for one in light_files.load(tmp_path / "f.npz").doubts}
     assert main(["decode", *words, "--anyway", "-o", str(tmp_path / "g.npz")]) == 0
     said = capsys.readouterr()
     assert "in doubt: " in said.out
@@ -176,7 +178,7 @@ def test_vignetting_is_a_doubt_unless_a_white_frame_takes_it_off(
     attributes = light_files.load(tmp_path / "f.npz").attributes
     lost, sigma = attributes["falloff"]
     assert abs(lost - 0.5) < 3 * sigma
-    assert any("give a white frame" in doubt for doubt in attributes["doubts"])
+    assert [one["code"] for one in attributes["doubts"]] == ["frame.vignetted"]
     assert main([*words, "--white", str(white)]) == 0
     assert "its corners" not in capsys.readouterr().out
     attributes = light_files.load(tmp_path / "f.npz").attributes

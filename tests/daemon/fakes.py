@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from dappled.clock import RecordedClock, SystemClock
 from dappled.config.settings import PoseSettings
@@ -127,7 +126,7 @@ class FakeDecoder:
         self.gate = threading.Event()
         self.gate.set()
         self.seen: list[str] = []
-        self.seen_facts: dict[str, Any] = {}
+        self.doubts: tuple[Finding, ...] = ()
         self.decision: LawDecision | None = None
         self.picture: PictureFacts | None = None
 
@@ -143,7 +142,7 @@ class FakeDecoder:
         unit = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]
         decision, self.decision = self.decision, None
         made = DecodedFrame(body, "0" * 64, arrays, [[0.0] * 4], "calibrated", 1, 1, "geometric", unit, b"", (0, 0))
-        return replace(made, seen=self.seen_facts, decision=decision, picture=self.picture)
+        return replace(made, doubts=self.doubts, decision=decision, picture=self.picture)
 
 
 @dataclass

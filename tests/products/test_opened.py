@@ -20,11 +20,15 @@ import dappled
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.errors import DecodeError
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, finding
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products import opened
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFrame, OpenedLightField, OpenError
 from tests.products.fields import DISPARITY, light_field
+
+CLIPPED = finding(Code.FRAME_CLIPPED, FRAME, share=0.03).to_json()
+DEVELOPED = finding(Code.FRAME_DEVELOPED, FRAME, why="a <JPEG>").to_json()
 
 
 @pytest.fixture(autouse=True)
@@ -158,7 +162,7 @@ def test_a_light_field_shows_itself_in_a_line(path: Path) -> None:
     assert repr(dappled.open(path)) == (
         "<light field a.npz: 5 × 5 views of 60 × 80 px, 3 slices, reference-36mm, 50 mm, f/7.4>"
     )
-    bare = opened.OpenedLightField(light_field(doubts=["the mask moved"], focal_length_mm=None, camera=None))
+    bare = opened.OpenedLightField(light_field(doubts=[CLIPPED], focal_length_mm=None, camera=None))
     assert repr(bare) == "<light field 5 × 5 views of 60 × 80 px, 3 slices, f/7.4, 1 doubt>"
 
 
@@ -171,17 +175,17 @@ def test_a_kind_is_asked_for_and_checked(path: Path) -> None:
 
 
 def test_a_notebook_shows_a_picture_and_the_doubts() -> None:
-    found = OpenedLightField(light_field(doubts=["the mask <moved>"]))
+    found = OpenedLightField(light_field(doubts=[DEVELOPED]))
     shown = found._repr_html_()
     assert "5 × 5 views of 60 × 80 px" in shown
-    assert "doubt: the mask &lt;moved&gt;" in shown
+    assert "doubt: a &lt;JPEG&gt;: its tones are not linear" in shown
     (data,) = re.findall(r'src="data:image/jpeg;base64,([^"]+)"', shown)
     with Image.open(io.BytesIO(base64.b64decode(data))) as picture:
         assert picture.size == (80, 60)
         shown_px, middle = np.asarray(picture, dtype=float), found.views[2, 2]
     assert np.corrcoef(shown_px.ravel(), middle.ravel())[0, 1] > 0.95
     empty = replace(
-        light_field(doubts=["one"] * 15),
+        light_field(doubts=[CLIPPED] * 15),
         slices=np.ones((3, 0, 0), np.complex64),
         views=np.zeros((5, 5, 0, 0), np.float32),
     )

@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 from dappled.cli import georeference, geotag
 from dappled.cli.arguments import whole
-from dappled.errors import DappledError, counted, doubts_of
+from dappled.errors import DappledError, counted
+from dappled.findings import first_by_name, to_rows, told
 from dappled.flight import disk_error, layout
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import KINDS, Done, Job, Manifest
@@ -111,15 +112,15 @@ def _report(done: Done, *, as_json: bool) -> None:
     if as_json:
         said = {"flight": done.flight, "frame": done.frame, "error": done.error, "refused": dict(done.refused)}
         files = [one.name for one in done.outputs]
-        print(json.dumps({**said, "doubts": done.doubts, "seconds": done.seconds, "files": files}))
+        print(json.dumps({**said, "doubts": to_rows(done.doubts), "seconds": done.seconds, "files": files}))
 
 
 def _tell_doubts(manifest: Manifest, jobs: Sequence[Job]) -> None:
     """Say what is in doubt about the light fields of each flight."""
     for flight in dict.fromkeys(job.flight for job in jobs):
         known = [manifest.done[job.key] for job in jobs if job.flight == flight and job.key in manifest.done]
-        for text in doubts_of((Path(one.frame).stem, one.doubts) for one in known):
-            print(f"dappled batch: {Path(flight).name}: {text}", file=sys.stderr)
+        for one in first_by_name((Path(done.frame).stem, done.doubts) for done in known):
+            print(f"dappled batch: {Path(flight).name}: in doubt: {told(one)}", file=sys.stderr)
 
 
 def _flights(given: Sequence[Path]) -> list[Path]:

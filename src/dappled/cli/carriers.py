@@ -25,12 +25,13 @@ from dappled.decode.optics import Carrier, Lattice, Mask, Order
 from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
 from dappled.decode.spectrum import Plane
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.peaks import Measured, measure, stretch_doubt
+from dappled.decode.spectrum.peaks import Measured, displaced, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
 from dappled.errors import counted
+from dappled.findings import FRAME, Finding, told
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -80,7 +81,7 @@ class Table:
         return None if self.checked is None else self.checked.search
 
     @property
-    def doubt(self) -> str | None:
+    def doubt(self) -> Finding | None:
         """Why the carriers can't be where slices are cut, or what can't be told of them; None where nothing is."""
         return None if self.checked is None else self.checked.contradiction or self.checked.unsettled
 
@@ -109,7 +110,7 @@ def run(arguments: argparse.Namespace) -> int:
         _save(_picture(plane, table, arguments), arguments.picture)
     print(json.dumps(_as_json(table), indent=2) if arguments.json else _as_text(table))
     if table.doubt:
-        print(f"dappled carriers: {table.doubt}", file=sys.stderr)
+        print(f"dappled carriers: {told(table.doubt, FRAME)}", file=sys.stderr)
     return 1 if table.checked is not None and table.checked.contradiction else 0
 
 
@@ -283,7 +284,7 @@ def _as_json(table: Table) -> dict[str, Any]:
         whole["rotation_rad"] = table.rotation_rad
     if table.search is not None:
         whole["observable"] = table.search.found is not None or table.search.expected
-        whole["reason"] = table.doubt or table.search.reason or None
+        whole["reason"] = None if (why := table.doubt or table.search.unseen) is None else why.to_json()
         whole["laws"] = [{"law": one.law, "odds_nats": one.nats} for one in table.search.odds]
     if table.found:
         whole["pitch_px"] = list(table.found.spacing_px)
@@ -328,11 +329,11 @@ def _summary(table: Table) -> str:
         orders = [(c.ky, c.kx) for c, _ in table.rows]
         if table.search is not None:
             sentence += f"; {table.search.sentence}"
-        strange = table.doubt or stretch_doubt(table.used.carriers(orders), [c for c, _ in table.rows])
-        return f"{sentence}; {strange}" if strange else sentence
+        strange = table.doubt or displaced(table.used.carriers(orders), [c for c, _ in table.rows])
+        return f"{sentence}; {told(strange, FRAME)}" if strange else sentence
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
-    if table.search is not None and table.search.found is None:
-        return f"{start}; {table.search.reason}; a decode uses the {whose} prediction"
+    if table.search is not None and table.search.unseen is not None:
+        return f"{start}; {told(table.search.unseen, FRAME)}; a decode uses the {whose} prediction"
     if table.seen == 0:
         return (
             f"{start}; no carriers in this frame: it was taken without this mask, or near the mask's ideal "

@@ -12,6 +12,7 @@ from dappled.cli.arguments import add_overwrite
 from dappled.cli.each_frame import each_frame
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
+from dappled.findings import FRAME, told
 from dappled.products.exports import light_files
 from dappled.shown import printable
 
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:
     """Carriers that must be visible and are not: slices cut at the prediction would hold nothing."""
     if made.contradiction:
-        raise DappledError(f"{frame}: {made.contradiction}; --anyway decodes it at the prediction")
+        raise DappledError(f"{frame}: {told(made.contradiction, FRAME)}; --anyway decodes it at the prediction")
 
 
 def _facts(target: Path, made: DecodeResult) -> dict[str, Any]:
@@ -79,7 +80,7 @@ def _facts(target: Path, made: DecodeResult) -> dict[str, Any]:
         "views_model": field.attributes.get("views_model"),
         "views_reason": field.attributes.get("views_reason") or None,
         "doubts": field.attributes["doubts"],
-        "contradiction": made.contradiction,
+        "contradiction": None if made.contradiction is None else made.contradiction.to_json(),
     }
 
 
@@ -93,9 +94,9 @@ def summary(made: DecodeResult) -> str:
     whole = f"slices {size}, {views}; {found}, {made.report.carriers_from}"
     whose = "calibration's" if made.report.carriers_from == "calibrated" else "law's"
     if made.contradiction:
-        whole += f": {made.contradiction}; cut at the {whose} prediction"
+        whole += f": {told(made.contradiction, FRAME)}; cut at the {whose} prediction"
     elif made.unsettled:
-        whole += f": {made.unsettled}"
+        whole += f": {told(made.unsettled, FRAME)}"
     elif not made.observable:
         whole += f", not observable at this aperture: no carriers in this frame, cut at the {whose} prediction"
     elif made.carriers_found == 0:
@@ -108,5 +109,5 @@ def summary(made: DecodeResult) -> str:
     if words := decode_arguments.views_words(field):
         whole += f"; {words}"
     if others := [one for one in made.doubts if one not in (made.contradiction, made.unsettled)]:
-        whole += f"; in doubt: {'; '.join(others)}"
+        whole += f"; in doubt: {'; '.join(told(one, FRAME) for one in others)}"
     return whole

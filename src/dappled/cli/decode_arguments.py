@@ -19,6 +19,7 @@ from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
 from dappled.errors import DappledError
+from dappled.findings import FRAME, told
 from dappled.flight import layout
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
@@ -222,7 +223,7 @@ def opened_field(arguments: argparse.Namespace) -> OpenedLightField:
         found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
         found.metres()  # the user named it: refuse it if it is for another focal length
     for doubt in found.doubts:
-        print(f"dappled {arguments.verb}: {arguments.field} is in doubt: {doubt}", file=sys.stderr)
+        print(f"dappled {arguments.verb}: {arguments.field} is in doubt: {told(doubt, FRAME)}", file=sys.stderr)
     return found
 
 

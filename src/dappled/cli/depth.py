@@ -22,6 +22,7 @@ from dappled.decode import DecodeError
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
 from dappled.errors import counted
+from dappled.findings import to_rows
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs, terrain
@@ -156,7 +157,7 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
         "disparity_px": _quartiles(made.disparity),
         "sigma_px": _quartiles(made.sigma),
         "distances_from": None if found.ranging is None else found.ranging.source,
-        "doubts": found.doubts,
+        "doubts": to_rows(found.doubts),
     }
     if distances is not None:
         report["distance_known"] = float(np.isfinite(distances.distance_m).mean())

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dappled.cli.field_arguments import FieldArguments, RangingArguments, opened_field, views_words
 from dappled.cli.verb import CallError, Output, OutputExistsError, Overwriting, Report, Verb, flag, option
+from dappled.findings import to_rows
 from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
@@ -57,7 +58,7 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
         words = views_words(found.field)
         if words and not self.json:
             output.remark(words)
-        facts = {"file": str(written), "as": self.kind, "views": words or None, "doubts": found.doubts}
+        facts = {"file": str(written), "as": self.kind, "views": words or None, "doubts": to_rows(found.doubts)}
         return Report(facts, [str(written)], doubted=bool(found.doubts))
 
     def _write(self, found: OpenedLightField) -> Path:

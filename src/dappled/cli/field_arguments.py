@@ -9,6 +9,7 @@ from dappled.cli.verb import Doubtable, Output, argument, option
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw import calibration_files
+from dappled.findings import FRAME, told
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 
@@ -48,7 +49,7 @@ def opened_field(path: Path, output: Output, ranging: RangingArguments | None = 
         found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
         found.metres()  # the user named it: refuse it if it is for another focal length
     for doubt in found.doubts:
-        output.warn(f"{path} is in doubt: {doubt}")
+        output.warn(f"{path} is in doubt: {told(doubt, FRAME)}")
     return found
 
 

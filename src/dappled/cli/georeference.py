@@ -19,6 +19,7 @@ from dappled.cli.calibrate import lens
 from dappled.daemon.pipeline import recipes
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, counted
+from dappled.findings import told
 from dappled.flight import layout
 from dappled.products.maps import difference, earth, georeference, map_files, photographs, terrain
 from dappled.products.maps.difference import DifferenceError, MapDifference
@@ -134,8 +135,8 @@ def placed(flight: Path, given: Mapping[str, Any], progress: Progress, stack: Ex
     configure(parser)
     arguments = argparse.Namespace(**{**vars(parser.parse_args([str(flight)])), **given})
     made = _survey(flight, arguments, progress, stack, [], watch=watch)
-    for text in made.doubts:
-        print(text, file=sys.stderr)
+    for one in made.doubts:
+        print(f"in doubt: {told(one)}", file=sys.stderr)
     return made
 
 
@@ -171,7 +172,7 @@ def run(arguments: argparse.Namespace) -> int:
                 missing.append(str(error))
         if arguments.against is not None:
             files += _changes(made, terrain_of, output, arguments, progress=progress, missing=missing)
-    made = replace(made, notes=(*made.notes, *made.doubts, *missing))
+    made = replace(made, notes=(*made.notes, *(f"in doubt: {told(one)}" for one in made.doubts), *missing))
     report = map_files.write_report(made, output, files)
     if arguments.json:
         print(report.read_text(), end="")

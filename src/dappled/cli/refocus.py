@@ -22,6 +22,7 @@ from dappled.cli.arguments import add_overwrite, metres, refuse_existing
 from dappled.cli.decode_arguments import FieldCallError
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
 from dappled.decode.lightfield.refocus import StereoPair, all_in_focus, anaglyph, focal_stack, magnified, side_by_side
+from dappled.findings import to_rows
 from dappled.products.exports import prints
 from dappled.products.maps.georeference import Survey
 from dappled.products.opened import OpenedLightField, OpenError
@@ -115,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         disparities = [] if arguments.all_in_focus or arguments.index else [d for _, d in planes]
         facts = [dict(note.facts) for note in notes]
-        made_of = {"disparities_px": disparities, "notes": facts, "doubts": found.doubts}
+        made_of = {"disparities_px": disparities, "notes": facts, "doubts": to_rows(found.doubts)}
         print(json.dumps({"file": str(arguments.output), **made_of}))
         return 0
     for note in notes:

@@ -13,6 +13,7 @@ from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
+from dappled.findings import to_rows
 from dappled.products.exports import epi, prints
 from dappled.products.opened import OpenedLightField, OpenError
 
@@ -59,7 +60,7 @@ class DrawViews(Overwriting, FieldArguments, Verb):
         facts = {"file": str(self.output), "of": self.of, "views": list(found.views.shape[:4])}
         said = f"{count_v} × {count_u} views of {width} × {height} px; {self.output}"
         return Report(
-            {**facts, "doubts": found.doubts, **({"note": note} if note else {})},
+            {**facts, "doubts": to_rows(found.doubts), **({"note": note} if note else {})},
             [*([note] if note else []), said],
             doubted=bool(found.doubts),
         )

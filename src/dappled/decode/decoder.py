@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Singles
-from dappled.decode.calibration.calibration import Calibration, LatticeFit
+from dappled.decode.calibration.calibration import Calibration, LatticeFit, moved
 from dappled.decode.errors import DecodeError
 from dappled.decode.joint.clipping import clipped_shares, unclipped
 from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of
@@ -40,28 +40,45 @@ from dappled.decode.spectrum.peaks import (
     STRONG,
     STRONGER,
     Measured,
+    displaced,
     farther_lattice,
     measure,
     own_lattice,
-    stretch_doubt,
     turn_between,
 )
 from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, padded_shape, transform
+from dappled.findings import Finding
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _UNKNOWN: Mapping[str, Any] = {
-    **dict.fromkeys(("transfers", "aperture", "aperture_doubt", "f_number_shown", "f_number_shown_sigma")),
-    **dict.fromkeys(("views_doubt", "views_model", "views_shares")),
+    **dict.fromkeys(("transfers", "aperture", "f_number_shown", "f_number_shown_sigma")),
+    **dict.fromkeys(("views_model", "views_shares", "mask_place")),
     "views_reason": "",
     "view_sigma": None,
     "views_unclipped": False,
-    **dict.fromkeys(("mask_place", "mask_doubt")),
 }
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MadeViews:
+    """Views with their offsets, and where their phases came from.
+
+    `facts` say what each slice is of the light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was
+    not used, and the `aperture` that it was taken through (see `Aperture.shape`). `findings` say what may be wrong with
+    aperture and views, `moved` how far the mask lies from its calibration.
+    """
+
+    values: Views
+    offsets: NDArray[np.float64]
+    source: ViewsFrom = "none"
+    facts: Mapping[str, Any] = field(default_factory=lambda: _UNKNOWN)
+    findings: tuple[Finding, ...] = ()
+    moved: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +89,7 @@ class DecodeReport:
     each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
     "calibrated": predicted by the calibration, as too few were seen; "predicted": by the law alone; "found": an
     unknown lattice found in the frame. `views_from`: whose phases and transfer made the views. `noise_rms` is the
-    plane's white noise, 1.0 = sensor white. `aperture_doubt` says what is strange about the aperture that it shows,
-    `views_doubt` about the views, `mask_doubt` how far the mask has moved since its calibration.
+    plane's white noise, 1.0 = sensor white. `findings` say what is unusual about mask, aperture and views.
     """
 
     predicted: tuple[Carrier, ...]
@@ -82,9 +98,7 @@ class DecodeReport:
     carriers_from: CarriersFrom
     views_from: ViewsFrom
     noise_rms: float
-    aperture_doubt: str | None = None
-    views_doubt: str | None = None
-    mask_doubt: str | None = None
+    findings: tuple[Finding, ...] = ()
 
     @property
     def found(self) -> int:
@@ -92,11 +106,10 @@ class DecodeReport:
         return sum(m is not None and not m.suspect for m in self.measured)
 
     @property
-    def doubt(self) -> str | None:
-        """What is unusual about carriers, mask, aperture and views, in a sentence; None where nothing is."""
-        place = stretch_doubt(self.used, self.predicted) if self.carriers_from == "measured" else None
-        words = (place, self.mask_doubt, self.aperture_doubt, self.views_doubt)
-        return "; ".join(one for one in words if one) or None
+    def doubts(self) -> tuple[Finding, ...]:
+        """What is unusual about carriers, mask, aperture and views."""
+        place = displaced(self.used, self.predicted) if self.carriers_from == "measured" else None
+        return self.findings if place is None else (place, *self.findings)
 
 
 def light_field(
@@ -231,7 +244,7 @@ class MaskDecoder:
             noise = noise_rms(spectrum)
         if views:
             clips = self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
-            made, offsets, views_from, known = self.views(
+            made = self.views(
                 slices,
                 lattice,
                 carriers_from,
@@ -241,17 +254,15 @@ class MaskDecoder:
                 plane=plane if clips else None,
             )
         else:
-            made, offsets, views_from, known = *no_views(slices.values.shape[1:]), "none", _UNKNOWN
+            made = MadeViews(*no_views(slices.values.shape[1:]))
         report = DecodeReport(
             tuple(predicted),
             tuple(measured),
             tuple(used),
             carriers_from,
-            views_from,
+            made.source,
             noise,
-            known["aperture_doubt"],
-            known["views_doubt"],
-            known["mask_doubt"] or self._mask_doubt(slices, lattice, focal_length_mm),
+            (*(made.moved or self._moved(slices, lattice, focal_length_mm)), *made.findings),
         )
         facts: dict[str, Any] = {
             "law": self.law,
@@ -263,12 +274,14 @@ class MaskDecoder:
             "level": spectrum.level,
             "band": list(size),
             "taper": self.taper,
-            **{name: value for name, value in known.items() if not name.endswith("_doubt")},
+            **made.facts,
         }
-        sigma = known["view_sigma"]
+        sigma = made.facts["view_sigma"]
         if sigma is not None:
             facts["view_sigma"] = np.sqrt(np.mean(sigma**2, axis=(2, 3))).tolist()
-        field = light_field(slices, made, offsets, shape=plane.shape, report=report, facts=facts, view_sigma=sigma)
+        field = light_field(
+            slices, made.values, made.offsets, shape=plane.shape, report=report, facts=facts, view_sigma=sigma
+        )
         return field, report
 
     def transform(self, plane: Source, focal_length_mm: float) -> Spectrum:
@@ -342,10 +355,10 @@ class MaskDecoder:
             return self.calibration.nearest(focal_length_mm).mask_distance_mm
         return self.mask_distance_mm
 
-    def _mask_doubt(self, slices: Slices, lattice: Lattice, focal_length_mm: float) -> str | None:
-        """How far the frame's slices show the mask from where the calibration has it, in a sentence."""
+    def _moved(self, slices: Slices, lattice: Lattice, focal_length_mm: float) -> tuple[Finding, ...]:
+        """How far the frame's slices show the mask from where the calibration has it."""
         if self.calibration is None:
-            return None
+            return ()
         orders = [(c.ky, c.kx) for c in slices.carriers]
         return self.calibration.mask_move(
             slices.values,
@@ -353,7 +366,7 @@ class MaskDecoder:
             focal_length_mm=focal_length_mm,
             lattice=lattice,
             samples_px=(float(slices.grid[0, 0]), float(slices.grid[1, 1])),
-        ).doubt(self.mask.frequency_per_mm)
+        ).findings(self.mask.frequency_per_mm)
 
     def views(
         self,
@@ -365,14 +378,12 @@ class MaskDecoder:
         f_number: float | None,
         noise_rms: float,
         plane: Source | None = None,
-    ) -> tuple[Views, NDArray[np.float64], ViewsFrom, Mapping[str, Any]]:
-        """Views of slices that were cut before, their offsets, where phases came from, and what each slice is of the
-        light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was not used, and the `aperture` that
-        it was taken through (see `Aperture.shape`), with what is strange about that. With their `plane`, its clipped
-        pixels count as what is around them tells, if there is a calibration and the mask hasn't turned since."""
-        none = no_views(slices.values.shape[1:])
+    ) -> MadeViews:
+        """Views of slices that were cut before. With their `plane`, its clipped pixels count as what is around them
+        tells, if there is a calibration and the mask hasn't turned since."""
+        none = MadeViews(*no_views(slices.values.shape[1:]))
         if f_number is None:
-            return *none, "none", _UNKNOWN
+            return none
         printed = self.mask.frequency_per_mm
         if self.calibration is not None:
             printed *= self.calibration.nearest(focal_length_mm).print_scale
@@ -421,12 +432,12 @@ class MaskDecoder:
             through = taken.aperture.transform(angular_frequencies(taken.orders, width.kappa, rotation)).real
             keep = np.abs(through) > _LEAST_THROUGH
             if np.linalg.matrix_rank([order for order, usable in zip(taken.orders, keep, strict=True) if usable]) < 2:
-                return *none, "none", _UNKNOWN
+                return none
             transfers = own_transfer(slices.values, taken.orders, through, keep)
             taken = replace(taken, transfers=np.where(keep, transfers, 0), rotation_rad=rotation)
             views_from = "frame"
         else:
-            return *none, "none", _UNKNOWN
+            return none
         shown, shown_sigma = self._shown(width, f_number * cycles, focal_length_mm)
         fits = width is None or width.fits  # the joint model trusts the aperture
         made = views_of(taken.used(), joint=self.joint_views and fits, workers=self.workers)
@@ -434,19 +445,24 @@ class MaskDecoder:
         facts = {
             "transfers": np.column_stack([taken.angular, used.real, used.imag]).tolist(),
             "aperture": taken.aperture.shape,
-            "aperture_doubt": width.doubt(f_number) if width is not None else None,
             "f_number_shown": shown,
             "f_number_shown_sigma": shown_sigma,
-            "views_doubt": made.doubt,
             "views_model": made.model,
             "views_reason": made.reason or ("" if fits else "its carriers agree with no aperture"),
             "views_shares": asdict(made.shares) if made.shares else None,
             "view_sigma": made.sigma,
             "views_unclipped": told,
             "mask_place": place.to_dict() if place is not None else None,
-            "mask_doubt": place.doubt(self.mask.frequency_per_mm) if place is not None else None,
         }
-        return made.views, taken.aperture.offsets(), views_from, facts
+        strange = None if width is None else width.finding(f_number)
+        return MadeViews(
+            made.views,
+            taken.aperture.offsets(),
+            views_from,
+            facts,
+            made.findings if strange is None else (strange, *made.findings),
+            () if place is None else moved(place.periods, place.turn_rad, self.mask.frequency_per_mm),
+        )
 
     def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:
         """The slices of a plane whose clipped pixels are as bright as what is around them tells."""

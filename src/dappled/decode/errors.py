@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Finding, told
 
 
 class DecodeError(DappledError, ValueError):
@@ -15,8 +16,9 @@ class NoCarriers(DecodeError):  # noqa: N818  # a finding, not a fault, as below
     `expected`: they must be visible in it, whatever shape the stop has.
     """
 
-    def __init__(self, sentence: str, *, expected: bool, focal_length_mm: float, f_number: float) -> None:
-        super().__init__(sentence)
+    def __init__(self, finding: Finding, *, expected: bool, focal_length_mm: float, f_number: float) -> None:
+        super().__init__(told(finding, FRAME))
+        self.finding = finding
         self.expected = expected
         self.focal_length_mm = focal_length_mm
         self.f_number = f_number

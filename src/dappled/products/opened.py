@@ -33,6 +33,7 @@ from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
 from dappled.decode.optics import Sensor
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, of_flight
 from dappled.errors import DappledError, counted
+from dappled.findings import FRAME, Finding, told
 from dappled.flight import Tag, flight_report, layout
 from dappled.products import figures, summaries
 from dappled.products.exports import light_files, view_folders
@@ -154,7 +155,7 @@ class OpenedLightField(Refocusable):
         picture: NDArray[np.float32] | None = np.abs(self.slices[0]) if len(self.slices) else None
         with contextlib.suppress(DecodeError):
             picture = self.stack.middle()
-        doubts = [f"doubt: {one}" for one in self.doubts]
+        doubts = [f"doubt: {told(one, FRAME)}" for one in self.doubts]
         more = [f"and {len(doubts) - _SHOWN} more"] if len(doubts) > _SHOWN else []
         shown = None if picture is None or not picture.size else figures.bright(picture)
         return summaries.block(repr(self), shown, [*doubts[:_SHOWN], *more])
@@ -175,8 +176,8 @@ class OpenedLightField(Refocusable):
         return self.field.attributes
 
     @property
-    def doubts(self) -> tuple[str, ...]:
-        """What is in doubt about the light field, a sentence each."""
+    def doubts(self) -> tuple[Finding, ...]:
+        """What is in doubt about the light field."""
         return self.field.doubts
 
     @cached_property

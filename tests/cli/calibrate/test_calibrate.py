@@ -10,10 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dappled import findings
 from dappled.cli import main
 from dappled.decode.calibration.calibration import Calibration
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.findings import Code
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from dappled.products.exports import light_files
 
@@ -113,7 +115,7 @@ def test_frames_of_the_other_law_choose_it_and_refuse_the_one_that_is_asked_for(
     assert main([*words, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["law"] == "fd"
-    assert "fd explains" in told["verdict"]
+    assert (told["verdict"]["code"], told["verdict"]["facts"]["law"]) == ("law.explains", "fd")
     for written in tmp_path.glob("c.*"):
         written.unlink()
     assert main([*words, "--law", "geometric"]) == 1
@@ -124,7 +126,7 @@ def test_frames_of_the_other_law_choose_it_and_refuse_the_one_that_is_asked_for(
     assert main([*words, "--law", "geometric", "--anyway"]) == 0
     made = calibration_files.load(tmp_path / "c.toml")
     assert made.law == "geometric"
-    assert "asked for, and does not explain" in (made.doubt or "")
+    assert [one.code for one in made.doubts] == [Code.LAW_ASKED]
 
 
 def test_a_batch_goes_on_past_bad_frames_and_says_so(
@@ -158,13 +160,13 @@ def test_a_wrong_mask_is_told_in_a_sentence(
     assert "\n" not in told
     assert not (tmp_path / "c.toml").exists()
     assert main(["calibrate", *words, "--anyway"]) == 0
-    assert "written with this doubt in it: neither law explains" in capsys.readouterr().err
-    assert calibration_files.load(tmp_path / "c.toml").verdict.startswith("neither law explains")
+    assert "written with this doubt in it: calibration: neither law explains" in capsys.readouterr().err
+    assert [one.code for one in calibration_files.load(tmp_path / "c.toml").doubts] == [Code.LAW_NEITHER]
     frame = [*words[:-2], "--calibration", str(tmp_path / "c.toml"), "-o", str(tmp_path / "f.npz")]
     assert main(["decode", *frame]) == 1
-    (doubt,) = light_files.load(tmp_path / "f.npz").attributes["doubts"]
-    assert doubt.startswith("calibration: neither law explains")
-    assert f"in doubt: {doubt}\n" in capsys.readouterr().out
+    (doubt,) = light_files.load(tmp_path / "f.npz").doubts
+    assert doubt.code is Code.LAW_NEITHER
+    assert f"in doubt: {findings.told(doubt)}\n" in capsys.readouterr().out
 
 
 def test_a_dark_frame_is_taken_off_and_one_of_another_size_is_refused(

@@ -14,8 +14,9 @@ import pytest
 from dappled.cli import main
 from dappled.cli.calibrate.frames import fit_views
 from dappled.cli.calibrate.kit import MaskResult, _agree, _lines
-from dappled.decode.calibration.law_choice import LawFit
+from dappled.decode.calibration.law_choice import CALIBRATION, LawFit
 from dappled.drivers.raw import calibration_files
+from dappled.findings import Code, Finding, finding
 from tests.cli.test_thesis_camera import dng_of
 from tests.decode.ray_frames import CANON, Body, Film, Shot, Stop
 
@@ -113,8 +114,8 @@ def test_one_focal_length_at_one_stop_cannot_tell(kit: Path, told: Told) -> None
     _only(kit, "full/28mm-f32.dng", "diagonal/28mm-f32.dng", "bare/28mm-f32.dng")
     code, values, err = told()
     assert code == 1
-    assert "full: cannot tell the mask's distance from the print's scale" in err
-    assert "full: 3 shots of 4 missing: 28 mm at f/16, 85 mm at f/16, 85 mm at f/32" in err
+    assert "mask full: cannot tell the mask's distance from the print's scale" in err
+    assert "mask full: 3 of 4 shots are missing, of these: 28 mm at f/16, 85 mm at f/16, 85 mm at f/32" in err
     assert values["masks"]["full"]["mask_distance_sigma_mm"] is None
 
 
@@ -124,7 +125,7 @@ def test_what_lies_in_the_wrong_place_or_cannot_be_read_is_named(kit: Path, told
     (kit / "full/broken.dng").write_bytes(b"II*\0 not a raw")
     code, values, err = told("-o", str(tmp_path / "c.toml"))
     assert code == 1
-    assert "film-in-place.dng shows the mask's carriers without a mask" in err
+    assert "film-in-place.dng: it shows the mask's carriers without a mask" in err
     assert "broken.dng" in err
     assert values["masks"]["full"]["law"] is None
     assert values["agree"] is None
@@ -140,7 +141,7 @@ def test_exchanged_masks_are_seen(kit: Path, told: Told) -> None:
     assert code == 1
     assert "the orders (0, 1) and (1, 0) stand out, which this diagonal mask doesn't make" in err
     assert "another mask" in err
-    assert "bare: no frame without a mask" in err
+    assert "bare frames: no frame without a mask" in err
 
 
 @pytest.mark.long
@@ -154,7 +155,7 @@ def test_prints_of_two_sizes_disagree(kit: Path, told: Told, tmp_path: Path) -> 
     assert values["agree"] is False
     assert "the masks disagree: prints of 1.0" in err
     assert told("--anyway", "-o", str(tmp_path / "c.toml"))[0] == 0
-    assert any("the masks disagree" in doubt for doubt in calibration_files.load(tmp_path / "c.toml").doubts)
+    assert Code.KIT_PRINTS_DISAGREE in {one.code for one in calibration_files.load(tmp_path / "c.toml").doubts}
 
 
 def test_wrong_calls_and_folders_are_refused_in_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -190,7 +191,7 @@ def test_a_mask_of_which_no_frame_shows_anything_is_in_doubt_and_writes_nothing(
     code, values, err = told("-o", str(tmp_path / "c.toml"), *words)
     assert code == 1
     assert values["masks"]["full"]["frames_unseen"] == 1
-    assert "full: no frame shows carriers" in err
+    assert "mask full: no frame shows carriers" in err
     assert "nothing written: no frame of the full mask shows its carriers" in err
     assert not (tmp_path / "c.toml").exists()
 
@@ -201,7 +202,7 @@ def test_frames_of_one_shot_do_not_stand_for_another(kit: Path, told: Told) -> N
     _blank(kit / "full" / "wide.dng", 4.0)
     _blank(kit / "full" / "again.dng", 4.0)
     _, _, err = told()
-    assert "full: 1 shot of 3 missing: 28 mm at f/16" in err
+    assert "mask full: 1 of 3 shots are missing, of these: 28 mm at f/16" in err
 
 
 def test_a_bare_frame_at_a_stop_that_hides_carriers_proves_nothing(kit: Path, told: Told) -> None:
@@ -209,7 +210,7 @@ def test_a_bare_frame_at_a_stop_that_hides_carriers_proves_nothing(kit: Path, to
     _blank(kit / "bare" / "wide.dng", 4.0)
     _, values, err = told()
     assert values["bare_clean"] == 0
-    assert "bare: at the stop of 1 frame no carrier could be seen with a mask, either" in err
+    assert "bare frames: at the stop of 1 of its frames no carrier could be seen with a mask, either" in err
 
 
 def test_a_bare_frame_at_a_stop_where_the_mask_was_seen_counts(kit: Path, told: Told) -> None:
@@ -251,7 +252,7 @@ def test_a_distance_is_told_with_how_it_is_known(law: str, sigma_mm: float | Non
 def test_a_stated_distance_is_not_compared_with_a_fitted_one(
     law: str, sigma_mm: float | None, agree: bool | None
 ) -> None:
-    doubts: list[str] = []
+    doubts: list[Finding] = []
     other = None if law == "fd" else 0.01
     results = {"diagonal": _result(law, 1.25, other), "full": _result(law, 1.01, sigma_mm)}
     assert _agree(results, doubts) is agree
@@ -264,10 +265,13 @@ def test_each_doubt_is_stored_once(kit: Path, told: Told, tmp_path: Path, monkey
     monkeypatch.setattr(
         "dappled.cli.calibrate.kit.fit_views",
         lambda *words, **named: replace(
-            fit_views(*words, **named), verdict="neither law explains", law="fd", doubts=("a JPEG",)
+            fit_views(*words, **named),
+            verdict=finding(Code.LAW_NEITHER, CALIBRATION, fits="", stated_mm=1.0),
+            law="fd",
+            overridden=(finding(Code.FRAME_DEVELOPED, CALIBRATION, why="a JPEG"),),
         ),
     )
     monkeypatch.setattr("dappled.decode.calibration.report.law_fits", lambda *_: [_fit("geometric", explains=False)])
     assert told("--anyway", "-o", str(tmp_path / "c.toml"))[0] == 0
-    doubt = calibration_files.load(tmp_path / "c.toml").doubt or ""
-    assert doubt.count("a JPEG") == doubt.count("neither law") == 2  # one of each mask
+    codes = [one.code for one in calibration_files.load(tmp_path / "c.toml").doubts]
+    assert codes.count(Code.FRAME_DEVELOPED) == codes.count(Code.LAW_NEITHER) == 2  # one of each mask

@@ -22,6 +22,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
+from dappled.findings import Finding
 from dappled.flight import Result, flight_report, layout, recording
 from tests.flight.makers import deliver, request, tag
 
@@ -131,7 +132,8 @@ class FakeDecoder:
 class FakeDecoded:
     law, carriers, carriers_from, carriers_found = "law", [[0, 0, 0.0, 0.0]], "calibrated", 24
     carriers_predicted, sha256, grid = 24, "00", [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]
-    seen: Mapping[str, Any] = {"frame_shape": [120, 160], "mosaic": False, "noise_rms": None, "doubts": []}
+    seen: Mapping[str, Any] = {"frame_shape": [120, 160], "mosaic": False, "noise_rms": None}
+    doubts: tuple[Finding, ...] = ()
     body = np.full((1, 24, 32), 0.5, dtype="<c8").tobytes()
     arrays = ({"name": "slices", "dtype": "<c8", "shape": [1, 24, 32], "unit": "1"},)
 

@@ -16,6 +16,7 @@ from dappled.daemon.health.go_no_go import Check, verdict
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
+from dappled.findings import Code, Subject, finding, told
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
 from tests.decode.ray_frames import MASKS, Shot
@@ -75,12 +76,12 @@ def test_a_jpeg_is_no_go_behind_a_mask(good: Path, tmp_path: Path, monkeypatch: 
 
 def test_what_a_calibration_is_in_doubt_about_is_a_caution(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     decode = Darkroom.decode
-    doubt = "calibration: neither law explains these frames"
+    doubt = finding(Code.LAW_NEITHER, Subject("calibration"), fits="", stated_mm=1.0)
     monkeypatch.setattr(
-        Darkroom, "decode", lambda *words, **names: replace(decode(*words, **names), calibration_doubt=doubt)
+        Darkroom, "decode", lambda *words, **names: replace(decode(*words, **names), calibration_doubts=(doubt,))
     )
     found = by_name(check_frame(good, RECIPE))
-    assert (found["doubts"].state, found["doubts"].text) == ("caution", doubt)
+    assert (found["doubts"].state, found["doubts"].text) == ("caution", told(doubt))
 
 
 def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:

@@ -104,7 +104,7 @@ def test_carriers_that_must_be_seen_and_are_not_are_a_doubt_about_every_frame(
     first, second = ask(worker, bare, 0), ask(worker, bare, 1)
     for one in (first, second):
         assert one["carriers_found"] == 0
-        assert "should stand out at f/22" in one["seen"]["doubts"][0]
+        assert one["doubts"][0]["code"] == "carriers.unseen"
     assert "laws" in first["ms"]
     assert "laws" not in second["ms"]
     assert "laws" not in ask(worker_of(flown[0]), bare, 0, look=False)["ms"]
@@ -123,8 +123,8 @@ def test_vignetting_of_the_first_frame_with_a_lens_is_a_doubt_about_all(
     for frames, doubted in (((even, darker), False), ((darker, even), True)):
         worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
         for index, path in enumerate(frames):
-            seen = ask(worker, path, index)["seen"]
-            assert any("its corners have" in words for words in seen["doubts"]) is doubted
+            codes = [one["code"] for one in ask(worker, path, index)["doubts"]]
+            assert ("frame.vignetted" in codes) is doubted
 
 
 def test_what_bends_the_tones_of_a_frame_is_a_doubt_about_it(flown: tuple[Recipe, list[Path]], tmp_path: Path) -> None:
@@ -140,11 +140,12 @@ def test_what_bends_the_tones_of_a_frame_is_a_doubt_about_it(flown: tuple[Recipe
     bent.save(tmp_path / "bent.png", pnginfo=chunk)
     worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
     frames = [good, tmp_path / "bent.jpg", tmp_path / "bent.png", clipped, good]
-    told = [ask(worker, path, n, lens=(85.0, 22.0))["seen"]["doubts"] for n, path in enumerate(frames)]
+    told = [ask(worker, path, n, lens=(85.0, 22.0))["doubts"] for n, path in enumerate(frames)]
     assert told[0] == told[4] == []
-    assert told[1] == ["it is a JPEG: its tones are not linear, which bends carriers and views; take raw files"]
-    assert told[2][0].startswith("its gAMA chunk says that its values have a gamma of 1/2.2: its tones are not linear")
-    assert any("of its pixels are clipped, which bends carriers and views" in one for one in told[3])
+    assert [(one["code"], one["facts"]["why"]) for one in told[1]] == [("frame.developed", "it is a JPEG")]
+    gamma = "its gAMA chunk says that its values have a gamma of 1/2.2"
+    assert (told[2][0]["code"], told[2][0]["facts"]["why"]) == ("frame.developed", gamma)
+    assert "frame.clipped" in [one["code"] for one in told[3]]
 
 
 def test_a_frame_that_tells_nothing_of_the_lens_does_not_tell_for_others(
@@ -160,7 +161,7 @@ def test_a_frame_that_tells_nothing_of_the_lens_does_not_tell_for_others(
     monkeypatch.setattr(Darkroom, "lost_at_corners", lambda *_: next(looked))
     worker = worker_of(replace(flown[0], law="geometric", try_laws=False))
     doubted = [
-        any("its corners have" in words for words in ask(worker, path, index)["seen"]["doubts"])
+        "frame.vignetted" in [one["code"] for one in ask(worker, path, index)["doubts"]]
         for index, path in enumerate((far, far, far, near, near))
     ]
     assert doubted == [False, False, False, True, True]
@@ -179,6 +180,6 @@ def test_a_search_that_fails_costs_no_frame_and_is_a_doubt_until_carriers_are_se
         for index in (1, 2):
             found = ask(worker, frames[1], index)
             assert (found["law"], found["decision"]) == ("fd", None)
-            assert "the search near other laws failed: " in found["seen"]["doubts"][0]
-            assert "singular matrix" in found["seen"]["doubts"][0]
+            assert found["doubts"][0]["code"] == "carriers.unsearched"
+            assert "singular matrix" in found["doubts"][0]["facts"]["why"]
             assert len(found["sha256"]) == 64

@@ -20,11 +20,12 @@ from dappled.daemon.pipeline.tagging import FrameSettings as Shown
 from dappled.daemon.pipeline.tagging import tag
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
+from dappled.findings import FRAME, Code, finding
 from dappled.flight import Cause, Frame, Shot
 from tests.daemon.fakes import FakeCamera, eventually, no_pose
 from tests.schemas import schema
 
-DOUBT = "3.0% of its pixels are clipped"
+DOUBT = finding(Code.FRAME_CLIPPED, FRAME, share=0.03)
 
 
 class FakeMaker:
@@ -112,7 +113,7 @@ def test_a_message_as_the_schema_says(bench: Bench) -> None:
     jsonschema.validate(header, schema("depth"))
     arrays = wire.Message("depth", header, body).arrays()
     assert [arrays[name].shape for name in ("disparity", "sigma")] == [(2, 3), (2, 3)]
-    assert header["doubts"] == [DOUBT]
+    assert header["doubts"] == [DOUBT.to_json()]
     assert bench.maker.asked == [("frames/3.dng", "contrast")]
 
 

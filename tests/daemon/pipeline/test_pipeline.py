@@ -29,9 +29,8 @@ from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred, Noticed
-from dappled.drivers.raw import law_check
 from dappled.drivers.raw.recipe import LawDecision, of_flight
-from dappled.findings import Code, Subject, finding
+from dappled.findings import FRAME, Code, Subject, finding, text
 from dappled.flight import FlightError, Recording, ShotState, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import FakeCamera, Rig, arrival, eventually, failed, fired, good, rig
@@ -436,7 +435,7 @@ def jpeg_at(focal_length_mm: float, taken: str = "") -> bytes:
     return file.getvalue()
 
 
-DOUBT = law_check.OTHER_LATTICE
+DOUBT = finding(Code.CARRIERS_ELSEWHERE, FRAME)
 
 
 def judged(one: Rig) -> Check:
@@ -463,18 +462,18 @@ def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_pa
     """As where the mask was moved after its calibration: the frames show its carriers elsewhere."""
     with rig(tmp_path) as one:
         assert one.decoder is not None
-        one.decoder.seen_facts = {"doubts": [DOUBT]}
+        one.decoder.doubts = (DOUBT,)
         one.request(1)
         pending = one.ended(0)
         row = one.flight.ledger.result(0)
         assert row is not None
-        assert row.details["doubts"] == [DOUBT]
+        assert row.details["doubts"] == [DOUBT.to_json()]
         assert pending.tag is not None
         assert pending.decoded is not None
-        assert wire.slices_header(pending.tag, pending.decoded)["doubts"] == [DOUBT]
+        assert wire.slices_header(pending.tag, pending.decoded)["doubts"] == [DOUBT.to_json()]
         check = judged(one)
-        assert (check.state, DOUBT in check.text) == ("caution", True)
-        one.decoder.seen_facts = {"doubts": []}
+        assert (check.state, text(DOUBT) in check.text) == ("caution", True)
+        one.decoder.doubts = ()
         one.request(2)
         one.ended(1)
         assert judged(one).state == "go"

@@ -28,7 +28,7 @@ from dappled.daemon.pipeline.verdicts import (
     verdict,
 )
 from dappled.decode.geometry import FrameGeometry, Gnss, GroundHeight, Pose, from_euler, image_motion, turned
-from dappled.drivers.raw.raw_file import clipping
+from dappled.findings import FRAME, Code, finding, told
 from dappled.flight import Tag
 from tests.daemon.fakes import no_pose
 
@@ -96,7 +96,7 @@ def judged(pose: Pose, *, exposure_s: float | None = 1e-3, rates: tuple[float, f
         (replace(GOOD, black_share=0.6), "usable", "60% of the pixels are black"),
         (replace(GOOD, defocus_view_px=2.0), "bad", "out of focus by 2.0"),
         (replace(GOOD, defocus_view_px=None), "unknown", "focus unknown"),
-        (replace(GOOD, doubts=("no carriers seen",)), "usable", "no carriers seen"),
+        (replace(GOOD, doubts=(finding(Code.CARRIERS_ELSEWHERE, FRAME),)), "usable", "are not where"),
         (replace(GOOD, off_plan=("ISO 400, not 100 as planned",)), "usable", "taken with ISO 400, not 100 as planned"),
         (replace(GOOD, carriers_found=8), "usable", "8 of 24 carriers seen where they are predicted"),
         (replace(GOOD, carriers_found=0), "usable", "0 of 24"),
@@ -120,7 +120,8 @@ def test_a_finding_has_its_bound_and_its_sentence(facts: FrameFacts, state: str,
 
 def test_clipped_pixels_are_told_once_and_judged_by_the_camera_s_own_bounds() -> None:
     seen = replace(SEEN, clipped_share=0.03)
-    doubts = [words for words in (clipping(0.03), "the mask lies 16 µm off") if words]
+    shifted = finding(Code.MASK_SHIFTED, FRAME, by_um=16.0)
+    doubts = [finding(Code.FRAME_CLIPPED, FRAME, share=0.03), shifted]
 
     def found(bounds: VerdictBounds) -> tuple[str, ...]:
         judge, facts = Judge(NADIR, on_gimbal=False), replace(seen, bounds=bounds)
@@ -128,8 +129,8 @@ def test_clipped_pixels_are_told_once_and_judged_by_the_camera_s_own_bounds() ->
             made = judge.judge(tag(flown()), (0, 0, 0), facts, carriers=(24, 24), doubts=doubts)
         return made.reasons
 
-    assert found(BOUNDS) == ("3.0% of the pixels are clipped", "the mask lies 16 µm off")
-    assert found(replace(BOUNDS, clipped_usable=0.04)) == ("the mask lies 16 µm off",)
+    assert found(BOUNDS) == ("3.0% of the pixels are clipped", told(shifted, FRAME))
+    assert found(replace(BOUNDS, clipped_usable=0.04)) == (told(shifted, FRAME),)
 
 
 def test_bad_goes_before_unknown_and_unknown_before_usable() -> None:

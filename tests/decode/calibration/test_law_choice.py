@@ -5,6 +5,7 @@ import pytest
 
 from dappled.decode.calibration.law_choice import LawVerdict, judge, steps_bins
 from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
+from dappled.findings import Code
 from tests.decode.thesis_tables import MASK_2, S5200
 
 CHIP = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))
@@ -34,7 +35,7 @@ def test_the_law_that_made_the_carriers_is_found(law: str, asked: str) -> None:
     fit = next(one for one in verdict.fits if one.law == law)
     assert fit.mask_distance_mm == pytest.approx(0.45, rel=1e-4)
     assert fit.rms_bins < 0.01
-    assert f"{law} explains" in verdict.sentence
+    assert (verdict.finding.code, verdict.finding.facts["law"]) == (Code.LAW_EXPLAINS, law)
 
 
 def test_the_exit_pupil_and_the_anisotropy_are_found() -> None:
@@ -55,7 +56,7 @@ def test_carriers_of_neither_law_are_called_so() -> None:
     seen = [(length, (4000 / length**0.5, 5000 / length**0.5)) for length in LENGTHS]
     verdict = _judged(seen)
     assert verdict.law is None
-    assert verdict.sentence.startswith("neither law explains")
+    assert verdict.finding.code is Code.LAW_NEITHER
 
 
 def test_the_thesis_s_own_readings_fit_neither_law_together() -> None:
@@ -70,7 +71,7 @@ def test_the_thesis_s_own_readings_fit_neither_law_together() -> None:
 def test_one_focal_length_is_not_much() -> None:
     verdict = _judged(_seen("geometric", 0.48)[:1], "geometric")
     assert verdict.law == "geometric"
-    assert "one focal length" in verdict.sentence
+    assert verdict.finding.code in (Code.LAW_ONLY, Code.LAW_BOTH)
 
 
 def test_steps_are_lengths_whatever_the_turn() -> None:

@@ -15,6 +15,7 @@ from dappled.decode.joint.patch_model import is_motionless
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from dappled.decode.lightfield.light_field import LightField
+from dappled.findings import Code
 from tests.decode.joint.ray_sums import FOCAL_MM, MASK, RaySum, on_slices, psnr
 
 BAND = 0.4 * MASK.frequency_per_mm * 0.01  # cycles/pixel: inside a slice's band
@@ -208,8 +209,8 @@ def test_a_frame_whose_slices_contradict_the_depth_of_its_views_is_doubted() -> 
     assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 43
     shares = field.attributes["views_shares"]
     assert (shares["told"], shares["at_rest"]) == (0, 0)
-    assert report.views_doubt is not None
-    assert report.views_doubt.startswith(f"in at least {shares['contradict']:.0%} of the picture the slices contradict")
+    (share,) = [one.facts["share"] for one in report.doubts if one.code is Code.VIEWS_CONTRADICTED]
+    assert share == shares["contradict"]
 
 
 @pytest.mark.parametrize(("moved", "motionless"), [(0.5, True), (6.0, False)])
@@ -250,8 +251,8 @@ def test_a_scene_beyond_all_ranges_is_told() -> None:
         plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number
     )
     assert field.attributes["views_model"] == "independent"
-    assert report.doubt is not None
-    assert "neighbouring views differ there by more than 13 px" in report.doubt
+    (px,) = [one.facts["px"] for one in report.doubts if one.code is Code.VIEWS_OUT_OF_REACH]
+    assert px == pytest.approx(13, abs=0.5)
 
 
 def test_a_depth_map_of_the_first_views_makes_them_better() -> None:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from dappled.decode.array_types import Complexes
+from dappled.decode.calibration.calibration import moved
 from dappled.decode.joint.mask_place import MaskPlace, cycles_per_radian, mask_place
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from dappled.decode.optics import Lattice, Sensor
+from dappled.findings import Code
 
 ORDERS = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) >= (0, 0)]
 SHAPE, SAMPLE_PX = (120, 132), 6.5
@@ -74,14 +76,17 @@ def test_a_mask_that_moved_and_turned_is_placed_where_its_carriers_average_out()
     back = found.undone(away, ORDERS, TURNED, (SAMPLE_PX, SAMPLE_PX))
     turned_back = _moved(slices, found.periods, 0.0)
     assert np.abs(back - turned_back)[1:].mean() < 0.1 * np.abs(away - turned_back)[1:].mean()
-    told = "the mask lies 17 µm off and is turned by 0.11° since it was calibrated"
-    assert found.doubt(15.5) == f"{told}; views allow for it, but calibrate again"
+    shifted, turned = moved(found.periods, found.turn_rad, 15.5)
+    assert shifted.code is Code.MASK_SHIFTED
+    assert shifted.facts["by_um"] == pytest.approx(17, abs=0.5)
+    assert turned.code is Code.MASK_TURNED
+    assert turned.facts["by_deg"] == pytest.approx(0.11, abs=0.01)
 
 
 def test_a_mask_in_its_place_is_left_there() -> None:
     found = _place(_slices(2))
     assert not found.moved
-    assert found.doubt(15.5) is None
+    assert moved(found.periods, found.turn_rad, 15.5) == ()
 
 
 @pytest.mark.long

@@ -12,6 +12,7 @@ from dappled.decode.decoder import MaskDecoder
 from dappled.decode.optics.carriers import Carrier, Mask
 from dappled.decode.spectrum.peaks import farther_lattice, is_suspect, measure, stretch
 from dappled.decode.spectrum.transform import Spectrum, transform
+from dappled.findings import Code
 from tests.decode.rays import FOCAL_MM, FULL_F, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Plane, Texture
 
 SHAPE = (150, 190)
@@ -113,20 +114,21 @@ def test_a_mask_a_tenth_off_is_found_and_its_place_is_doubted(off: float, mask: 
     away = (field.carriers[:, 2:] - [(c.fy, c.fx) for c in true]) * SENSOR.shape
     assert np.sqrt((away**2).sum(axis=1).mean()) < 0.1
     assert stretch(report.used, report.predicted) == pytest.approx(off, abs=0.002)
-    assert report.doubt is not None
-    assert f"{abs(off):.1%} farther {'out' if off > 0 else 'in'} than predicted" in report.doubt
+    (doubt,) = report.doubts
+    assert doubt.code is Code.CARRIERS_DISPLACED
+    assert doubt.facts["off"] == pytest.approx(off, abs=0.002)
 
 
 @pytest.mark.parametrize("off", [-0.02, 0.0, 0.02])
 def test_a_mask_near_its_place_is_not_doubted(off: float) -> None:
     _, report = _told(off).decode_reported(_frame()[1], focal_length_mm=FOCAL_MM, f_number=STOPPED_F)
-    assert (report.carriers_from, report.doubt) == ("measured", None)
+    assert (report.carriers_from, report.doubts) == ("measured", ())
 
 
 @pytest.mark.parametrize("off", [-0.1, 0.0, 0.1])
 def test_at_the_ideal_aperture_nothing_is_taken_for_carriers(off: float) -> None:
     _, report = _told(off).decode_reported(_frame(f_number=FULL_F)[1], focal_length_mm=FOCAL_MM, f_number=FULL_F)
-    assert (report.carriers_from, report.doubt) == ("predicted", None)
+    assert (report.carriers_from, report.doubts) == ("predicted", ())
 
 
 @pytest.mark.parametrize("seed", range(8))

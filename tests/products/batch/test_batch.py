@@ -22,6 +22,7 @@ from dappled import durable
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, finding, told
 from dappled.flight import Frame, disk_error
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import Done, Job, Manifest
@@ -34,6 +35,8 @@ from dappled.products.maps import georeference, photographs
 from dappled.products.maps.georeference import Options
 from tests import globe
 from tests.products.flown import Flown
+
+CLIPPED = finding(Code.FRAME_CLIPPED, FRAME, share=0.03)
 
 
 @pytest.fixture
@@ -207,7 +210,7 @@ def listed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         named[f"{flight}/{form}"] = list(names)
         return []
 
-    monkeypatch.setattr(georeference, "decode", lambda *_: SimpleNamespace(doubts=("3.0% of its pixels are clipped",)))
+    monkeypatch.setattr(georeference, "decode", lambda *_: SimpleNamespace(doubts=(CLIPPED,)))
     monkeypatch.setattr(workers, "in_processes", lambda jobs, make, _: map(make, jobs))
     monkeypatch.setattr(forms, "write_frame", written)
     monkeypatch.setattr(forms, "finish", finished)
@@ -229,13 +232,13 @@ def test_what_one_form_refuses_the_others_keep(
     assert said.err.splitlines() == [
         *["dappled batch: the time of frames/000000.dng in UTC was never known"] * 2,
         f"dappled batch: {full}",
-        "dappled batch: first: frame 000000 is in doubt: 3.0% of its pixels are clipped",
-        "dappled batch: second: frame 000000 is in doubt: 3.0% of its pixels are clipped",
+        f"dappled batch: first: in doubt: frame 000000: {told(CLIPPED, FRAME)}",
+        f"dappled batch: second: in doubt: frame 000000: {told(CLIPPED, FRAME)}",
     ]
     rows = [json.loads(line) for line in said.out.splitlines()]
     assert [sorted(row["refused"]) for row in rows] == [["stac"], [], ["stac"], []]
     assert [len(row["files"]) for row in rows] == [2, 3, 2, 3]
-    assert {tuple(row["doubts"]) for row in rows} == {("3.0% of its pixels are clipped",)}
+    assert [row["doubts"] for row in rows] == [[CLIPPED.to_json()]] * 4
 
 
 def test_files_of_other_positions_are_made_again(

@@ -14,6 +14,7 @@ import zarr
 
 from dappled.decode.lightfield.light_field import LightField
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, finding
 from dappled.products.exports import light_files
 from dappled.products.exports.light_files import load, save
 
@@ -143,10 +144,15 @@ def test_without_hdf5_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
         save(tmp_path / "a.h5", light_field())
 
 
-def test_doubts_that_are_no_sentences_are_told(tmp_path: Path) -> None:
-    for bad in (5, "one", [1]):
+def test_doubts_that_are_no_findings_are_told(tmp_path: Path) -> None:
+    for bad in (
+        5,
+        "one",
+        [1],
+        [{"code": "no.such", "level": "note", "subject": {"kind": "frame", "which": ""}, "facts": {}}],
+    ):
         save(tmp_path / "a.npz", replace(light_field(), attributes={"doubts": bad}), overwrite=True)
-        with pytest.raises(DappledError, match="its attribute doubts is not a list of texts"):
+        with pytest.raises(DappledError, match="its attribute doubts is not a list of findings"):
             load(tmp_path / "a.npz")
 
 
@@ -244,12 +250,12 @@ def test_the_pages_programs_read_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (Path(__file__).parents[3] / "docs" / "lightfield.md").read_text(encoding="utf-8")
-    said = {**ATTRIBUTES, "doubts": ["the mask moved"]}
+    said = {**ATTRIBUTES, "doubts": [finding(Code.MASK_TURNED, FRAME, by_deg=0.1).to_json()]}
     carriers = np.array([[0, 0, 0, 0], [0, 1, 0, 0.1], [1, 0, 0.1, 0], [1, 1, 0.1, 0.1], [1, -1, 0.1, -0.1]])
     one = replace(light_field(), carriers=carriers, slices=np.ones((5, 4, 6), dtype=np.complex64), attributes=said)
     save(tmp_path / "frame.npz", one)
     monkeypatch.chdir(tmp_path)
     exec(re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)[0], {})  # noqa: S102  # our own page
     told = capsys.readouterr().out
-    assert "50.0 mm, doubts: ['the mask moved']" in told
+    assert "50.0 mm, doubts: ['mask.turned']" in told
     assert "order (+1, +0) at (+0.1000, +0.0000) cycles/pixel: 1.0000" in told

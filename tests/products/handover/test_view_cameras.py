@@ -15,6 +15,7 @@ import pytest
 from dappled import durable
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError
+from dappled.findings import Code, Subject, finding, told
 from dappled.flight import Frame, Tag
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.products.handover import colmap, forms, nerfstudio, stac, view_cameras, view_files
@@ -133,7 +134,9 @@ def test_frames_of_one_stop_are_one_rig(tmp_path: Path) -> None:
     def shot(name: str, wide: float, sigma_m: float | None) -> FrameCameras:
         views = tuple(replace(v, centre_m=(wide * v.centre_m[0], wide * v.centre_m[1], 0.0)) for v in VIEWS)
         own = replace(FRAME, name=name, views=views, aperture_m=wide * 3e-3, aperture_sigma_m=sigma_m)
-        return replace(own, aperture_from="carriers", doubts=(f"its carriers show f/{wide:g}",))
+        return replace(
+            own, aperture_from="carriers", doubts=(finding(Code.APERTURE_UNEXPLAINED, Subject("frame"), told=wide),)
+        )
 
     shots = [
         shot("000000", 1.0, 1e-5),
@@ -148,7 +151,7 @@ def test_frames_of_one_stop_are_one_rig(tmp_path: Path) -> None:
     said = json.loads((tmp_path / "sparse/0/origin.json").read_text())["views"]
     assert said[0] == "views stand as far apart as the frames show, in 4 of 4 frames: to ±0.7% (1 standard deviation)"
     assert said[1].startswith("the lens was taken as focused at infinity")
-    assert said[2:] == ["frame 000000 is in doubt: its carriers show f/1"]
+    assert said[2:] == [f"in doubt: {told(finding(Code.APERTURE_UNEXPLAINED, Subject('frame', '000000'), told=1.0))}"]
     assert (tmp_path / "sparse/0/priors.csv").read_text().splitlines()[4].endswith(",0.003,,carriers,infinity")
 
 

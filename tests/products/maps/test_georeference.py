@@ -16,6 +16,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
+from dappled import findings
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
@@ -23,6 +24,7 @@ from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import Tag, recording
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene.masked_camera import Truth
@@ -58,11 +60,14 @@ def test_maps_of_light_fields_in_doubt_say_so(
 
     def doubted(*given: Any, **named: Any) -> DecodeResult:
         made = decode(*given, **named)
-        attributes = {**made.light_field.attributes, "doubts": ["3.0% of its pixels are clipped"]}
+        attributes = {
+            **made.light_field.attributes,
+            "doubts": [finding(Code.FRAME_CLIPPED, FRAME, share=0.03).to_json()],
+        }
         return replace(made, light_field=replace(made.light_field, attributes=attributes))
 
     monkeypatch.setattr(Darkroom, "decode", doubted)
-    told = "frame 000000 is in doubt: 3.0% of its pixels are clipped"
+    told = f"in doubt: {findings.told(finding(Code.FRAME_CLIPPED, Subject('frame', '000000'), share=0.03))}"
     assert main(words(short_flight, tmp_path / "maps", "--as", "cog")) == 0
     assert capsys.readouterr().err.splitlines().count(told) == 1
     assert told in (tmp_path / "maps" / "report.json").read_text()

@@ -16,9 +16,11 @@ from dappled.cli.calibrate.frames import CalibrationView, fit_views, views_of
 from dappled.config import profiles
 from dappled.config.schema import ConfigError
 from dappled.decode.calibration import Calibration, report
+from dappled.decode.calibration.law_choice import CALIBRATION
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
 from dappled.errors import counted
+from dappled.findings import Code, finding, told
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -90,9 +92,9 @@ def _from_frames(arguments: argparse.Namespace) -> int:
         raise DarkroomError("no frame is left to calibrate with: each was refused, for the reason above")
     camera = darkroom.camera(seen[0].model)
     found = fit_views(darkroom, seen, choose_law=not arguments.law)
-    found, able = _judged(arguments, found, seen, camera.mask_distance_mm)
-    for doubt in (*found.doubts, *([] if able else [found.verdict])):
-        print(f"dappled calibrate: written with this doubt in it: {doubt}", file=sys.stderr)
+    found = _judged(arguments, found, seen, camera.mask_distance_mm)
+    for doubt in found.doubts:
+        print(f"dappled calibrate: written with this doubt in it: {told(doubt)}", file=sys.stderr)
     written = calibration_files.save(arguments.output, found)
     if arguments.json:
         print(json.dumps(report.as_values(found, camera.mask_distance_mm), indent=2))
@@ -106,20 +108,21 @@ def _from_frames(arguments: argparse.Namespace) -> int:
 
 def _judged(
     arguments: argparse.Namespace, found: Calibration, seen: Sequence[CalibrationView], stated_mm: float
-) -> tuple[Calibration, list[str]]:
-    """The calibration with what its law leaves in doubt, and the laws that explain its frames.
+) -> Calibration:
+    """The calibration with what its law leaves in doubt.
 
     Raises DarkroomError where its own law does not, or all frames' carriers are weak, without --anyway.
     """
-    weak = [one.shown.doubt for one in seen if one.shown.doubt is not None]
+    weak = [one.shown.weak for one in seen if one.shown.weak is not None]
     if len(weak) == len(seen) and not arguments.anyway:
-        raise DarkroomError(f"{weak[0]}; --anyway writes the calibration with this doubt in it")
+        raise DarkroomError(f"{told(weak[0], CALIBRATION)}; --anyway writes the calibration with this doubt in it")
     able = [law.law for law in report.law_fits(found, stated_mm) if law.explains]
-    if found.law not in able:
-        asked = f"the law {found.law} was asked for, and does not explain these frames: " if able else ""
-        do = "leave out --law" if able else "check that mask, camera and focal length are the right ones"
-        if not arguments.anyway:
-            raise DarkroomError(f"{asked}{found.verdict}: {do}; --anyway writes the calibration with this doubt in it")
-        if able:
-            found = replace(found, doubts=(*found.doubts, f"{asked}{found.verdict}"))
-    return found, able
+    if found.law in able:
+        return found
+    asked = found.verdict
+    if able:
+        fits = asked.facts["fits"] if asked is not None else ""
+        asked = finding(Code.LAW_ASKED, CALIBRATION, law=found.law, seen=able[0], fits=fits)
+    if asked is not None and not arguments.anyway:
+        raise DarkroomError(f"{told(asked, CALIBRATION)}; --anyway writes the calibration with this doubt in it")
+    return replace(found, overridden=(*found.overridden, asked)) if able and asked is not None else found

@@ -17,16 +17,17 @@ from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
 from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
 from dappled.errors import DappledError
+from dappled.findings import Finding, Subject, told
 
 
 @dataclass(frozen=True, slots=True)
 class CalibrationView:
-    """What a calibration frame shows, with its camera and size. `doubts` are why its values may not be linear."""
+    """What a calibration frame shows, with its camera and size. `overridden` is why its values may not be linear."""
 
     shown: FrameLattice
     shape: tuple[int, int]
     model: str
-    doubts: tuple[str, ...] = ()
+    overridden: tuple[Finding, ...] = ()
 
 
 def view_of(
@@ -41,9 +42,9 @@ def view_of(
     length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
     if length is None or stop is None:
         raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
-    bent = not_linear(raw, exposure(raw))
+    bent = not_linear(raw, exposure(raw), of=Subject("calibration frame", path.name))
     if bent and not anyway:
-        raise DarkroomError(f"{path}: {'; '.join(bent)}; --anyway calibrates with it")
+        raise DarkroomError(f"{path}: {'; '.join(told(one, one.subject) for one in bent)}; --anyway calibrates with it")
     camera = darkroom.camera(raw.camera_model or "")
     stops = camera.f_numbers
     with darkroom.naming(path):
@@ -57,7 +58,7 @@ def view_of(
             camera.mask_distance_mm,
             workers=2,
         )
-    return CalibrationView(shown, shape, raw.camera_model or "", tuple(f"{path.name}: {words}" for words in bent))
+    return CalibrationView(shown, shape, raw.camera_model or "", tuple(bent))
 
 
 def views_of(
@@ -98,4 +99,4 @@ def fit_views(darkroom: Darkroom, seen: Sequence[CalibrationView], *, choose_law
         mask_distance_mm=camera.mask_distance_mm,
         choose_law=choose_law,
     )
-    return replace(found, doubts=(*found.doubts, *(doubt for one in seen for doubt in one.doubts)))
+    return replace(found, overridden=(*found.overridden, *(bent for one in seen for bent in one.overridden)))

@@ -18,13 +18,15 @@ from dappled.cli.calibrate.frames import fit_views, view_of, views_of
 from dappled.cli.mask.kit import KIT
 from dappled.config.schema import ConfigError, read_toml
 from dappled.decode.calibration import Calibration, report
-from dappled.decode.calibration.law_choice import EXPLAINED_BINS, LawFit
+from dappled.decode.calibration.law_choice import CALIBRATION, EXPLAINED_BINS, LawFit
 from dappled.decode.errors import NoCarriers
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.raw_file import exposure
 from dappled.errors import DappledError, counted
+from dappled.findings import Code, Finding, Level, Subject, finding, to_rows, told
 
+BARE = Subject("bare frames")
 _MASKS = ("diagonal", "full")
 _DARK_SHARE = 0.05  # of white: a white frame so dark was not exposed
 _SAME_LENGTH, _SAME_STOP = 0.1, 0.15  # relative: a zoom is set by eye; f/22 may be f/22.6
@@ -68,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     asked = _asked(folder)
     if arguments.camera == "auto":
         arguments.camera = asked["camera"]
-    doubts: list[str] = []
+    doubts: list[Finding] = []
     results = {name: _mask_result(arguments, folder, name, asked, doubts) for name in _MASKS}
     bare = _bare(arguments, folder, results["diagonal"].shots, doubts)
     agree = _agree(results, doubts)
@@ -76,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     written = False
     if arguments.output is not None and full is not None and (arguments.anyway or not doubts):
         written = True
-        calibration_files.save(arguments.output, replace(full, doubts=tuple(doubts)))
+        calibration_files.save(arguments.output, replace(full, overridden=tuple(doubts)))
     if arguments.json:
         print(json.dumps(_values(arguments.camera, results, bare, agree, doubts), indent=2))
     else:
@@ -84,7 +86,7 @@ def run(arguments: argparse.Namespace) -> int:
         if written:
             print(f"written to {' and '.join(map(str, calibration_files.pair(arguments.output)))}")
     for doubt in doubts:
-        print(f"dappled calibrate: in doubt: {doubt}", file=sys.stderr)
+        print(f"dappled calibrate: in doubt: {told(doubt)}", file=sys.stderr)
     if arguments.output is not None and full is None:
         print("dappled calibrate: nothing written: no frame of the full mask shows its carriers", file=sys.stderr)
     unwritten = arguments.output is not None and not written
@@ -120,7 +122,7 @@ def _frames(folder: Path) -> list[Path]:
 
 
 def _mask_result(
-    arguments: argparse.Namespace, folder: Path, name: str, asked: dict[str, Any], doubts: list[str]
+    arguments: argparse.Namespace, folder: Path, name: str, asked: dict[str, Any], doubts: list[Finding]
 ) -> MaskResult:
     """What the frames of one mask show. Appends what speaks against it to `doubts`."""
     darkroom = _darkroom(arguments, folder, name)
@@ -128,13 +130,14 @@ def _mask_result(
     seen, bad = views_of(darkroom, paths, arguments.focal_length, arguments.f_number, arguments.anyway)
     blank = [none for _, error in bad if (none := _no_carriers(error)) is not None]
     unseen = [none for none in blank if not none.expected]
-    doubts += [str(error) for _, error in bad if (none := _no_carriers(error)) is None or none.expected]
+    doubts += [_refused(path, error) for path, error in bad if (no := _no_carriers(error)) is None or no.expected]
     used = tuple((one.shown.focal_length_mm, one.shown.f_number) for one in seen)
     shot = [*used, *((none.focal_length_mm, none.f_number) for none in blank)]
     doubts += _missing(name, shot, len(paths), asked)
     if not seen:
         if unseen:
-            doubts.append(f"{name}: no frame shows carriers ({unseen[0]}): nothing is known of this mask")
+            mask = Subject("mask", name)
+            doubts += [finding(Code.KIT_UNSEEN, mask), replace(unseen[0].finding, subject=mask, level=Level.CAUTION)]
         return MaskResult(0, len(unseen), None, None)
     if name == "diagonal":
         doubts += _mixed_up(arguments, folder, paths, bad)
@@ -142,7 +145,7 @@ def _mask_result(
     stated = darkroom.camera(seen[0].model).mask_distance_mm
     fits = report.law_fits(found, stated)
     fit = next((one for one in fits if one.law == found.law and one.explains), None)
-    doubts += [f"{name}: {words}" for words in (*found.doubts, *_untold(found, fits, fit))]
+    doubts += [*found.overridden, *(replace(one, subject=Subject("mask", name)) for one in _untold(found, fits, fit))]
     return MaskResult(len(seen), len(unseen), found, fit, used)
 
 
@@ -152,8 +155,16 @@ def _no_carriers(error: DappledError) -> NoCarriers | None:
     return cause if isinstance(cause, NoCarriers) else None
 
 
-def _missing(name: str, shot: Sequence[tuple[float, float]], there: int, asked: dict[str, Any]) -> list[str]:
-    """The shots of the list that no frame is of, in a sentence.
+def _refused(path: Path, error: DappledError) -> Finding:
+    """Why a frame is of no use for a calibration."""
+    subject, none = Subject("calibration frame", path.name), _no_carriers(error)
+    if none is not None:
+        return replace(none.finding, subject=subject)
+    return finding(Code.FRAME_REFUSED, subject, why=str(error))
+
+
+def _missing(name: str, shot: Sequence[tuple[float, float]], there: int, asked: dict[str, Any]) -> list[Finding]:
+    """The shots of the list that no frame is of.
 
     `shot` are focal lengths and f-numbers of the frames that tell them; each other one of all that are `there` may be
     any shot.
@@ -165,11 +176,7 @@ def _missing(name: str, shot: Sequence[tuple[float, float]], there: int, asked: 
     if missing <= 0:
         return []
     shots = ", ".join(f"{length:g} mm at f/{stop:g}" for length, stop in lacking)
-    if untold:
-        return [f"{name}: {counted(missing, 'shot')} of {len(wanted)} missing, among {shots}"]
-    return [
-        f"{name}: {counted(missing, 'shot')} of {len(wanted)} missing: {shots if there else 'the folder has no frame'}"
-    ]
+    return [finding(Code.KIT_SHOTS_MISSING, Subject("mask", name), missing=missing, wanted=len(wanted), shots=shots)]
 
 
 def _among(shots: Sequence[tuple[float, float]], length_mm: float, f_number: float) -> bool:
@@ -182,13 +189,12 @@ def _among(shots: Sequence[tuple[float, float]], length_mm: float, f_number: flo
 
 def _mixed_up(
     arguments: argparse.Namespace, folder: Path, paths: Sequence[Path], bad: Sequence[tuple[Path, DappledError]]
-) -> list[str]:
-    """A sentence where a frame of the diagonal mask shows the full one: films or folders were exchanged."""
+) -> list[Finding]:
+    """That a frame of the diagonal mask shows the full one: films or folders were exchanged."""
     path = next(one for one in paths if one not in {refused for refused, _ in bad})
     if not _shows_full(arguments, folder, path):
         return []
-    shows = f"{path} shows the orders (0, 1) and (1, 0) of the full mask"
-    return [f"{shows}: another film was in the camera, or its frames lie in the wrong folder"]
+    return [finding(Code.KIT_MIXED_UP, Subject("calibration frame", path.name))]
 
 
 def _shows_full(arguments: argparse.Namespace, folder: Path, path: Path) -> bool:
@@ -201,26 +207,29 @@ def _shows_full(arguments: argparse.Namespace, folder: Path, path: Path) -> bool
     return True
 
 
-def _untold(found: Calibration, fits: Sequence[LawFit], fit: LawFit | None) -> list[str]:
-    """What the frames of one mask leave open, in sentences."""
+def _untold(found: Calibration, fits: Sequence[LawFit], fit: LawFit | None) -> list[Finding]:
+    """What the frames of one mask leave open."""
     if fit is None:
+        verdict = [] if found.verdict is None else [replace(found.verdict, level=Level.CAUTION)]
         geometric = next(one for one in fits if one.law == "geometric")
         if geometric.rms_bins <= EXPLAINED_BINS and abs(geometric.print_scale - 1) > 0.01:
-            off = 1 / geometric.print_scale
-            return [f"{found.verdict}; was the film printed at {off:.1%} of its size? Print it at 100 %"]
-        return [found.verdict]
+            return [*verdict, finding(Code.KIT_PRINT_SIZE, CALIBRATION, size=1 / geometric.print_scale)]
+        return verdict
     able = [one.law for one in fits if one.explains]
-    open_ = [] if len(able) == 1 else [f"cannot tell the law: {' and '.join(able)} both explain these frames"]
-    sigma, apart = fit.distance_sigma_mm, "cannot tell the mask's distance from the print's scale"
+    open_ = [] if len(able) == 1 else [finding(Code.KIT_LAW_OPEN, CALIBRATION, laws=" and ".join(able))]
+    sigma = fit.distance_sigma_mm
     if fit.law == "geometric" and sigma is None:
-        open_.append(f"{apart} with one focal length at one f-number: shoot the list")
+        open_.append(finding(Code.KIT_DISTANCE_OPEN, CALIBRATION))
     elif fit.law == "geometric" and sigma is not None and sigma > _TOLD * fit.mask_distance_mm:
-        found_mm = f"{fit.mask_distance_mm:.2f} ± {sigma:.2f} mm"
-        open_.append(f"{apart} ({found_mm}): shoot the list's focal lengths and stops")
+        open_.append(
+            finding(Code.KIT_DISTANCE_UNCERTAIN, CALIBRATION, distance_mm=fit.mask_distance_mm, sigma_mm=sigma)
+        )
     return open_
 
 
-def _bare(arguments: argparse.Namespace, folder: Path, shown: Sequence[tuple[float, float]], doubts: list[str]) -> int:
+def _bare(
+    arguments: argparse.Namespace, folder: Path, shown: Sequence[tuple[float, float]], doubts: list[Finding]
+) -> int:
     """How many frames without a mask show no carriers where a mask would. Every mask has the diagonal one's lattice.
 
     `shown` are the focal lengths and f-numbers at which the diagonal mask's own frames show them: what the f-number
@@ -229,58 +238,52 @@ def _bare(arguments: argparse.Namespace, folder: Path, shown: Sequence[tuple[flo
     darkroom = _darkroom(arguments, folder, "diagonal")
     paths = _frames(folder / "bare")
     if not paths:
-        doubts.append(
-            "bare: no frame without a mask: nothing tells the mask's carriers from what the camera makes itself"
-        )
+        doubts.append(finding(Code.KIT_NO_BARE, BARE))
     clean = blind = 0
     for path in paths:
+        frame = Subject("calibration frame", path.name)
         if (mean := exposure(darkroom.read(path)).mean_share) < _DARK_SHARE:
-            doubts.append(
-                f"{path}: only {mean:.1%} of white on average, which shows nothing: was the cap on? Expose more"
-            )
+            doubts.append(finding(Code.KIT_DARK, frame, share=mean))
             continue
         try:
             view_of(darkroom, path, arguments.focal_length, arguments.f_number, arguments.anyway)
         except DappledError as error:
             none = _no_carriers(error)
             if none is None:
-                doubts.append(str(error))
+                doubts.append(_refused(path, error))
             elif _shows_full(arguments, folder, path):
-                doubts.append(f"{path} shows the mask's carriers without a mask: the full mask was in the camera")
+                doubts.append(finding(Code.KIT_FULL_FILM_IN, frame))
             elif none.expected or _among(shown, none.focal_length_mm, none.f_number):
                 clean += 1
             else:
                 blind += 1
             continue
-        doubts.append(
-            f"{path} shows the mask's carriers without a mask: a film was in the camera, or the frame is another's"
-        )
+        doubts.append(finding(Code.KIT_FILM_IN, frame))
     if blind and not clean:
-        doubts.append(
-            f"bare: at the stop of {counted(blind, 'frame')} no carrier could be seen with a mask, either: stop down"
-        )
+        doubts.append(finding(Code.KIT_BLIND, BARE, frames=blind))
     return clean
 
 
-def _agree(results: dict[str, MaskResult], doubts: list[str]) -> bool | None:
+def _agree(results: dict[str, MaskResult], doubts: list[Finding]) -> bool | None:
     """Whether both masks show one law, distance and print scale; None where one of them tells no distance."""
     first, second = (results[name].fit for name in _MASKS)
     if first is None or second is None:
         return None
     if first.law != second.law:
-        doubts.append(f"the masks disagree: diagonal shows the law {first.law}, full {second.law}")
+        doubts.append(finding(Code.KIT_LAWS_DISAGREE, CALIBRATION, diagonal=first.law, full=second.law))
         return False
     if first.law == "geometric" and None in (first.distance_sigma_mm, second.distance_sigma_mm):
         return None  # a distance that was stated, not measured
-    apart = []
+    apart: list[Finding] = []
     off = second.mask_distance_mm - first.mask_distance_mm
     if abs(off) > _REMOUNTED_MM + _AGREE * _both(first.distance_sigma_mm, second.distance_sigma_mm):
-        apart.append(f"distances of {first.mask_distance_mm:.3f} and {second.mask_distance_mm:.3f} mm")
+        mm = {"diagonal_mm": first.mask_distance_mm, "full_mm": second.mask_distance_mm}
+        apart.append(Finding(Code.KIT_DISTANCES_DISAGREE, CALIBRATION, mm, Level.CAUTION))
     error = _AGREE * _both(first.print_scale_sigma, second.print_scale_sigma)
     if first.law == "geometric" and error > 0 and abs(second.print_scale - first.print_scale) > error:
-        apart.append(f"prints of {first.print_scale:.4f} and {second.print_scale:.4f} times their design")
-    if apart:
-        doubts.append(f"the masks disagree: {', '.join(apart)} (diagonal, full)")
+        scales = {"diagonal": first.print_scale, "full": second.print_scale}
+        apart.append(Finding(Code.KIT_PRINTS_DISAGREE, CALIBRATION, scales, Level.CAUTION))
+    doubts += apart
     return not apart
 
 
@@ -289,7 +292,7 @@ def _both(first: float | None, second: float | None) -> float:
 
 
 def _values(
-    camera: str, results: dict[str, MaskResult], bare: int, agree: bool | None, doubts: list[str]
+    camera: str, results: dict[str, MaskResult], bare: int, agree: bool | None, doubts: list[Finding]
 ) -> dict[str, Any]:
     def of(one: MaskResult) -> dict[str, Any]:
         fit, found = one.fit, one.found
@@ -303,7 +306,7 @@ def _values(
             "print_scale_sigma": None if fit is None else fit.print_scale_sigma,
             "pupil_mm": None if fit is None else fit.pupil_mm,
             "rotation_rad": None if found is None else float(np.mean([length.rotation_rad for length in found.fits])),
-            "verdict": None if found is None else found.verdict,
+            "verdict": None if found is None or found.verdict is None else found.verdict.to_json(),
         }
 
     return {
@@ -311,7 +314,7 @@ def _values(
         "masks": {name: of(one) for name, one in results.items()},
         "bare_clean": bare,
         "agree": agree,
-        "doubts": doubts,
+        "doubts": to_rows(doubts),
     }
 
 

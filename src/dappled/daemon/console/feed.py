@@ -23,6 +23,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.subscriber import AsyncSubscriber
 from dappled.daemon.stream.wire import Message
 from dappled.errors import DappledError, report
+from dappled.findings import FRAME, from_rows, told
 
 log = logging.getLogger(__name__)
 FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
@@ -331,13 +332,13 @@ def _facts(message: Message) -> dict[str, Any]:
     shape = header["arrays"][0]["shape"]
     return {
         "shape": shape,
+        "doubts": [told(one, FRAME) for one in from_rows(header.get("doubts") or ())],
         **{
             name: header.get(name)
             for name in (
                 "carriers",
                 "carriers_from",
                 "carriers_found",
-                "doubts",
                 "grid",
                 "frame_shape",
                 "predicted",

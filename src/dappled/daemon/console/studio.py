@@ -173,7 +173,7 @@ class Studio:
             grid,
             float(1 / (grid[0, 0] * grid[1, 1])),
         )
-        views, offsets, views_from, _ = decoder.views(
+        made = decoder.views(
             slices,
             Lattice(tuple(vectors[0].tolist()), tuple(vectors[1].tolist())),
             header["carriers_from"],
@@ -181,12 +181,12 @@ class Studio:
             f_number=header["f_number"],
             noise_rms=header["noise_rms"] or 0.0,
         )
-        if not views.size:
+        if not made.values.size:
             raise StudioError(
                 "this frame has no views: without a calibration, its f-number and visible carriers are needed"
             )
         carriers = np.array(header["carriers"])
-        return LightField(slices.values, carriers, views, offsets, grid, {"views_from": views_from})
+        return LightField(slices.values, carriers, made.values, made.offsets, grid, {"views_from": made.source})
 
     def _once(self, message: Message, kind: str, make: Callable[[], Made]) -> Made:
         key = (message.header["flight"], message.header["frame"], kind)

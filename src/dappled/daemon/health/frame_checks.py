@@ -16,6 +16,7 @@ from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, exposure
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
+from dappled.findings import FRAME, told
 
 DARK_SHARE = 0.01
 SHARP = {1: 0.31, 2: 0.335}
@@ -81,8 +82,8 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Check:
             f"{seen} of {predicted} seen by the law {law}, none where configured; a flight is decoded by what is seen"
         )
         return Check("carriers", "caution", f"{text} ({made.search.sentence}): calibrate", measured=measured)
-    if made.report.doubt:
-        text = f"{seen} of {predicted} seen; {made.report.doubt}"
+    if made.report.doubts:
+        text = f"{seen} of {predicted} seen; {'; '.join(told(one, FRAME) for one in made.report.doubts)}"
     elif not made.observable:
         text = "none can be seen at this aperture, so mask and focal length are not checked: stop down for a test"
     elif seen >= SEEN_SHARE * predicted:
@@ -97,8 +98,8 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Check:
 
 def _doubts(made: DecodeResult) -> list[Check]:
     """What no other check says: of the calibration, and of carriers that can't be this mask's."""
-    said = made.calibration_doubt, made.contradiction, made.unsettled
-    text = "; ".join(words for words in said if words)
+    found = *made.calibration_doubts, made.contradiction, made.unsettled
+    text = "; ".join(told(one, FRAME) for one in found if one is not None)
     return [Check("doubts", "no-go" if made.contradiction else "caution", text)] if text else []
 
 

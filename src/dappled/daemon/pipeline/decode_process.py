@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
+from dappled import findings
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.drivers.child_process import (
@@ -29,6 +30,7 @@ from dappled.drivers.child_process import (
 )
 from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.errors import DappledError
+from dappled.findings import Finding
 from dappled.flight import Result
 from dappled.workers import Loop
 
@@ -66,6 +68,7 @@ class DecodedFrame:
     preview_size: tuple[int, int]
     ms: Mapping[str, float] = field(default_factory=dict)
     seen: Mapping[str, Any] = field(default_factory=dict)
+    doubts: tuple[Finding, ...] = ()
     decision: LawDecision | None = None
     fingerprint: Mapping[str, Any] | None = None
     picture: PictureFacts | None = None
@@ -75,8 +78,8 @@ class DecodedFrame:
     ) -> Result:
         """The row of the ledger; `judged` are the values of the frame's verdict."""
         details: dict[str, Any] = {"ms": dict(self.ms)}
-        if self.seen.get("doubts"):
-            details["doubts"] = self.seen["doubts"]
+        if self.doubts:
+            details["doubts"] = findings.to_rows(self.doubts)
         if self.fingerprint is not None:
             details["fingerprint"] = dict(self.fingerprint)
         if judged is not None:
@@ -107,7 +110,7 @@ class FrameDepth:
     grid: list[list[float]]
     law: str
     nearest_m: tuple[float, float] | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
 
 
 class FrameDecoder(Protocol):
@@ -191,7 +194,13 @@ class DecodeProcess:
         nearest = depth["nearest_m"]
         pair = None if nearest is None else (float(nearest[0]), float(nearest[1]))
         return FrameDepth(
-            body, depth["arrays"], depth["range_px"], depth["grid"], depth["law"], pair, tuple(depth["doubts"])
+            body,
+            depth["arrays"],
+            depth["range_px"],
+            depth["grid"],
+            depth["law"],
+            pair,
+            findings.from_rows(depth["doubts"]),
         )
 
     def close(self) -> None:
@@ -287,6 +296,7 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
         preview_size=(facts["preview_size"][0], facts["preview_size"][1]),
         ms=facts["ms"],
         seen=facts["seen"],
+        doubts=findings.from_rows(facts["doubts"]),
         decision=None if facts["decision"] is None else LawDecision.of_values(facts["decision"]),
         fingerprint=facts["fingerprint"],
         picture=_picture(facts["picture"]),

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from dappled import findings
 from dappled.config.profiles import VerdictBounds
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
 from dappled.daemon.pipeline.verdicts import PictureFacts, detail, noise_of
@@ -31,6 +32,7 @@ from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError, sentence
+from dappled.findings import FRAME, Code, Finding, finding
 from dappled.shown import guard_output
 
 log = logging.getLogger(__name__)
@@ -51,7 +53,7 @@ class DecodeWorker:
         self._preview_px = 1024
         self._looks = False
         self._laws = LawLooks()
-        self._lens_seen: dict[tuple[float | None, float | None], list[str]] = {}
+        self._lens_seen: dict[tuple[float | None, float | None], list[Finding]] = {}
         self._sensors: dict[tuple[str, int, int], tuple[tuple[float, float], VerdictBounds] | None] = {}
 
     def __call__(self, question: ChannelMessage) -> WorkerReply:
@@ -121,7 +123,8 @@ class DecodeWorker:
             "carriers_predicted": done.carriers_predicted,
             "law": field.attributes["law"],
             "grid": field.grid.tolist(),
-            "seen": {**_seen(done), "doubts": doubts},
+            "seen": _seen(done),
+            "doubts": findings.to_rows(doubts),
             "preview_size": list(size),
             "picture": None if picture is None else asdict(picture),
             "ms": ms,
@@ -129,7 +132,7 @@ class DecodeWorker:
         }
         return facts, (body.fd, blob.fd)
 
-    def _lens_doubts(self, configured: Darkroom, done: DecodeResult) -> list[str]:
+    def _lens_doubts(self, configured: Darkroom, done: DecodeResult) -> list[Finding]:
         """What is strange about the lens, by the first frame at this focal length and f-number that tells; without an
         f-number each frame may be at another stop, and tells for itself."""
         lens = _lens(done)
@@ -138,7 +141,8 @@ class DecodeWorker:
         lost = configured.lost_at_corners(done.light_field)
         if lost is None:
             return []
-        doubts = [] if lost.doubt is None else [lost.doubt]
+        vignetted = lost.finding()
+        doubts = [] if vignetted is None else [vignetted]
         if None not in lens:
             self._lens_seen[lens] = doubts
         return doubts
@@ -202,7 +206,7 @@ class LawLooks:
         self._last = -1
         self._settled = False
         self._left = _LOOKS
-        self._unseen: dict[tuple[float | None, float | None], tuple[bool, str | None]] = {}  # observable, doubt
+        self._unseen: dict[tuple[float | None, float | None], tuple[bool, Finding | None]] = {}  # observable, doubt
 
     def wanted(self, done: DecodeResult, index: int) -> bool:
         """Whether to search this frame. Not one that was taken before another one that is decoded already."""
@@ -226,12 +230,11 @@ class LawLooks:
 
     def fail(self, done: DecodeResult, why: str) -> None:
         """Keep that the search of a frame failed: whether its carriers stand elsewhere is not known."""
-        words = f"no carriers where predicted, and the search near other laws failed: {why}"
-        self._unseen[_lens(done)] = True, words
+        self._unseen[_lens(done)] = True, finding(Code.CARRIERS_UNSEARCHED, FRAME, why=why)
 
-    def judge(self, done: DecodeResult) -> tuple[int | None, list[str]]:
+    def judge(self, done: DecodeResult) -> tuple[int | None, list[Finding]]:
         """How many carriers a frame shows, None where none can be seen with its lens so; and what is in doubt."""
-        doubts = [words for words in (done.report.doubt, done.calibration_doubt) if words]
+        doubts = [*done.report.doubts, *done.calibration_doubts]
         if done.report.carriers_from == "measured" or _lens(done) not in self._unseen:
             return done.carriers_found, doubts
         observable, missing = self._unseen[_lens(done)]
@@ -263,7 +266,7 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         "range_px": [float(edge) for edge in np.quantile(known, [0.02, 0.98])] if known.size else None,
         "grid": field.grid.tolist(),
         "law": field.attributes["law"],
-        "doubts": done.doubts,
+        "doubts": findings.to_rows(done.doubts),
     }
     return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
 

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dappled import findings
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
@@ -159,7 +160,7 @@ class Decoding:
         decoded = self._decoder.decode(
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
-        doubts = [*decoded.seen.get("doubts", ()), *([decoded.decision.sentence] if decoded.decision else [])]
+        doubts = [*map(findings.told, decoded.doubts), *([decoded.decision.sentence] if decoded.decision else [])]
         self.failures = replace(self.failures, in_a_row=0, doubt=doubts[0] if doubts else "")
         pending.decoded = decoded
         self._unrecorded = decoded.decision or self._unrecorded
@@ -182,7 +183,7 @@ class Decoding:
                 pending.rates_rad_s,
                 decoded.picture,
                 carriers=(decoded.carriers_found, decoded.carriers_predicted),
-                doubts=decoded.seen.get("doubts", ()),
+                doubts=decoded.doubts,
             )
             json.dumps(found.values(), allow_nan=False)  # what the ledger can't hold is no verdict
         except Exception as error:  # noqa: BLE001  # a decoded frame must not be lost with its verdict

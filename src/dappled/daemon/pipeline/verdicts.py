@@ -5,18 +5,19 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import findings
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
-from dappled.drivers.raw.raw_file import clipping
 from dappled.errors import counted
+from dappled.findings import FRAME, Code, Finding, told
 from dappled.flight import Tag
 
 VerdictState = Literal["good", "usable", "bad", "unknown"]
@@ -100,7 +101,7 @@ class FrameFacts:
     focus_unknown: str
     carriers_found: int | None
     carriers_predicted: int
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
     off_plan: tuple[str, ...]
     pose_source: str
     position_sigma_m: float | None
@@ -118,8 +119,10 @@ class Verdict:
 
     def values(self) -> dict[str, Any]:
         """As ledger and stream have it."""
-        facts = {} if self.facts is None else asdict(self.facts)
-        numbers = {name: _plain(one) for name, one in facts.items()}
+        if self.facts is None:
+            return {"state": self.state, "reasons": list(self.reasons), "facts": {}}
+        numbers = {name: _plain(one) for name, one in asdict(replace(self.facts, doubts=())).items()}
+        numbers["doubts"] = findings.to_rows(self.facts.doubts)
         return {"state": self.state, "reasons": list(self.reasons), "facts": numbers}
 
 
@@ -173,7 +176,7 @@ def _focus(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
 
 
 def _rest(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
-    found: Findings = [("usable", text) for text in facts.doubts]
+    found: Findings = [("usable", told(one, FRAME)) for one in facts.doubts]
     seen, predicted = facts.carriers_found, facts.carriers_predicted
     if seen is not None and seen < bounds.carriers_share * predicted:
         found.append(("usable", f"{seen} of {predicted} carriers seen where they are predicted"))
@@ -245,7 +248,7 @@ class Judge:
         seen: PictureFacts | None,
         *,
         carriers: tuple[int | None, int],
-        doubts: Sequence[str],
+        doubts: Sequence[Finding],
     ) -> Verdict:
         """Judge a frame. `rates` are the body's at mid-exposure (rad/s), None where unknown; `carriers` were found, and
         are predicted."""
@@ -269,7 +272,7 @@ class Judge:
             focus_unknown=focus_unknown,
             carriers_found=carriers[0],
             carriers_predicted=carriers[1],
-            doubts=tuple(one for one in doubts if one != clipping(seen.clipped_share)),  # judged by its own bounds
+            doubts=tuple(one for one in doubts if one.code != Code.FRAME_CLIPPED),  # judged by its own bounds
             off_plan=off_plan(tag, self._plan.exposure),
             pose_source=tag.pose.source,
             position_sigma_m=tag.pose.position_sigma_m,

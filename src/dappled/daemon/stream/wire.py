@@ -16,11 +16,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import __version__
+from dappled import __version__, findings
 from dappled.bounds import claims
 from dappled.bounds.parsing import parse_json
 from dappled.config.settings import PublishSettings
 from dappled.errors import DappledError
+from dappled.findings import Finding
 from dappled.flight import Frame, Tag
 
 VERSION = 1
@@ -98,6 +99,10 @@ class DecodedSlices(Protocol):
         """(2, 3), from (y, x, 1) of a slice to sensor (row, column)."""
 
     @property
+    def doubts(self) -> tuple[Finding, ...]:
+        """What may be wrong with the frame."""
+
+    @property
     def seen(self) -> Mapping[str, Any]:
         """Further entries of the `slices` schema, for viewers."""
 
@@ -131,6 +136,7 @@ def slices_header(tag: Tag, decoded: DecodedSlices) -> dict[str, object]:
         "carriers_found": decoded.carriers_found,
         "grid": decoded.grid,
         **decoded.seen,
+        "doubts": findings.to_rows(decoded.doubts),
         "slices_sha256": decoded.sha256,
         "arrays": decoded.arrays,
     }

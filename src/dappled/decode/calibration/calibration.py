@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import findings
 from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.findings import FRAME, Code, Finding, Level, finding
 
 _MOST_HARMONICS = 20  # as a mask's profile
 _BLOCKS = (6, 8)  # of a frame, whose scatter says how well a mean is known
@@ -70,16 +72,19 @@ class MaskMove:
     periods: tuple[float, float]
     turn_rad: float
 
-    def doubt(self, frequency_per_mm: float) -> str | None:
-        """The move in a sentence; None where there is none."""
-        found = []
-        if any(self.periods):
-            found.append(f"lies at least {1e3 * math.hypot(*self.periods) / frequency_per_mm:.0f} µm off")
-        if self.turn_rad:
-            found.append(f"is turned by {abs(math.degrees(self.turn_rad)):.2f}°")
-        if not found:
-            return None
-        return f"the mask {' and '.join(found)} since it was calibrated, which spoils views: calibrate again"
+    def findings(self, frequency_per_mm: float) -> tuple[Finding, ...]:
+        """The move of a frame's mask, as findings."""
+        return moved(self.periods, self.turn_rad, frequency_per_mm)
+
+
+def moved(periods: tuple[float, float], turn_rad: float, frequency_per_mm: float) -> tuple[Finding, ...]:
+    """How far a frame's mask of this frequency lies from where it was calibrated, in periods and radians."""
+    found = []
+    if any(periods):
+        found.append(finding(Code.MASK_SHIFTED, FRAME, by_um=1e3 * math.hypot(*periods) / frequency_per_mm))
+    if turn_rad:
+        found.append(finding(Code.MASK_TURNED, FRAME, by_deg=abs(math.degrees(turn_rad))))
+    return tuple(found)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +93,8 @@ class Calibration:
 
     `pupil_mm` is the distance of the exit pupil beyond the focal length, v(f) = f + pupil, under `geometric`; `verdict`
     says which law explains the frames. `swept` is what their f-numbers say of the distance (None: nothing),
-    `focal_sigma_mm` the standard error of their focal lengths. `doubts` are sentences about the frames that the user
-    overrode: clipped pixels, a JPEG.
+    `focal_sigma_mm` the standard error of their focal lengths. `overridden` is what speaks against the frames, and the
+    user overrode: clipped pixels, a JPEG.
     """
 
     shape: tuple[int, int]
@@ -98,17 +103,17 @@ class Calibration:
     sensor: Sensor
     fits: tuple[LatticeFit, ...]
     pupil_mm: float = 0.0
-    verdict: str = ""
+    verdict: Finding | None = None
     swept: SweptDistance | None = None
     focal_sigma_mm: float = 0.0
-    doubts: tuple[str, ...] = ()
+    overridden: tuple[Finding, ...] = ()
 
     @property
-    def doubt(self) -> str | None:
-        """All that is doubtful about this calibration, in a sentence; None where nothing is."""
-        told = any(self.verdict in one for one in self.doubts)
-        neither = [self.verdict] if self.verdict.startswith("neither") and not told else []
-        return "; ".join([*neither, *self.doubts]) or None
+    def doubts(self) -> tuple[Finding, ...]:
+        """All that is doubtful about this calibration."""
+        known = self.verdict
+        told = known is None or known.level == Level.NOTE or any(one.code is known.code for one in self.overridden)
+        return self.overridden if known is None or told else (known, *self.overridden)
 
     def nearest(self, focal_length_mm: float) -> LatticeFit:
         """The fit at the nearest focal length."""
@@ -174,10 +179,10 @@ class Calibration:
             "shape": list(self.shape),
             "law": self.law,
             "pupil_mm": self.pupil_mm,
-            "verdict": self.verdict,
+            **({"verdict": self.verdict.to_json()} if self.verdict is not None else {}),
             **({"swept": _swept_values(self.swept)} if self.swept is not None else {}),
             "focal_sigma_mm": self.focal_sigma_mm,
-            "doubts": list(self.doubts),
+            "overridden": findings.to_rows(self.overridden),
             "mask": {
                 "frequency_per_mm": self.mask.frequency_per_mm,
                 "p": self.mask.p,
@@ -227,10 +232,11 @@ class Calibration:
                 )
                 for entry in values["fits"]
             )
-            law, pupil, verdict = values["law"], float(values.get("pupil_mm", 0.0)), str(values.get("verdict", ""))
+            law, pupil = values["law"], float(values.get("pupil_mm", 0.0))
+            verdict = Finding.from_json(values["verdict"]) if "verdict" in values else None
             swept = _swept_of(values["swept"]) if "swept" in values else None
             focal_sigma = float(values.get("focal_sigma_mm", 0.0))
-            doubts = tuple(str(one) for one in values.get("doubts", ()))
+            overridden = findings.from_rows(values.get("overridden", ()))
             known_law = law in LAWS
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DecodeError(f"the calibration is incomplete or wrong ({error}): calibrate again") from error
@@ -238,7 +244,8 @@ class Calibration:
             raise DecodeError(f"the calibration names the law {law!r}; known are {', '.join(LAWS)}")
         if not fits or any(len(f.transfer) != len(mask.half_orders()) for f in fits):
             raise DecodeError("the calibration's transfer doesn't fit its mask: calibrate again")
-        return cls((int(shape[0]), int(shape[1])), law, mask, sensor, fits, pupil, verdict, swept, focal_sigma, doubts)
+        shape = int(shape[0]), int(shape[1])
+        return cls(shape, law, mask, sensor, fits, pupil, verdict, swept, focal_sigma, overridden)
 
 
 def _block_sums(

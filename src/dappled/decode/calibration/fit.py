@@ -122,10 +122,8 @@ def from_lattices(
             if shown.focal_length_mm == length
         ]
         fits.append(_mean(seen))
-    doubts = tuple(shown.doubt for shown in lattices if shown.doubt is not None)
-    return Calibration(
-        sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.sentence, swept, focal_sigma, doubts
-    )
+    weak = tuple(shown.weak for shown in lattices if shown.weak is not None)
+    return Calibration(sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.finding, swept, focal_sigma, weak)
 
 
 def _steps(lattices: Sequence[FrameLattice], sensor: Sensor) -> list[tuple[float, tuple[float, float]]]:

@@ -17,6 +17,7 @@ from dappled.decode.spectrum.mask_lattice import MaskLattice, levels
 from dappled.decode.spectrum.peaks import Measured, fit, measure, residual_bins
 from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import transform
+from dappled.findings import Code, Finding, Level, Subject
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _CLEAR = 6.5  # times the level around: noise moves a carrier so strong by less than a tenth of a bin
@@ -28,7 +29,7 @@ class FrameLattice:
     """What one calibration frame shows: its lattice, the carriers seen, and each slice's factor on the mean's.
 
     `relative` complex (K,) belongs to `orders`, DC first. `odds` is what the frame says of each law. `focal_sigma_mm`
-    is the standard error of its focal length. `doubt` says that its carriers are so weak that noise moves them.
+    is the standard error of its focal length. `weak` says that its carriers are so weak that noise moves them.
     """
 
     focal_length_mm: float
@@ -40,7 +41,7 @@ class FrameLattice:
     relative: NDArray[np.complex128]
     odds: tuple[LawOdds, ...] = ()
     focal_sigma_mm: float = 0.0
-    doubt: str | None = None
+    weak: Finding | None = None
 
 
 def frame_lattice(
@@ -72,7 +73,8 @@ def frame_lattice(
         narrowest_f=narrowest_f,
     )
     if search.found is None:
-        raise NoCarriers(search.reason, expected=search.expected, focal_length_mm=focal_length_mm, f_number=f_number)
+        assert search.unseen is not None
+        raise NoCarriers(search.unseen, expected=search.expected, focal_length_mm=focal_length_mm, f_number=f_number)
     lattice, found = _fitted(spectrum, search.found, mask)
     lattice = refine(spectrum, lattice, [(0, 0), *((c.ky, c.kx) for c, _ in found)], workers)
     residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
@@ -87,22 +89,20 @@ def frame_lattice(
         tuple((c.ky, c.kx) for c in carriers),
         relative_transfer(values),
         search.odds,
-        doubt=_weak(spectrum, found, focal_length_mm, f_number),
+        weak=_weak(spectrum, found, focal_length_mm, f_number),
     )
 
 
 def _weak(
     spectrum: Spectrum, found: Sequence[tuple[Carrier, Measured]], focal_length_mm: float, f_number: float
-) -> str | None:
-    """A sentence where the carriers that stand clear of the noise are too few to place a lattice."""
+) -> Finding | None:
+    """That the carriers that stand clear of the noise are too few to place a lattice; else None."""
     level = levels(spectrum, [c for c, _ in found])
     clear = [(c.ky, c.kx) for (c, m), one in zip(found, level, strict=True) if m.strength > _CLEAR * one]
     if len(clear) > 1 and np.linalg.matrix_rank(clear) == 2:
         return None
-    return (
-        f"at {focal_length_mm:g} mm, f/{f_number:g} only {2 * len(clear)} carriers stand clear of the noise, so the "
-        "lattice may be off by a quarter of a bin: take a white frame at a smaller aperture, exposed well"
-    )
+    lens = {"focal_length_mm": focal_length_mm, "f_number": f_number}
+    return Finding(Code.LATTICE_WEAK, Subject("calibration"), {**lens, "carriers": 2 * len(clear)}, Level.CAUTION)
 
 
 def _fitted(spectrum: Spectrum, at: MaskLattice, mask: Mask) -> tuple[Lattice, list[tuple[Carrier, Measured]]]:

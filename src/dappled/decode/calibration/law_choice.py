@@ -17,7 +17,9 @@ from scipy import optimize
 
 from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.findings import Code, Finding, Subject, finding
 
+CALIBRATION = Subject("calibration")
 EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed
 _PRINTED = 0.05  # relative: a print's frequency is not further off
@@ -63,11 +65,11 @@ class LawFit:
 
 @dataclass(frozen=True, slots=True)
 class LawVerdict:
-    """All laws as fitted, the one that explains the frames best (None: neither), and that in a sentence."""
+    """All laws as fitted, the one that explains the frames best (None: neither), and that as a finding."""
 
     fits: tuple[LawFit, ...]
     law: str | None
-    sentence: str
+    finding: Finding
 
 
 def steps_bins(lattice: Lattice, sensor: Sensor) -> tuple[float, float]:
@@ -106,14 +108,14 @@ def judge(
     if swept is not None:
         words += f"; the f-numbers alone say {swept.scaled_mm:.3f} ± {swept.sigma_mm:.3f} mm"
     if not able:
-        return LawVerdict(fits, None, f"neither law explains these frames ({words}; stated are {stated_mm:g} mm)")
+        return LawVerdict(fits, None, finding(Code.LAW_NEITHER, CALIBRATION, fits=words, stated_mm=stated_mm))
     if len(set(lengths.tolist())) < 2:
         best = max(able, key=lambda fit: (fit.nats + (_DECISIVE if fit.law == asked else 0.0), fit.law == asked))
-        which = f"only {best.law} would do" if len(able) == 1 else f"both would do, {best.law} is taken"
+        code = Code.LAW_ONLY if len(able) == 1 else Code.LAW_BOTH
         apart = "the laws" if best.distance_sigma_mm is not None else "the laws, or scale and distance,"
-        return LawVerdict(fits, best.law, f"{which}, as far as one focal length tells {apart} apart ({words})")
+        return LawVerdict(fits, best.law, finding(code, CALIBRATION, law=best.law, apart=apart, fits=words))
     best = min(able, key=lambda fit: fit.rms_bins)
-    return LawVerdict(fits, best.law, f"{best.law} explains these frames ({words})")
+    return LawVerdict(fits, best.law, finding(Code.LAW_EXPLAINS, CALIBRATION, law=best.law, fits=words))
 
 
 def _words(fit: LawFit) -> str:

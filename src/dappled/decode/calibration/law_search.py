@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,10 @@ from dappled.decode.spectrum.mask_lattice import (
     should_stand,
 )
 from dappled.decode.spectrum.peaks import ALONE_NATS, measure, residual_bins
+from dappled.findings import FRAME, Code, Finding, finding
 
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _SCALE_OFF = {"geometric": 0.06, "fd": 0.35}  # relative: no print, and no distance, is farther off than that
-_SCENE = "a pattern of the scene (fence, woven cloth, halftone print, a screen)"
 _STANDS_NATS = 3.5  # above what is around: a peak that is more than noise
 _LACKING = 3  # orders missing, whatever the stop: fewer may be lost at its nulls
 _PLAIN = 0.01  # of the mean: a carrier so strong stands out in any white frame
@@ -51,7 +51,7 @@ class LawSearch:
     """What a frame shows under all laws.
 
     `found` is the lattice that chance is ruled out for, `law` the law near whose prediction it is; both None where
-    there is none, and `reason` says why. `expected` is whether carriers must be visible in this frame, whatever shape
+    there is none, and `unseen` says why. `expected` is whether carriers must be visible in this frame, whatever shape
     the stop has: then the absence of a lattice means that something is wrong.
     """
 
@@ -59,7 +59,7 @@ class LawSearch:
     found: MaskLattice | None
     law: str | None
     expected: bool
-    reason: str
+    unseen: Finding | None
 
     @property
     def sentence(self) -> str:
@@ -105,8 +105,8 @@ def search_laws(
     advice = _advice(
         mask, sensor, mask_distance_mm, LAWS[law](mask, sensor, mask_distance_mm, focal_length_mm), narrowest_f
     )
-    expects, reason = unseen(spectrum, asked, advice=advice, f_number=f_number)
-    foreign: list[str] = []
+    expects, why = unseen(spectrum, asked, advice=advice, f_number=f_number)
+    foreign: list[Finding] = []
     for lattice, name in sorted(sure, key=lambda one: -one[0].odds_nats):
         wrong = not_this_mask(
             spectrum,
@@ -118,14 +118,14 @@ def search_laws(
             most_scale=None if anywhere else _SCALE_OFF[name],
         )
         if wrong is None:
-            return LawSearch(tuple(odds), lattice, name, expects, "")
+            return LawSearch(tuple(odds), lattice, name, expects, None)
         foreign.append(wrong)
     if foreign:
-        return LawSearch(tuple(odds), None, None, True, f"no carriers: {foreign[0]}")
+        return LawSearch(tuple(odds), None, None, True, foreign[0])
     best = _anywhere(spectrum, mask) if anywhere and mask.pattern == "full" else None
     if expects and len(peaks.prominence) and float(peaks.prominence.max()) > _STANDS_NATS:
-        reason += f"; the peaks that do stand belong to {_SCENE}, or to another mask"
-    return LawSearch(tuple(odds), best, None, expects, "" if best is not None else reason)
+        why = replace(why, code=Code.CARRIERS_OTHER_PEAKS)
+    return LawSearch(tuple(odds), best, None, expects, None if best is not None else why)
 
 
 def not_this_mask(
@@ -137,8 +137,8 @@ def not_this_mask(
     mask_distance_mm: float,
     f_number: float | None,
     most_scale: float | None = None,
-) -> str | None:
-    """Why a lattice can't be that of this mask, in a sentence; None where it may be.
+) -> Finding | None:
+    """Why a lattice can't be that of this mask; None where it may be.
 
     `most_scale` is how far its size may be off the prediction (None: not judged). A pattern of the scene that has the
     mask's own period can't be told from it, however strong it is: a film of high contrast makes stronger carriers than
@@ -146,13 +146,12 @@ def not_this_mask(
     """
     off = found.scale - 1
     if most_scale is not None and abs(off) > most_scale:
-        way = "finer" if off > 0 else "coarser"
-        return f"peaks stand on a lattice {abs(off):.0%} {way} than this mask's: {_SCENE}, or another mask"
+        return finding(Code.CARRIERS_OTHER_SIZE, FRAME, off=off)
     strongest = max(m.strength for _, m in found.found)
     between = [Carrier(0, 0, fy, fx) for fy, fx in np.array([(0.5, 0.5), (0.5, -0.5)]) @ found.lattice.matrix()]
     halves = [one for one in measure(spectrum, between, 1.5, prominence_nats=ALONE_NATS) if one is not None]
     if len(halves) == 2 and min(one.strength for one in halves) > strongest:
-        return "stronger peaks stand half-way between this mask's carriers: another mask, with periods twice as long"
+        return finding(Code.CARRIERS_HALF_WAY, FRAME)
     if mask.pattern == "diagonal" and (more := _as_full(spectrum, found)) is not None:
         return more
     expected = order_strengths(mask, sensor, found.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
@@ -164,15 +163,12 @@ def not_this_mask(
     seen = measure(spectrum, found.lattice.carriers([one.order for one in stand]), 1.5, prominence_nats=ALONE_NATS)
     gone = [_name(one) for one, peak in zip(stand, seen, strict=True) if peak is None]
     if seen[0] is None and len(gone) > 1:
-        return (
-            f"peaks stand where some of this mask's carriers would, but none at {_some(gone)}, which should stand out "
-            f"as well: another mask, or {_SCENE}"
-        )
+        return finding(Code.CARRIERS_SOME_ABSENT, FRAME, orders=_some(gone))
     return _lacking(spectrum, found, expected, stops)
 
 
-def _as_full(spectrum: Spectrum, found: MaskLattice) -> str | None:
-    """A sentence where (0, 1) and (1, 0), which a diagonal mask has not, are both stronger than its innermost orders.
+def _as_full(spectrum: Spectrum, found: MaskLattice) -> Finding | None:
+    """That (0, 1) and (1, 0), which a diagonal mask has not, are both stronger than its innermost orders; else None.
 
     Neither comes of a film that is not linear: what that adds to a diagonal mask has an even sum of orders.
     """
@@ -182,16 +178,14 @@ def _as_full(spectrum: Spectrum, found: MaskLattice) -> str | None:
     )
     diagonal = max((one.strength for one in outer if one is not None), default=0.0)
     if all(one is not None and not one.suspect and one.strength > diagonal for one in inner):
-        return (
-            "the orders (0, 1) and (1, 0) stand out, which this diagonal mask doesn't make: a full mask of its period"
-        )
+        return finding(Code.CARRIERS_FULL_MASK, FRAME)
     return None
 
 
 def _lacking(
     spectrum: Spectrum, found: MaskLattice, expected: Sequence[OrderStrength], stops: NDArray[np.float64]
-) -> str | None:
-    """The orders that are missing behind any stop that lets through as much as is seen of the others, in a sentence."""
+) -> Finding | None:
+    """The orders that are missing behind any stop that lets through as much as is seen of the others."""
     there = [i for i, one in enumerate(expected) if one.on_sensor and one.most > 0]
     orders = [expected[i].order for i in there]
     looked = found.lattice.carriers(orders)
@@ -208,16 +202,13 @@ def _lacking(
     if likeliest.sum() < _LACKING:
         return None
     names = _some([f"({ky}, {kx})" for (ky, kx), one in zip(orders, likeliest, strict=True) if one])
-    return (
-        f"peaks stand where some of this mask's carriers would, but none at {names}, which would stand out as well "
-        "behind any stop that shows the others: another mask"
-    )
+    return finding(Code.CARRIERS_LACKING, FRAME, orders=names)
 
 
 def missing(
     spectrum: Spectrum, lattice: Lattice, *, sensor: Sensor, mask: Mask, mask_distance_mm: float, f_number: float
-) -> str | None:
-    """Why a calibration's lattice can't be this frame's, in a sentence: most of the carriers due on it are not there.
+) -> Finding | None:
+    """Why a calibration's lattice can't be this frame's: most of the carriers due on it are not there.
 
     A peak or two near them may be the scene's.
     """
@@ -229,27 +220,21 @@ def missing(
     stand = sum(one is not None for one in seen)
     if 2 * stand > len(there):
         return None
-    which = "none does" if not stand else f"{len(there) - stand} of these {len(there)} don't"
-    return (
-        f"no carriers: {_some([_name(one) for one in there])} should stand out at f/{f_number:g} where the calibration "
-        f"has them, and {which}: check mask, camera, focal length, f-number and calibration"
-    )
+    orders = _some([_name(one) for one in there])
+    due = len(there)
+    return finding(Code.CARRIERS_MISSING, FRAME, orders=orders, f_number=f_number, missing=due - stand, due=due)
 
 
 def unseen(
     spectrum: Spectrum, predictions: Sequence[Sequence[OrderStrength]], *, advice: str, f_number: float | None
-) -> tuple[bool, str]:
-    """(whether carriers must be visible, why no lattice is, in a sentence that names the orders and ends in `advice`).
+) -> tuple[bool, Finding]:
+    """(whether carriers must be visible, why no lattice is); `advice` says at which stop carriers are visible.
 
-    `predictions` are one or more laws'; the sentence is about the one under which most should be seen.
+    `predictions` are one or more laws'; the finding is about the one under which most should be seen.
     """
     if f_number is None:
         some = asked_orders(max(predictions, key=lambda one: sum(order.on_sensor for order in one)))
-        return False, (
-            "no carriers in this frame near the prediction of any law, and the f-number is unknown: "
-            f"{_some([_name(one) for one in some])} may stand or be averaged out over the stop, and where slices "
-            "are cut is not confirmed; give the f-number with --f-number"
-        )
+        return False, finding(Code.CARRIERS_UNCONFIRMED, FRAME, orders=_some([_name(one) for one in some]))
     expected, above = max(
         ((list(one), should_stand(spectrum, one)) for one in predictions), key=lambda pair: len(pair[1])
     )
@@ -259,15 +244,9 @@ def unseen(
             causes.setdefault(one.cause or "below the frame's own detail and noise", []).append(_name(one))
     lost = "; ".join(f"{_some(orders)} {cause}" for cause, orders in causes.items())
     if _spans(above):
-        more = f" (not expected: {lost})" if lost else ""
-        return True, (
-            f"no carriers: {_some([_name(one) for one in above])} should stand out at f/{f_number:g} and no lattice of "
-            f"this mask does{more}: check mask, camera, focal length and f-number"
-        )
-    return False, (
-        f"no carriers can be seen in this frame at f/{f_number:g}: {lost}. Calibrate on a white frame at a small "
-        f"aperture ({advice})"
-    )
+        orders = _some([_name(one) for one in above])
+        return True, finding(Code.CARRIERS_UNSEEN, FRAME, orders=orders, f_number=f_number, not_expected=lost or "none")
+    return False, finding(Code.CARRIERS_UNOBSERVABLE, FRAME, f_number=f_number, lost=lost, advice=advice)
 
 
 def _advice(mask: Mask, sensor: Sensor, mask_distance_mm: float, lattice: Lattice, narrowest_f: float | None) -> str:

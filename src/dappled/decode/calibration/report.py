@@ -12,6 +12,7 @@ import numpy as np
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.calibration.law_choice import LawFit, judge, steps_bins
 from dappled.decode.optics import LAWS, Carrier, Order
+from dappled.findings import text, to_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,8 @@ def as_values(found: Calibration, mask_distance_mm: float) -> dict[str, Any]:
     """All of it in plain values for JSON."""
     return {
         "law": found.law,
-        "verdict": found.verdict,
+        "verdict": None if found.verdict is None else found.verdict.to_json(),
+        "doubts": to_rows(found.doubts),
         "laws": [
             {
                 "law": fit.law,
@@ -149,7 +151,7 @@ def as_text(found: Calibration, mask_distance_mm: float) -> str:
         if law.pupil_mm is not None:
             words += f", exit pupil at the focal length {law.pupil_mm:+.2f} mm"
         lines.append(f"{words}; {law.rms_bins:.2f} bins rms are left")
-    return "\n".join([*lines, found.verdict])
+    return "\n".join([*lines, *([] if found.verdict is None else [text(found.verdict)])])
 
 
 def _table(table: Sequence[Row]) -> list[str]:

@@ -17,6 +17,7 @@ from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, UsedAperture, angular_frequencies, used_aperture
 from dappled.decode.lightfield.views import Views, chroma_noise, from_slices
 from dappled.decode.optics import Carrier, Order
+from dappled.findings import FRAME, Code, Finding, finding
 
 ViewsModel = Literal["joint", "independent"]
 _REACH = 1.0  # samples of a slice from view to view: a carrier's order further, and parallax can't be told apart
@@ -38,7 +39,7 @@ _SOME_IN_BAND = 0.04  # of the patches hardly have any
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameViews:
     """`views` float32 (V, U, h, w), by which model they were made, and their standard errors `sigma` float32
-    (V, U, m, n), see `JointViews`, in the plane's unit; None where the model tells none. `doubt` says in a sentence
+    (V, U, m, n), see `JointViews`, in the plane's unit; None where the model tells none. `findings` say
     what may be wrong with them, `reason` why the joint model did not make them: "" where it did, or was not asked to;
     `shares` how it made which patches, None where it did not.
     """
@@ -46,7 +47,7 @@ class FrameViews:
     views: Views
     model: ViewsModel
     sigma: Singles | None
-    doubt: str | None = None
+    findings: tuple[Finding, ...] = ()
     reason: str = ""
     shares: PatchShares | None = None
 
@@ -190,27 +191,20 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         workers=workers,
     )
     shares = found.shares
-    doubt = contradicted = None
+    doubts: tuple[Finding, ...] = ()
     if shares.beyond > _TOLD_BEYOND:
-        doubt = (
-            f"{shares.beyond:.0%} of the picture is so near or far that neighbouring views differ there by more than "
-            f"{FARTHEST * taken.samples_px[1]:.0f} px of the sensor, and {taken.aperture.views} views can't tell by "
-            "how much: don't trust parallax there, focus on it, or stop down"
-        )
+        px, views = FARTHEST * taken.samples_px[1], taken.aperture.views
+        doubts = (finding(Code.VIEWS_OUT_OF_REACH, FRAME, share=shares.beyond, px=px, views=views),)
     if shares.beyond > _MOST_BEYOND:  # inverting supposes no range
         reason = f"{shares.beyond:.0%} of the picture is nearer or farther than the model of the light field reaches"
-        return replace(independent, doubt=doubt, reason=reason)
+        return replace(independent, findings=doubts, reason=reason)
     cleaner = _CLEANER if shares.in_band > _SOME_IN_BAND else _CLEANER_FOLDED
     if np.mean(noise) < cleaner**2 * np.mean(found.sigma**2):
         reason = "the frame has so little noise that the model of the light field would add errors"
-        return replace(independent, doubt=doubt, reason=reason)
+        return replace(independent, findings=doubts, reason=reason)
     if shares.contradict > _TOLD_CONTRADICTED:
-        contradicted = (
-            f"in at least {shares.contradict:.0%} of the picture the slices contradict the depth that the views show, "
-            "as where things shine through each other: don't trust depth there"
-        )
-    doubt = "; ".join(filter(None, (doubt, contradicted))) or None
-    return FrameViews(found.views, "joint", found.sigma, doubt, shares=shares)
+        doubts += (finding(Code.VIEWS_CONTRADICTED, FRAME, share=shares.contradict),)
+    return FrameViews(found.views, "joint", found.sigma, doubts, shares=shares)
 
 
 def _unfit(orders: int, shape: tuple[int, int], views: int) -> str:

@@ -11,7 +11,6 @@ a polynomial of few terms, m the differences of orders. Parallax tells δ even w
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -77,17 +76,6 @@ class MaskPlace:
             for along, side, px in zip(cycles.T, slices.shape[1:], steps_px, strict=True)
         )
         return np.asarray(slices * down[:, :, None] * across[:, None, :])
-
-    def doubt(self, frequency_per_mm: float) -> str | None:
-        """The move in a sentence; None where there is none."""
-        found = []
-        if any(self.periods):
-            found.append(f"lies {1e3 * math.hypot(*self.periods) / frequency_per_mm:.0f} µm off")
-        if self.turn_rad:
-            found.append(f"is turned by {abs(math.degrees(self.turn_rad)):.2f}°")
-        if not found:
-            return None
-        return f"the mask {' and '.join(found)} since it was calibrated; views allow for it, but calibrate again"
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a light field's attributes."""

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dappled.decode.optics import Lattice, Order
+from dappled.findings import FRAME, Code, Finding, finding
 
 Shape = Literal["beams", "filled", "round"]
 _PARTS = 15  # of a cell's side, where a circle cuts through cells
@@ -226,19 +227,13 @@ class UsedAperture:
         """Whether the carriers agree with an aperture, if not with the told one; also where they tell nothing."""
         return self.share is None or not math.isnan(self.share)
 
-    def doubt(self, f_number: float) -> str | None:
-        """What is strange about the aperture of a frame at a told f-number, in a sentence; None where nothing is."""
+    def finding(self, f_number: float) -> Finding | None:
+        """What is strange about the aperture of a frame at a told f-number; None where nothing is."""
         if self.share is None:
             return None
         if not self.fits:
-            return (
-                f"its carriers agree with no aperture near f/{f_number:.3g}, which the views take for right: check "
-                "f-number, calibration and clipping"
-            )
-        return (
-            f"its carriers show f/{f_number / self.share:.2g}, told is f/{f_number:.3g}: the views go by the carriers, "
-            "distances by the told one; check the f-number and the mask's distance"
-        )
+            return finding(Code.APERTURE_UNEXPLAINED, FRAME, told=f_number)
+        return finding(Code.APERTURE_DISAGREES, FRAME, shown=f_number / self.share, told=f_number)
 
 
 def used_aperture(

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats
+from dappled.findings import FRAME, Code, Finding, finding
 
 _ROWS = 64  # of the reduced picture
 _LEAST = 24  # samples of the shorter side
@@ -40,18 +41,14 @@ class Falloff:
     sigma: float
     against: int
 
-    @property
-    def doubt(self) -> str | None:
-        """A sentence where the loss is large, not larger than a lens', and clear of the scatter; else None."""
+    def finding(self) -> Finding | None:
+        """That the loss is large, not larger than a lens', and clear of the scatter; else None."""
         if not _LEAST_LOST < self.lost < _MOST_LOST or self.against > _MOST_AGAINST:
             return None
         left = 1 - self.lost
         if -math.log(left) < _LEAST_SIGMAS * self.sigma / left:
             return None
-        return (
-            f"its corners have {self.lost:.0%} (± {self.sigma:.0%}) less light than its middle, as by a lens' "
-            "vignetting: give a white frame with --white"
-        )
+        return finding(Code.FRAME_VIGNETTED, FRAME, lost=self.lost, sigma=self.sigma)
 
 
 def falloff(picture: NDArray[np.floating]) -> Falloff | None:

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import findings
 from dappled.decode.errors import DecodeError
+from dappled.findings import Finding
 
 Image = NDArray[np.float32]
 CAMERAS = "cameras"  # an attribute of light fields: true where each view is a camera's, further right with larger u
@@ -45,9 +47,9 @@ class LightField:
     view_sigma: NDArray[np.float32] | None = None
 
     @property
-    def doubts(self) -> tuple[str, ...]:
-        """What may be wrong with it, a sentence each; files of older versions name none."""
-        return tuple(map(str, self.attributes.get("doubts") or ()))
+    def doubts(self) -> tuple[Finding, ...]:
+        """What may be wrong with it; the attribute `doubts` has them as JSON."""
+        return findings.from_rows(self.attributes.get("doubts") or ())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum.transform import Complex, Spectrum, hann
+from dappled.findings import FRAME, Code, Finding, finding
 
 PROMINENCE_NATS = 2.5  # of log magnitude above the median around; the highest of 400 bins of noise reaches 1.1
 ALONE_NATS = 1.6  # for a peak that is expected within a bin: the highest of 10 bins of noise reaches 0.6
@@ -239,13 +240,10 @@ def stretch(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> float:
     return sum(here for here, _ in both) / whole - 1 if whole else 0.0
 
 
-def stretch_doubt(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> str | None:
-    """A sentence where carriers are too far from their prediction for a mask at its stated place; else None."""
+def displaced(used: Sequence[Carrier], predicted: Sequence[Carrier]) -> Finding | None:
+    """That carriers are too far from their prediction for a mask at its stated place; else None."""
     off = stretch(used, predicted)
-    if abs(off) <= _DOUBTED:
-        return None
-    way = "farther out" if off > 0 else "farther in"
-    return f"they stand {abs(off):.1%} {way} than predicted: check mask distance and focal length, or calibrate"
+    return None if abs(off) <= _DOUBTED else finding(Code.CARRIERS_DISPLACED, FRAME, off=off)
 
 
 def turn_between(lattice: Lattice, predicted: Lattice) -> float:

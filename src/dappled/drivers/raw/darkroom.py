@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import findings
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
@@ -38,6 +39,7 @@ from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, ex
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
+from dappled.findings import Finding, Subject
 
 Painter = Callable[[LightField], NDArray[np.float32]]  # views in colour of a light field with grey ones
 
@@ -120,8 +122,8 @@ __all__ = [
 class DecodeResult:
     """A decoded frame, its report and raw file, and how many milliseconds each step took.
 
-    `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubt` is what
-    the calibration itself was in doubt about, `exposed` how the file's values are, `not_linear` why they may not follow
+    `checked` is whether its carriers stand where slices are cut, where that was checked. `calibration_doubts` are
+    those about the calibration itself, `exposed` how the file's values are, `not_linear` why they may not follow
     the light in the scene, vignetting among it.
     """
 
@@ -131,8 +133,8 @@ class DecodeResult:
     exposed: Exposure
     ms: dict[str, float] = field(default_factory=dict)
     checked: LawCheck | None = None
-    calibration_doubt: str | None = None
-    not_linear: tuple[str, ...] = ()
+    calibration_doubts: tuple[Finding, ...] = ()
+    not_linear: tuple[Finding, ...] = ()
 
     @property
     def search(self) -> LawSearch | None:
@@ -140,20 +142,20 @@ class DecodeResult:
         return None if self.checked is None else self.checked.search
 
     @property
-    def contradiction(self) -> str | None:
+    def contradiction(self) -> Finding | None:
         """Why carriers should be visible and are not, or stand elsewhere; None where there is no such reason."""
         return None if self.checked is None else self.checked.contradiction
 
     @property
-    def unsettled(self) -> str | None:
+    def unsettled(self) -> Finding | None:
         """What can't be told of the carriers, or is strange about those that are there; None where nothing is."""
         return None if self.checked is None else self.checked.unsettled
 
     @property
-    def doubts(self) -> tuple[str, ...]:
-        """All that is in doubt about the frame, a sentence each."""
-        found = (self.contradiction, self.unsettled, self.report.doubt, self.calibration_doubt, *self.not_linear)
-        return tuple(words for words in found if words)
+    def doubts(self) -> tuple[Finding, ...]:
+        """All that is in doubt about the frame."""
+        carriers = (one for one in (self.contradiction, self.unsettled) if one is not None)
+        return (*carriers, *self.report.doubts, *self.calibration_doubts, *self.not_linear)
 
     @property
     def observable(self) -> bool:
@@ -260,11 +262,11 @@ class Darkroom:
         bent = not_linear(raw, exposed, masked=isinstance(decoder, MaskDecoder))
         bent += self._lineariser.doubts
         lost = self.lost_at_corners(light_field) if views else None
-        if lost is not None and lost.doubt is not None:
-            bent.append(lost.doubt)
+        if lost is not None and (vignetted := lost.finding()) is not None:
+            bent.append(vignetted)
         attributes["falloff"] = None if lost is None else [lost.lost, lost.sigma]
-        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubt_of(decoder), tuple(bent))
-        attributes["doubts"] = list(made.doubts)
+        made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubts_of(decoder), tuple(bent))
+        attributes["doubts"] = findings.to_rows(made.doubts)
         if self._checks and not made.observable:
             attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))
@@ -359,11 +361,10 @@ class Darkroom:
         return calibration_files.load(Path(self.recipe.calibration))
 
 
-def doubt_of(decoder: Decoder) -> str | None:
-    """What is doubtful about a decoder's calibration, in a sentence: no law explains it, or its frames were not linear.
-    None for others."""
+def doubts_of(decoder: Decoder) -> tuple[Finding, ...]:
+    """What is doubtful about a decoder's calibration: no law explains it, or its frames were not linear."""
     known = decoder.calibration if isinstance(decoder, MaskDecoder) else None
-    return None if known is None or known.doubt is None else f"calibration: {known.doubt}"
+    return () if known is None else known.doubts
 
 
 def known_to(decoder: MaskDecoder, focal_sigma_mm: float | None) -> MaskDecoder:
@@ -384,7 +385,7 @@ class FrameLineariser:
 
     def __init__(self, recipe: Recipe) -> None:
         self._recipe = recipe
-        self.doubts: list[str] = []
+        self.doubts: list[Finding] = []
         self._dark: NDArray[Any] | None = None
         self._defects: Places | None = None
         self._gains: dict[tuple[int, int], Plane] = {}
@@ -476,7 +477,7 @@ class FrameLineariser:
 
     def _white_frame(self) -> RawFile:
         raw, masked = read(self._recipe.white, self._recipe), self._recipe.mask != profiles.LENSLET
-        self.doubts = [f"white frame: {words}" for words in not_linear(raw, exposure(raw), masked=masked)]
+        self.doubts = not_linear(raw, exposure(raw), masked=masked, of=Subject("white frame"))
         return raw
 
     def _dark_frame(self) -> NDArray[Any] | None:

@@ -15,24 +15,22 @@ from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.mask_lattice import MaskLattice
 from dappled.decode.spectrum.peaks import Measured, lattice_from
 from dappled.decode.spectrum.transform import Source, transform
-
-OTHER_LATTICE = "the mask's carriers are not where the calibration has them: calibrate again"
-"""The doubt about a frame whose carriers were found elsewhere; it is decoded without the calibration."""
+from dappled.findings import FRAME, Code, Finding, finding
 
 
 @dataclass(frozen=True, slots=True)
 class LawCheck:
     """What a check says of a frame: `decoder` is the one to decode it with, which may be at another lattice.
 
-    `search` is what the frame shows under the laws, where they were tried. `contradiction` says in a sentence that
+    `search` is what the frame shows under the laws, where they were tried. `contradiction` says that
     carriers should be visible and are not, or stand elsewhere; `unsettled` what can't be told, or is strange about
     carriers that are there. None where there is no such reason for doubt.
     """
 
     decoder: MaskDecoder
     search: LawSearch | None = None
-    contradiction: str | None = None
-    unsettled: str | None = None
+    contradiction: Finding | None = None
+    unsettled: Finding | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +77,7 @@ def check(
             return LawCheck(decoder, found.search, contradiction or found.contradiction, unsettled)
         if contradiction is None and _alike(found.search.found.lattice, decoder.lattice_at(lens.focal_length_mm)):
             return LawCheck(decoder)
-        return replace(found, contradiction=OTHER_LATTICE)
+        return replace(found, contradiction=finding(Code.CARRIERS_ELSEWHERE, FRAME))
     return _searched(decoder, plane, lens, keep_law=keep_law)
 
 
@@ -88,18 +86,14 @@ def _searched(decoder: MaskDecoder, plane: Source, lens: FrameLens, *, keep_law:
     if search.found is not None and keep_law and search.law not in (None, decoder.law):
         own = search_frame(decoder, plane, lens, other_laws=False)
         if own.found is None:
-            return LawCheck(
-                decoder,
-                search,
-                f"its carriers don't stand where the law {decoder.law} has them, but where {search.law} has "
-                f"({search.sentence}): leave out --law",
-            )
+            other = finding(Code.CARRIERS_OTHER_LAW, FRAME, law=decoder.law, seen=search.law, odds=search.sentence)
+            return LawCheck(decoder, search, other)
         search = own
     if search.found is not None:
         return LawCheck(at_found(decoder, search), search)
     if search.expected:
-        return LawCheck(decoder, search, search.reason)
-    return LawCheck(decoder, search, None, search.reason if lens.f_number is None else None)
+        return LawCheck(decoder, search, search.unseen)
+    return LawCheck(decoder, search, None, search.unseen if lens.f_number is None else None)
 
 
 def search_frame(decoder: MaskDecoder, plane: Source, lens: FrameLens, *, other_laws: bool = True) -> LawSearch:
@@ -123,8 +117,8 @@ def at_found(decoder: MaskDecoder, search: LawSearch) -> MaskDecoder:
     return replace(decoder, law=search.law or decoder.law, at=search.found.lattice)
 
 
-def _missing(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> str | None:
-    """Why a calibration can't be this frame's, in a sentence; None where it may be."""
+def _missing(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> Finding | None:
+    """Why a calibration can't be this frame's; None where it may be."""
     return missing(
         _spectrum(decoder, plane),
         decoder.lattice_at(focal_length_mm),
@@ -141,8 +135,8 @@ def _foreign(
     used: Lattice,
     pairs: Sequence[tuple[Carrier, Measured | None]],
     lens: FrameLens,
-) -> str | None:
-    """Why the carriers that a frame shows can't be those of this mask, in a sentence; None where they may be."""
+) -> Finding | None:
+    """Why the carriers that a frame shows can't be those of this mask; None where they may be."""
     seen = tuple((c, m) for c, m in pairs if m is not None and not m.suspect and (c.ky, c.kx) != (0, 0))
     if not seen:
         return None

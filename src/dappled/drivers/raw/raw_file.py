@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.bounds.pictures import open_picture
+from dappled.findings import FRAME, Code, Finding, Subject, finding
 
 RawSource = Path | str | bytes | memoryview | mmap.mmap
 Values = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32] | NDArray[np.float64]
@@ -170,22 +171,15 @@ def exposure(raw: RawFile, every: int = _EVERY) -> Exposure:
     return Exposure(shares, clipped, float(np.mean(share)), black)
 
 
-def not_linear(raw: RawFile, exposed: Exposure, *, masked: bool = True) -> list[str]:
-    """Return why a frame's values do not follow the light, in sentences; empty where nothing speaks against it. Behind
+def not_linear(raw: RawFile, exposed: Exposure, *, masked: bool = True, of: Subject = FRAME) -> list[Finding]:
+    """Return why a frame's values do not follow the light; empty where nothing speaks against it. Behind
     lenslets, not `masked`, what is clipped spoils its own place alone."""
     found = []
     if raw.developed:
-        found.append(f"{raw.developed}: its tones are not linear, which bends carriers and views; take raw files")
-    if masked and (clipped := clipping(exposed.clipped_share)) is not None:
-        found.append(clipped)
+        found.append(finding(Code.FRAME_DEVELOPED, of, why=raw.developed))
+    if masked and exposed.clipped_share > MOST_CLIPPED:
+        found.append(finding(Code.FRAME_CLIPPED, of, share=exposed.clipped_share))
     return found
-
-
-def clipping(share: float) -> str | None:
-    """Return the doubt about a frame of which this share of pixels is clipped; None for a few."""
-    if not share > MOST_CLIPPED:
-        return None
-    return f"{share:.1%} of its pixels are clipped, which bends carriers and views: expose less"
 
 
 def read_exif(file: BinaryIO) -> ExposureSettings:

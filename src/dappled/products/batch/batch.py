@@ -20,10 +20,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
-from dappled import __version__, confined, durable, file_lock
+from dappled import __version__, confined, durable, file_lock, findings
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError, sentence
+from dappled.findings import Finding
 from dappled.flight import Frame, Tag, canonical
 from dappled.products.exports import light_files
 from dappled.products.extras import need
@@ -95,7 +96,7 @@ class Done:
     cpu_seconds: float
     peak_mb: float
     refused: Mapping[str, str] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
 
     def lacks(self, kind: str) -> bool:
         """Whether this kind was not made."""
@@ -173,7 +174,7 @@ def make(job: Job) -> Done:
     began, cpu = time.monotonic(), time.process_time()
     outputs: list[BatchOutput] = []
     refused: dict[str, str] = {}
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
     try:
         making = _making(job)
         doubts = making.decoded.doubts
@@ -380,7 +381,13 @@ class Manifest:
 
     def add(self, done: Done) -> None:
         """Append a result, durably."""
-        os.write(self._fd, json.dumps(asdict(done), sort_keys=True).encode() + b"\n")
+        os.write(
+            self._fd,
+            json.dumps(
+                {**asdict(replace(done, doubts=())), "doubts": findings.to_rows(done.doubts)}, sort_keys=True
+            ).encode()
+            + b"\n",
+        )
         os.fsync(self._fd)
         self._note(done)
 
@@ -429,8 +436,8 @@ class Manifest:
 def _done(row: dict[str, Any]) -> Done:
     """Raises ValueError, TypeError and KeyError."""
     outputs = tuple(BatchOutput(**one) for one in row["outputs"])
-    done = Done(**{**row, "outputs": outputs, "doubts": tuple(row.get("doubts", ()))})
-    if not all(isinstance(name, str) for name in (done.key, *done.doubts, *(one.name for one in done.outputs))):
+    done = Done(**{**row, "outputs": outputs, "doubts": findings.from_rows(row.get("doubts", ()))})
+    if not all(isinstance(name, str) for name in (done.key, *(one.name for one in done.outputs))):
         raise TypeError("a name is not text")
     if not isinstance(done.refused, dict):
         raise TypeError("what was refused is not told by kind")

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import confined, durable
+from dappled import confined, durable, findings
 from dappled.bounds.arrays import read_npz
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json
@@ -152,9 +152,10 @@ def _check_attributes(path: Path, attributes: Any) -> None:
         if value is not None and (not isinstance(value, kind) or isinstance(value, bool)):
             what = "a text" if kind == (str,) else "a number"
             raise DappledError(f"{path}: its attribute {name} is not {what}; decode the frame again")
-    doubts = attributes.get("doubts") or []
-    if not (isinstance(doubts, list) and all(isinstance(one, str) for one in doubts)):
-        raise DappledError(f"{path}: its attribute doubts is not a list of texts; decode the frame again")
+    try:
+        findings.from_rows(attributes.get("doubts") or [])
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
+        raise DappledError(f"{path}: its attribute doubts is not a list of findings; decode it again") from error
     shape = attributes.get("shape", [1, 1])
     if not (isinstance(shape, list) and len(shape) == 2 and all(type(side) is int and side > 0 for side in shape)):
         raise DappledError(f"{path}: its attribute shape is not rows and columns; decode the frame again")

@@ -14,10 +14,12 @@ from typing import Any
 
 import numpy as np
 
+from dappled import findings
 from dappled.bounds.parsing import parse_json
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import camera_pose
-from dappled.errors import DappledError, doubts_of
+from dappled.errors import DappledError
+from dappled.findings import Finding, first_by_name, told
 from dappled.products.maps.eye import through
 from dappled.products.maps.photographs import Photograph, Station
 
@@ -64,11 +66,12 @@ class FrameCameras:
     aperture_sigma_m: float | None = None
     aperture_from: str = ""
     focus_m: float | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
 
     def encoded(self) -> bytes:
         """The record as JSON."""
-        return (json.dumps(asdict(self), indent=1, allow_nan=False) + "\n").encode()
+        row = {**asdict(replace(self, doubts=())), "doubts": findings.to_rows(self.doubts)}
+        return (json.dumps(row, indent=1, allow_nan=False) + "\n").encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +181,7 @@ def decoded(data: bytes, where: str) -> FrameCameras:
         )
         rows, columns = row.pop("shape")
         turn, distortion = row.pop("camera_to_ned"), row.pop("distortion")
-        doubts = tuple(map(str, row.pop("doubts", ())))
+        doubts = findings.from_rows(row.pop("doubts", ()))
         made = FrameCameras(
             **row,
             camera_to_ned=tuple(map(float, turn)),
@@ -254,7 +257,7 @@ def provisos(frames: Sequence[FrameCameras]) -> list[str]:
             "the lens was taken as focused at infinity: focused at F metres, each view's principal point is off by its "
             "distance from the middle view (m) times the focal length (px) / F (give it with --focus)"
         )
-    return [*said, *doubts_of((one.name, one.doubts) for one in frames)]
+    return [*said, *(f"in doubt: {told(one)}" for one in first_by_name((one.name, one.doubts) for one in frames))]
 
 
 def world_of(frames: Sequence[FrameCameras]) -> LocalAxes:

@@ -13,7 +13,8 @@ import numpy as np
 
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.errors import DappledError, doubts_of
+from dappled.errors import DappledError
+from dappled.findings import Finding, first_by_name
 from dappled.flight import FlightFolder, Frame, Tag
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
@@ -75,9 +76,9 @@ class Survey:
     lens: FlightLens | None = None
 
     @property
-    def doubts(self) -> list[str]:
-        """What is in doubt about the photographs' light fields, a sentence each."""
-        return doubts_of((one.name, one.doubts) for one in self.photographs)
+    def doubts(self) -> list[Finding]:
+        """What is in doubt about the photographs' light fields."""
+        return first_by_name((one.name, one.doubts) for one in self.photographs)
 
     def tags(self) -> dict[str, str]:
         """The metadata of map files."""

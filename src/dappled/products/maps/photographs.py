@@ -16,6 +16,7 @@ from dappled.decode.geometry.camera_pose import CameraPose, Matrix
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
+from dappled.findings import Finding
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye, intrinsics, look, through
@@ -82,7 +83,7 @@ class Photograph:
     views: Singles | None = None
     apertures_m: NDArray[np.float64] | None = None
     aperture: ApertureWidth | None = None
-    doubts: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
     lens: Lens | None = None
 
     def layers(self, focus_m: float = math.inf) -> list[tuple[Singles, Eye]]:
