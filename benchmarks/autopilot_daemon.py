@@ -71,7 +71,7 @@ class Daemon:
         self.clock = RecordedClock(START_NS, START_NS - 10**12)
         self.telemetry = Telemetry(component_id=US[1], cam_idx=camera)
         self.shutter = Shutter(self, self.clock, next_index=0, capacity=1000, fires=not outside)
-        self.latency = BodyLatency(LATENCY_MS, LATENCY_SIGMA_MS, clocks.LATENCY_SOURCE, outside)
+        self.latency = BodyLatency(LATENCY_MS, LATENCY_SIGMA_MS, fired_outside=outside)
         self.named = 0
         self._send, self._fired, self._packets = send, fired, 0
         self._packer = mavlink.MAVLink(None, *US)

@@ -24,7 +24,7 @@ from limits import show
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Blob
-from dappled.flight import Cause, Shot, Tag, recording
+from dappled.flight import Cause, Shot, Tag, TimeSource, recording
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.masked_camera import reference_camera
 
@@ -71,7 +71,20 @@ def fly(folder: Path, count: int, file: bytes | None = None) -> Path:
             telemetry_packets=1,
         )
         begun.ledger.add_tag(
-            Tag(index, utc_ns, 10_000, "hot shoe", FOCAL_MM, F_NUMBER, 0.001, 100, CAMERA, MASK, frame.sha256, pose)
+            Tag(
+                index,
+                utc_ns,
+                10_000,
+                TimeSource.HOT_SHOE,
+                FOCAL_MM,
+                F_NUMBER,
+                0.001,
+                100,
+                CAMERA,
+                MASK,
+                frame.sha256,
+                pose,
+            )
         )
     begun.close()
     return begun.folder.path

@@ -140,7 +140,7 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
         NoPoses(),
         decoder=SlowDecoder(decode_s),
         publisher=None,
-        latency=BodyLatency(60.0, 15.0, "benchmark"),
+        latency=BodyLatency(60.0, 15.0),
         names=Names("benchmark", "mask", "geometric"),
         observer=ends,
         decode_queue=QUEUE,

@@ -30,7 +30,7 @@ from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.verdicts import Judge, PictureFacts, detail, noise_of
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, exposure
-from dappled.flight import Tag
+from dappled.flight import Tag, TimeSource
 from dappled.mocks.autopilot.autopilot import telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
@@ -112,7 +112,7 @@ def motion(frames: int, seed: int) -> Iterator[tuple[float, float]]:
         exposure_s = float(rng.uniform(0, 3)) / fast
         true = _moved(path, middle_s, exposure_s, ground_m)
         pose = telemetry.pose_at(START_NS + round((middle_s + rng.normal(0, TIME_SIGMA_S)) * 1e9), 0.0)
-        tag = Tag(index, 0, 0, "", FOCAL_MM, 8.0, exposure_s, 100.0, "", "", "0" * 64, pose)
+        tag = Tag(index, 0, 0, TimeSource.HOT_SHOE, FOCAL_MM, 8.0, exposure_s, 100.0, "", "", "0" * 64, pose)
         facts = judge.judge(tag, telemetry.rates(pose), SHARP, carriers=(24, 24), doubts=()).facts
         assert facts is not None
         assert facts.blur_view_px is not None, facts.blur_unknown
@@ -173,7 +173,9 @@ def defocus(frames: int, seed: int) -> Iterator[tuple[float, float]]:
             sigma = NOISE * float(picture.mean())
             picture += rng.normal(0, sigma, picture.shape)
             seen = replace(SHARP, detail=detail(picture), noise=noise_of(picture, sigma))
-            tag = Tag(number, 0, 0, "", None, None, None, None, "", "", "0" * 64, Telemetry().pose_at(0, 0))
+            tag = Tag(
+                number, 0, 0, TimeSource.HOT_SHOE, None, None, None, None, "", "", "0" * 64, Telemetry().pose_at(0, 0)
+            )
             facts = judge.judge(tag, None, seen, carriers=(None, 24), doubts=()).facts
             assert facts is not None
             if number >= SHARP_FIRST and given < frames:

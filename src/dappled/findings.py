@@ -10,7 +10,7 @@ import json
 import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from enum import IntEnum, StrEnum
 from importlib import resources
 from types import MappingProxyType
@@ -61,11 +61,14 @@ class Code(StrEnum):
     CARRIERS_UNOBSERVABLE = "carriers.unobservable"
     CARRIERS_UNSEARCHED = "carriers.unsearched"
     CARRIERS_UNSEEN = "carriers.unseen"
+    CLOCK_STEPPED = "clock.stepped"
+    CLOCK_UNSTEADY = "clock.unsteady"
     DISK_FEW_FILES = "disk.few_files"
     DISK_FULL = "disk.full"
     DISK_NEARLY_FULL = "disk.nearly_full"
     DISK_UNREADABLE = "disk.unreadable"
     FLIGHT_NEXT_BEGINS = "flight.next_begins"
+    FLIGHT_VEHICLE_UNDECIDED = "flight.vehicle_undecided"
     FRAME_CLIPPED = "frame.clipped"
     FRAME_CLOCK_DISAGREES = "frame.clock_disagrees"
     FRAME_DEVELOPED = "frame.developed"
@@ -136,9 +139,13 @@ class Code(StrEnum):
     PICTURE_SHADOW_UNSEEN = "picture.shadow_unseen"
     PICTURE_SOFT = "picture.soft"
     PICTURE_UNDATED = "picture.undated"
+    POSITION_IMPOSSIBLE = "position.impossible"
+    POSITION_JUMPED = "position.jumped"
     SERVICE_STOPPING = "service.stopping"
     SHOT_INTERVAL_BOUNDS = "shot.interval_bounds"
     SHOT_NOT_NOTED = "shot.not_noted"
+    TIME_MACHINE_DIFFERS = "time.machine_differs"
+    TIME_TRIGGER_UNUSABLE = "time.trigger_unusable"
     TIME_WEEK_MENDED = "time.week_mended"
     TIME_WEEK_ROLLOVER = "time.week_rollover"
     TRIGGER_JUMP = "trigger.jump"
@@ -301,6 +308,17 @@ def to_rows(found: Iterable[Finding]) -> list[dict[str, Any]]:
 def from_rows(rows: Iterable[Mapping[str, Any]]) -> tuple[Finding, ...]:
     """What `to_rows` made. Raises KeyError, TypeError or ValueError."""
     return tuple(Finding.from_json(row) for row in rows)
+
+
+def plain(value: Any) -> Any:
+    """A record's values as JSON holds them, findings among them."""
+    if isinstance(value, Finding):
+        return value.to_json()
+    if is_dataclass(value):
+        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: plain(one) for name, one in value.items()}
+    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def first_by_name(frames: Iterable[tuple[str, Iterable[Finding]]]) -> list[Finding]:

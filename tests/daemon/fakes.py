@@ -311,7 +311,7 @@ def rig(
         NoPoses(),
         decoder=decoder,
         publisher=None,
-        latency=BodyLatency(60.0, 15.0, "test"),
+        latency=BodyLatency(60.0, 15.0),
         names=Names("test", "mask", "geometric"),
         observer=CallingObserver(
             settled,

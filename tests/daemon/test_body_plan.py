@@ -12,7 +12,7 @@ from dappled.config.settings import PlannedBody
 from dappled.daemon.body_plan import BodyPlan, BodyReport, BodyTemperature
 from dappled.daemon.health import go_no_go
 from dappled.drivers.camera import CameraError, Setting, SettingName, SettingsChanged, StateChanged, check_change
-from dappled.flight import Tag
+from dappled.flight import Tag, TimeSource
 from tests.daemon.fakes import no_pose
 
 AS_PLANNED = (
@@ -73,7 +73,8 @@ class Rig:
 
 def tag(index: int, **values: float | None) -> Tag:
     given = {"focal_length_mm": 35.0, "f_number": 5.6, "exposure_s": 1 / 1000, "iso": 100.0} | values
-    return Tag(index, 0, 0, "trigger", camera="", mask="", frame_sha256="", pose=no_pose(), **given)
+    lens = given["focal_length_mm"], given["f_number"], given["exposure_s"], given["iso"]
+    return Tag(index, 0, 0, TimeSource.TRIGGER_CALL, *lens, "", "", "", no_pose())
 
 
 @pytest.mark.parametrize("word", ["Low", "25%", "0 %", " 10% ", "EMPTY", "critical"])

@@ -26,7 +26,7 @@ from tests.flight.makers import held
 
 START_NS = 1_790_000_000 * 10**9
 PATH = FlightPath(3, speed_m_s=8.0)
-LATENCY = BodyLatency(60.0, 15.0, "test")  # what `again` replays with
+LATENCY = BodyLatency(60.0, 15.0)  # what `again` replays with
 Packets = Iterator[tuple[float, MavlinkMessage]]
 LINK_S = 0.005
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.decode.geometry import Pose
-from dappled.flight import Cause, Frame, Recording, Shot, Tag
+from dappled.flight import Cause, Frame, Recording, Shot, Tag, TimeSource
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,18 @@ def pose(packets: int = 3) -> Pose:
 
 def tag(frame: Frame) -> Tag:
     return Tag(
-        frame.index, 9, 10, "latency", 146.0, 5.6, 0.0005, None, "canon-eos-450d", "mask-1", frame.sha256, pose()
+        frame.index,
+        9,
+        10,
+        TimeSource.TRIGGER_CALL,
+        146.0,
+        5.6,
+        0.0005,
+        None,
+        "canon-eos-450d",
+        "mask-1",
+        frame.sha256,
+        pose(),
     )
 
 

@@ -55,17 +55,17 @@ def test_the_report_names_frames_in_doubt_and_what_the_card_holds(
     flight: Recording, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """By what a driver's findings left in the ledger; a frame that may be another shot's makes it exit with 1."""
-    card = findings.told(finding(Code.PICTURE_ON_CARD, Subject("picture", "/DCIM/IMG_0004.CR2")))
-    doubt = findings.text(finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 0), rival=1))
+    card = finding(Code.PICTURE_ON_CARD, Subject("picture", "/DCIM/IMG_0004.CR2"))
+    doubt = findings.json_text(finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 0), rival=1))
     request(flight, 0)
     deliver(flight, 0, bytes(1000))
-    flight.ledger.add_event(Code.PICTURE_ON_CARD.value, card)
+    flight.ledger.add_event("noticed", findings.json_text(card))
     flight.ledger.add_event("doubt", doubt, 0)
     flight.close()
     assert main(["flight", "report", str(flight.folder.path)]) == 1
     said = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert f"card: {card}" in said
-    assert "in doubt: frame 0: it may be of shot 1 as well" in said
+    assert f"card: {findings.told(card)}" in said
+    assert "in doubt: frame 0: it may be of shot 1 as well: compare the picture with its neighbours" in said
 
 
 def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:

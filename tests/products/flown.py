@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose, Quaternion, camera_pose, metres_per_radian
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import Tag, recording
+from dappled.flight import Tag, TimeSource, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import landscape
@@ -88,7 +88,20 @@ def fly(
         frame = deliver(begun, index, exposure.file, f"IMG_{index:04d}.DNG")
         pose = as_recorded(told(index, truth.pose))
         begun.ledger.add_tag(
-            Tag(index, pose.utc_ns, 10_000, "hot shoe", 50.0, F_NUMBER, 0.001, 100, CAMERA, MASK, frame.sha256, pose)
+            Tag(
+                index,
+                pose.utc_ns,
+                10_000,
+                TimeSource.HOT_SHOE,
+                50.0,
+                F_NUMBER,
+                0.001,
+                100,
+                CAMERA,
+                MASK,
+                frame.sha256,
+                pose,
+            )
         )
     begun.close()
     calibration = simulation.write_calibration(camera, folder)

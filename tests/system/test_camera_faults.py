@@ -121,7 +121,7 @@ def back_in_service(daemon: Flying, body: SimulatedBody) -> None:
     eventually(lambda: daemon.camera == "ready", f"ready again: {daemon.problems}", BACK_S)
     pending = daemon.shoot()
     assert pending.problem == ""
-    assert pending.doubt == ""
+    assert pending.doubt is None
     is_frame(daemon, pending.shot.index, body.releases)
 
 

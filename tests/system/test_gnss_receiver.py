@@ -14,7 +14,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.drivers.gnss import recorded
-from dappled.flight import LedgerReader, log_reading
+from dappled.flight import LedgerReader, TimeSource, log_reading
 from dappled.mocks.simulation import Simulation, World
 from dappled.workers import Loop
 from tests.drivers.gnss.test_ubx import NEW_FALLING, UTC_BASE, VALID, mark, message
@@ -101,7 +101,7 @@ def test_marks_time_the_frames_and_the_stream_comes_out_again(
     start_utc_ns = receiver._start_utc_ns
     for index, path in list(enumerate(sorted(truth.glob("*.json"))))[1:]:
         exposed_ns = start_utc_ns + round(json.loads(path.read_text())["mid_exposure_t_s"] * 1e9)
-        assert tags[index].time_source == "hot shoe (TIM-TM2)"
+        assert tags[index].time_source == TimeSource.RECEIVER_MARK
         assert abs(tags[index].utc_ns - exposed_ns) < 4 * 10**6
         assert tags[index].utc_sigma_ns < 10**7  # without the mark it is more than the body's 15 ms
         assert abs(tags[index].utc_ns - exposed_ns) < 2 * tags[index].utc_sigma_ns

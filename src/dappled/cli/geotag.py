@@ -19,7 +19,7 @@ from dappled.daemon.replay import late_tags
 from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.decode.geometry import Vector3, camera_pose
 from dappled.errors import DappledError, counted
-from dappled.findings import told
+from dappled.findings import Code, Finding, Subject, finding, to_rows, told
 from dappled.flight import Tag, layout, seals
 from dappled.flight.layout import LockHeldError
 from dappled.flight.seal_key import SealKey
@@ -105,7 +105,7 @@ def run(arguments: argparse.Namespace) -> int:
     found = dict(tqdm(made, unit="frame", disable=None, delay=1.0, leave=False, file=sys.__stderr__))
     copied = [str(path) for path in found.values() if isinstance(path, Path)]
     without_copy = {name: reason for name, reason in found.items() if isinstance(reason, str)}
-    doubts += [f"{name}: {text}" for name, text in geotags.doubts(arguments.flight)]
+    doubts += geotags.doubts(arguments.flight)
     if arguments.json:
         print(
             json.dumps(
@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
                     "copies": copied,
                     "without_copy": without_copy,
                     "geoid": geoid.name if geoid else None,
-                    "doubts": doubts,
+                    "doubts": to_rows(doubts),
                     "marks": _marks_json(marked) if marked else None,
                 },
                 indent=2,
@@ -141,8 +141,8 @@ def run(arguments: argparse.Namespace) -> int:
     for name, reason in without_copy.items():
         if name not in (*written.without_position, *written.without_tag):
             print(f"no copy of {name}: {reason}", file=sys.stderr)
-    for text in doubts:
-        print(f"in doubt: {text}", file=sys.stderr)
+    for one in doubts:
+        print(f"in doubt: {told(one)}", file=sys.stderr)
     doubted = bool(doubts or (marked and marked.doubts))
     return 1 if doubted and not arguments.anyway else 0
 
@@ -166,14 +166,14 @@ def mark_arm(arguments: argparse.Namespace, mounting: Mounting) -> Vector3:
     return (forward - own[0], right - own[1], down - own[2])
 
 
-def _vehicle(arguments: argparse.Namespace) -> tuple[dict[int, Tag] | None, list[str]]:
+def _vehicle(arguments: argparse.Namespace) -> tuple[dict[int, Tag] | None, list[Finding]]:
     """The tags by another vehicle than the flight followed, where one is named or evidence says so, and doubts."""
     try:
         tags, found = late_tags.by_vehicle(arguments.flight, arguments.vehicle)
     except VehicleError as error:
         if arguments.vehicle is not None:
             raise
-        return None, [str(error)]
+        return None, [finding(Code.FLIGHT_VEHICLE_UNDECIDED, Subject("flight"), why=str(error))]
     for one in found:
         print(f"{one.level.word}: {told(one)}", file=sys.stderr)
     return tags, []

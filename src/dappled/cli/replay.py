@@ -27,7 +27,7 @@ from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
 from dappled.findings import Finding, Level, first_of_each, in_order, told, worst
-from dappled.flight import LIVE, layout
+from dappled.flight import LIVE, TimeSource, layout
 from dappled.flight.checks import flight_check
 
 _OF_FOLDERS = ("telemetry", "vehicle", "match", "start", "interval")
@@ -212,7 +212,7 @@ def _recording(arguments: argparse.Namespace, is_flight: bool) -> replay.Recorde
 def _as_recorded(arguments: argparse.Namespace, facts: Mapping[str, Any], recipe: Recipe | None) -> FlownWith:
     """Names, body latency and settings of the flight. The frames of a folder begin to expose at their times."""
     if not facts:
-        latency = BodyLatency(0.0, 0.0, "given by --start and --interval")
+        latency = BodyLatency(0.0, 0.0, TimeSource.GIVEN)
         return FlownWith(recipes.names(recipe), latency, configuration.Settings())
     if "settings" not in facts or "names" not in facts:
         raise ReplayError(f"{arguments.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")

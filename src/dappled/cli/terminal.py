@@ -25,6 +25,7 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.errors import counted
+from dappled.findings import plain
 from dappled.workers import Loop, Worker
 
 log = logging.getLogger("dappled.run")
@@ -252,7 +253,7 @@ def frame_json(pending: PendingShot) -> str:
         "index": pending.shot.index,
         "cause": asdict(pending.shot.cause),
         "frame": asdict(pending.frame) if pending.frame else None,
-        "tag": asdict(pending.tag) if pending.tag else None,
+        "tag": plain(pending.tag),
         "carriers_found": pending.decoded.carriers_found if pending.decoded else None,
         "carriers_predicted": pending.decoded.carriers_predicted if pending.decoded else None,
         "carriers_from": pending.decoded.carriers_from if pending.decoded else None,

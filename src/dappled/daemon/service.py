@@ -396,8 +396,8 @@ class Service:
         doubts = (
             self.component.doubt(),
             *(findings.told(one) for one in self.component.findings()),
-            navigation.utc.doubt(),
-            *navigation.telemetry.doubts(self._clock.utc_ns()),
+            None if (off := navigation.utc.doubt()) is None else findings.told(off),
+            *map(findings.told, navigation.telemetry.doubts(self._clock.utc_ns())),
             *([] if (short := self._control.shortage) is None else [findings.text(short)]),
             *map(findings.told, self.links.findings()),
             None if self._gnss is None else self._gnss.problem(),

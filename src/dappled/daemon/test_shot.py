@@ -122,7 +122,7 @@ class TestShot:
 def latency(pending: PendingShot) -> Latency:
     """The times of one shot."""
     to_exposure = to_file = None
-    if pending.fired is not None and pending.tag is not None and pending.tag.time_source.startswith("hot shoe"):
+    if pending.fired is not None and pending.tag is not None and pending.tag.time_source.contact:
         called_utc_ns = clocks.called_utc_ns(pending.shot, pending.fired.called_monotonic_ns)
         opened_utc_ns = pending.tag.utc_ns - round((pending.tag.exposure_s or 0.0) / 2 * 1e9)
         to_exposure = (opened_utc_ns - called_utc_ns) / 1e6

@@ -98,7 +98,7 @@ class Arrival:
     """A file came from the camera. `shot` is None where the driver can't say which shot made it.
 
     `name` is the camera's own name for it ("IMG_0042.CR2"). The receiver closes the blob. `facts` are the driver's
-    notes; where they include a "doubt", its sentence says why `shot` may be the wrong one.
+    notes; where they include a "doubt", the JSON of a finding, that says why `shot` may be the wrong one.
     """
 
     shot: int | None

@@ -6,10 +6,10 @@ from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import LIVE, Ledger, LedgerReader
 from dappled.flight.recording import Recorder, Recording
-from dappled.flight.records import Cause, Frame, Result, Shot, ShotRow, ShotState, Stray, Tag
+from dappled.flight.records import Cause, Frame, Result, Shot, ShotRow, ShotState, Stray, Tag, TimeSource
 
 __all__ = [
     "LIVE", "Cause", "FlightError", "FlightFolder", "FlightsLock", "Frame", "ImageIndex", "Ledger", "LedgerReader",
-    "Recorder", "Recording", "Result", "Shot", "ShotRow", "ShotState", "Stray", "Tag", "canonical", "digest",
-    "disk_error",
+    "Recorder", "Recording", "Result", "Shot", "ShotRow", "ShotState", "Stray", "Tag", "TimeSource",
+    "canonical", "digest", "disk_error",
 ]  # fmt: skip

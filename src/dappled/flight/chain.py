@@ -9,10 +9,11 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from dappled.decode.geometry import Pose
+from dappled.findings import plain
 from dappled.flight.records import Tag
 
 Column = str | int | float | bytes | None
@@ -42,7 +43,7 @@ def canonical(value: Any) -> bytes:
 
 def digest(record: Pose | Tag | Mapping[str, Any]) -> str:
     """SHA-256 (hex) of a record's canonical form."""
-    value = record if isinstance(record, Mapping) else asdict(record)
+    value = record if isinstance(record, Mapping) else plain(record)
     return hashlib.sha256(canonical(value)).hexdigest()
 
 

@@ -9,12 +9,23 @@ from pathlib import Path
 from typing import Any
 
 from dappled import findings
+from dappled.findings import Finding
 from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.records import DOUBT, LATER_DOUBT, LOST, REFUSED, Frame, LedgerEvent, Result, ShotRow, Stray, Tag
-
-_CARD = ("card.", "picture.")  # what a driver said of the camera's card: codes of `findings`
+from dappled.flight.records import (
+    DOUBT,
+    LATER_DOUBT,
+    LOST,
+    NOTICED,
+    REFUSED,
+    Frame,
+    LedgerEvent,
+    Result,
+    ShotRow,
+    Stray,
+    Tag,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,8 +61,8 @@ class Balance:
     judged: Mapping[str, int] = field(default_factory=dict)
     bad: tuple[str, ...] = ()
     unknown: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
-    card: tuple[str, ...] = ()
+    doubts: tuple[Finding, ...] = ()
+    card: tuple[Finding, ...] = ()
 
     @property
     def balanced(self) -> bool:
@@ -131,11 +142,14 @@ def balance(path: Path) -> Balance:
             judged=_by_verdict(judged, len(frames)),
             bad=_reasons("bad", judged, frames),
             unknown=_reasons("unknown", judged, frames),
-            doubts=tuple(
-                f"frame {event.index}: {event.text}" for event in events if event.kind in (DOUBT, LATER_DOUBT)
-            ),
-            card=tuple(event.text for event in events if event.kind.startswith(_CARD)),
+            doubts=_found(events, DOUBT, LATER_DOUBT),
+            card=_found(events, NOTICED),
         )
+
+
+def _found(events: Iterable[LedgerEvent], *kinds: str) -> tuple[Finding, ...]:
+    """What events of these kinds hold."""
+    return tuple(found for event in events if event.kind in kinds and (found := event.finding) is not None)
 
 
 def _reasons(wanted: str, judged: Mapping[int, tuple[str, list[str]]], frames: Sequence[Frame]) -> tuple[str, ...]:

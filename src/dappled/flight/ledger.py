@@ -12,17 +12,18 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
+from dappled import findings
 from dappled.clock import Clock
 from dappled.decode.geometry import Gnss, GroundHeight, Pose
+from dappled.findings import plain
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column, canonical, digest
 from dappled.flight.errors import FlightError, ledger_error
 from dappled.flight.logs import TelemetryLog
-from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag
+from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag, TimeSource
 from dappled.flight.tables import (
     APPLICATION_ID,
     CHAIN,
@@ -347,12 +348,12 @@ class Ledger(LedgerReader):
         """Add a frame's tag and, with a digest of its own, the pose in it."""
         with self._transaction():
             for table, record in (("poses", tag.pose), ("tags", tag)):
-                self._insert(table, (tag.index,), tag.index, digest(record), canonical(asdict(record)).decode())
+                self._insert(table, (tag.index,), tag.index, digest(record), canonical(plain(record)).decode())
 
     def add_result(self, result: Result) -> None:
         """Add the result of decoding a frame; once for each run."""
         with self._transaction():
-            values = (result.index, result.run, result.slices_sha256, canonical(asdict(result)).decode())
+            values = (result.index, result.run, result.slices_sha256, canonical(plain(result)).decode())
             self._insert("results", (result.index, result.run), *values)
 
     def add_event(self, kind: str, text: str, index: int | None = None) -> None:
@@ -487,8 +488,9 @@ def _pose(value: dict[str, Any]) -> Pose:
 
 
 def _tag(value: dict[str, Any]) -> Tag:
-    """A record of `tags`. Raises TypeError or KeyError for anything else."""
-    return Tag(**{**value, "pose": _pose(value["pose"])})
+    """A record of `tags`. Raises TypeError, ValueError or KeyError for anything else."""
+    made = {"pose": _pose(value["pose"]), "time_source": TimeSource(value["time_source"])}
+    return Tag(**{**value, **made, "doubts": findings.from_rows(value["doubts"])})
 
 
 def _result(value: dict[str, Any]) -> Result:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any, Literal
 
 from dappled import findings
@@ -16,11 +17,39 @@ from dappled.findings import Finding
 
 ShotState = Literal["wished", "fired", "safe", "failed"]
 DOUBT, LATER_DOUBT = "doubt", "later doubt"
-"""Kinds of events: a frame may be another shot's. The first kind came with its file and is in its tag; the second was
-found after that."""
+"""Kinds of events that hold a finding: a frame may be another shot's. The first kind came with its file and is in its
+tag; the second was found after that."""
+NOTICED = "noticed"
+"""A kind of events that hold a finding: what a driver said of the camera's card."""
 REFUSED, LOST = "refused", "lost trigger"
 """Kinds of events that hold a finding: requests that became no shot, with their number `times` and their source as
 subject; triggers of the autopilot that became no request."""
+
+
+class TimeSource(StrEnum):
+    """What a frame's time was taken from."""
+
+    HOT_SHOE = "hot shoe"
+    """A contact, by the autopilot's clock."""
+    RECEIVER_MARK = "receiver mark"
+    """A contact, by the clock of a GNSS receiver on this machine."""
+    LOGGED_MARK = "logged mark"
+    """A contact, by a receiver's own log, computed after the flight."""
+    AUTOPILOT_TRIGGER = "autopilot trigger"
+    """The autopilot's command to fire, and the body's latency."""
+    TRIGGER_CALL = "trigger call"
+    """Our own command to fire, and the body's latency."""
+    REQUEST = "request"
+    """The capture request, and the body's latency."""
+    CAMERA_CLOCK = "camera clock"
+    """EXIF, by the offset that other shots showed."""
+    GIVEN = "given"
+    """What a person said."""
+
+    @property
+    def contact(self) -> bool:
+        """Whether a contact in the hot shoe was timed in flight."""
+        return self in (TimeSource.HOT_SHOE, TimeSource.RECEIVER_MARK)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +85,13 @@ class Frame:
 
 @dataclass(frozen=True, slots=True)
 class Tag:
-    """What is known of a frame apart from its pixels. `utc_ns` is mid-exposure; sigmas are one standard deviation."""
+    """What is known of a frame apart from its pixels. `utc_ns` is mid-exposure; sigmas are one standard deviation.
+    `doubts` are those about its time, and whose picture it is."""
 
     index: int
     utc_ns: int
     utc_sigma_ns: int
-    time_source: str
+    time_source: TimeSource
     focal_length_mm: float | None
     f_number: float | None
     exposure_s: float | None
@@ -70,6 +100,7 @@ class Tag:
     mask: str
     frame_sha256: str
     pose: Pose
+    doubts: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

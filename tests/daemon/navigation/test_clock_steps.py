@@ -12,13 +12,15 @@ from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.navigation.clocks import from_arrivals
 from dappled.decode.geometry import Pose, metres_per_radian
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.findings import Code, Finding
+from dappled.flight import TimeSource
 from dappled.mocks.autopilot.autopilot import BootTime
 
 START_NS = 1_790_000_000 * 10**9
 SPEED_M_S, LATITUDE_DEG = 10.0, 41.0
 MS = 10**6
 NORTH_M, _ = metres_per_radian(math.radians(LATITUDE_DEG), 200.0)
-LATENCY = BodyLatency(0.0, 1.0, "latency")
+LATENCY = BodyLatency(0.0, 1.0)
 
 
 class Vehicle:
@@ -49,14 +51,14 @@ class Vehicle:
                 answer = mavlink.MAVLink_timesync_message(boot.ns(t_s + 0.022), sent_ns)
                 self.feed(sent_ns + 4 * MS, answer)
 
-    def locate(self, t_s: float) -> tuple[str, Pose, float]:
-        """(the time's source, the pose, the position's error in σ) of an exposure."""
+    def locate(self, t_s: float) -> tuple[list[Finding], Pose, float]:
+        """(doubts of the time, the pose, the position's error in σ) of an exposure."""
         exposure = clocks.mid_exposure(START_NS + round(t_s * 1e9), LATENCY, None)
         better, pose = self.telemetry.locate(exposure)
         assert pose.latitude_rad is not None
         assert pose.position_sigma_m is not None
         truth_rad = math.radians(LATITUDE_DEG) + SPEED_M_S * t_s / NORTH_M
-        return better.source, pose, abs(pose.latitude_rad - truth_rad) * NORTH_M / pose.position_sigma_m
+        return list(better.doubts), pose, abs(pose.latitude_rad - truth_rad) * NORTH_M / pose.position_sigma_m
 
 
 @pytest.mark.parametrize("by_s", [0.12, 0.4, 1.5])
@@ -65,11 +67,13 @@ def test_a_step_ahead_without_answers_to_timesync_is_seen_as_well(by_s: float) -
     vehicle = Vehicle(answers=False)
     vehicle.fly(BootTime(drift=20e-6, jumps=((20.05, by_s),)), 0, 30)
     for t_s in (10.0, 15.37, 19.0, 19.85, 21.0, 22.5, 29.3):
-        source, pose, sigmas = vehicle.locate(t_s)
-        assert (pose.source, "in doubt" in source, sigmas < 1.2) == ("interpolated", False, True), t_s
-    source, pose, sigmas = vehicle.locate(20.07)
-    assert (pose.source, "in doubt" in source, sigmas < 1.2) == ("nearest", True, True)
-    assert "stepped by -" in vehicle.telemetry.doubts(START_NS + 30 * 10**9)[0]
+        doubts, pose, sigmas = vehicle.locate(t_s)
+        assert (pose.source, bool(doubts), sigmas < 1.2) == ("interpolated", False, True), t_s
+    doubts, pose, sigmas = vehicle.locate(20.07)
+    assert (pose.source, bool(doubts), sigmas < 1.2) == ("nearest", True, True)
+    told = vehicle.telemetry.doubts(START_NS + 30 * 10**9)[0]
+    assert told.code is Code.CLOCK_STEPPED
+    assert float(str(told.facts["by_s"])) < 0
 
 
 @pytest.mark.parametrize("late_s", [0.05, 0.3, 2.0])
@@ -98,19 +102,20 @@ def test_a_pose_next_to_a_step_is_in_doubt_and_those_around_it_are_right(by_s: f
     vehicle = Vehicle()
     vehicle.fly(boot, 0, 30)
     for t_s in (10.0, 15.37, 19.0, 19.95, 21.0 + max(0, -by_s), 22.5, 29.3):
-        source, pose, sigmas = vehicle.locate(t_s)
-        assert (pose.source, "in doubt" in source) == ("interpolated", False), t_s
+        doubts, pose, sigmas = vehicle.locate(t_s)
+        assert (pose.source, bool(doubts)) == ("interpolated", False), t_s
         assert sigmas < 1
         assert pose.position_sigma_m is not None
         assert pose.position_sigma_m < 0.3
     for t_s in (20.04, 20.08, 20.15, 20.21):
-        source, pose, sigmas = vehicle.locate(t_s)
+        doubts, pose, sigmas = vehicle.locate(t_s)
         assert pose.source == "nearest", t_s
-        assert f"in doubt: the autopilot's clock stepped by {abs(by_s):.3f} s" in source
+        assert [(one.code, one.facts["steps"]) for one in doubts] == [(Code.CLOCK_STEPPED, 1)]
+        assert doubts[0].facts["by_s"] == pytest.approx(abs(by_s), abs=0.001)
         assert sigmas <= 1.2, t_s
-    assert vehicle.telemetry.doubts(START_NS + 30 * 10**9) == (
-        f"the autopilot's clock stepped by {-by_s:+.3f} s: poses next to that are in doubt",
-    )
+    (told,) = vehicle.telemetry.doubts(START_NS + 30 * 10**9)
+    assert told.code is Code.CLOCK_STEPPED
+    assert told.facts["by_s"] == pytest.approx(-by_s, abs=0.001)
     assert vehicle.telemetry.doubts(START_NS + 90 * 10**9) == ()
 
 
@@ -122,7 +127,7 @@ def test_a_pose_waits_for_the_answer_that_may_show_a_step_before_it() -> None:
     assert not vehicle.telemetry.settled(exposure)
     vehicle.fly(boot, 20.2, 20.5)
     assert vehicle.telemetry.settled(exposure)
-    assert "in doubt" in vehicle.telemetry.locate(exposure)[0].source
+    assert vehicle.telemetry.locate(exposure)[0].doubts
 
 
 @pytest.mark.parametrize("drift", [0.02, 1.0, 4.0])
@@ -132,14 +137,12 @@ def test_a_clock_that_runs_fast_gives_no_confident_pose(drift: float) -> None:
     vehicle.fly(BootTime(drift=drift), 0, 30)
     worst = 0.0
     for number in range(60):
-        source, pose, sigmas = vehicle.locate(15 + number * 0.2317)
+        doubts, pose, sigmas = vehicle.locate(15 + number * 0.2317)
         assert pose.source == "nearest"
-        assert "in doubt: the autopilot's clock stepped" in source
+        assert [one.code for one in doubts] == [Code.CLOCK_STEPPED]
         worst = max(worst, sigmas)
     assert worst < 3
-    assert vehicle.telemetry.doubts(START_NS + 30 * 10**9) == (
-        "the autopilot's clock does not run steadily: poses are in doubt",
-    )
+    assert [one.code for one in vehicle.telemetry.doubts(START_NS + 30 * 10**9)] == [Code.CLOCK_UNSTEADY]
 
 
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -400e-6])
@@ -157,10 +160,10 @@ def test_an_exposure_before_a_reboot_is_posed_by_the_boot_before(answers: bool) 
     vehicle.fly(BootTime(drift=0.0), 0, 20)
     vehicle.fly(BootTime(-22.0, drift=0.0), 23, 30)
     for t_s in (10.02, 19.83):
-        source, pose, sigmas = vehicle.locate(t_s)
+        doubts, pose, sigmas = vehicle.locate(t_s)
         assert pose.source == "interpolated"
         assert sigmas < 1
-        assert "in doubt" not in source
+        assert not doubts
     late = vehicle.locate(21.0)[1]
     assert late.source == "nearest"
     assert late.age_ms == pytest.approx(1100, abs=20)
@@ -191,7 +194,8 @@ def test_a_hot_shoe_beside_steps_has_a_pose_as_wide_as_the_largest() -> None:
     trigger = clocks.TriggerMessage("CAMERA_FEEDBACK", 1, START_NS + 20_012 * MS, LATENCY)
     exposure = replace(clocks.mid_exposure(START_NS + 20_012 * MS, LATENCY, None), trigger=trigger)
     better, pose = vehicle.telemetry.locate(exposure)
-    assert better.source.startswith("hot shoe (CAMERA_FEEDBACK); in doubt: the autopilot's clock stepped 2 times")
+    assert better.source == TimeSource.HOT_SHOE
+    assert [(one.code, one.facts["steps"]) for one in better.doubts] == [(Code.CLOCK_STEPPED, 2)]
     assert pose.position_sigma_m is not None
     assert pose.position_sigma_m >= 0.4 * SPEED_M_S
 
@@ -204,13 +208,14 @@ def test_a_step_in_a_silence_of_timesync_is_seen(gap_s: float, by_s: float) -> N
     vehicle.fly(boot, 0, 20)
     vehicle.fly(boot, 20 + gap_s, 30 + gap_s)
     for t_s in (15.0, 22.0 + gap_s + max(0.0, -by_s), 29.0 + gap_s):
-        source, pose, sigmas = vehicle.locate(t_s)
-        assert (pose.source, "in doubt" in source) == ("interpolated", False), t_s
+        doubts, pose, sigmas = vehicle.locate(t_s)
+        assert (pose.source, bool(doubts)) == ("interpolated", False), t_s
         assert sigmas < 1, t_s
     for t_s in (20.5, 25.0, 19.5 + gap_s):  # also more than ten seconds from the first answer after the step
         better, pose = vehicle.telemetry.locate(clocks.mid_exposure(START_NS + round(t_s * 1e9), LATENCY, None))
         assert pose.source != "interpolated", t_s
-        assert f"in doubt: the autopilot's clock stepped by {abs(by_s):.3f} s" in better.source, t_s
+        (told,) = better.doubts
+        assert told.facts["by_s"] == pytest.approx(abs(by_s), abs=0.001), t_s
 
 
 def test_beside_steps_no_shot_gets_the_next_ones_contact() -> None:
@@ -226,7 +231,7 @@ def test_beside_steps_no_shot_gets_the_next_ones_contact() -> None:
         vehicle.fly(boot, at + 0.4, at + 1)
     for at in range(20, 46):
         called_ns, truth_ns = START_NS + at * 10**9 + 300 * MS, START_NS + at * 10**9 + 360 * MS
-        better, pose = vehicle.telemetry.locate(clocks.mid_exposure(called_ns, BodyLatency(60.0, 15.0, "body"), None))
+        better, pose = vehicle.telemetry.locate(clocks.mid_exposure(called_ns, BodyLatency(60.0, 15.0), None))
         assert abs(better.utc_ns - truth_ns) < 100 * MS, at
         assert pose.boot_us is not None
         assert pose.source != "interpolated" or abs(pose.boot_us * 1000 - boot.ns(at + 0.36)) < 5 * MS, at

@@ -18,6 +18,8 @@ from dappled.daemon.navigation.clocks import (
 )
 from dappled.daemon.navigation.samples import Feedback
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.findings import FRAME, Code, finding
+from dappled.flight import TimeSource
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 from tests.benchmarks import program
@@ -25,7 +27,7 @@ from tests.benchmarks import program
 MS = 10**6
 START_NS = 1_790_000_000 * 10**9
 CLOCK = BootClock("timesync", 0, START_NS, 0.0, 0.3 * MS)
-EXPECTED = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 10.0, "latency"), 0.002)
+EXPECTED = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 10.0), 0.002)
 
 
 def event(after_call_ms: float, number: int = 0, image: int = 0) -> Feedback:
@@ -57,7 +59,7 @@ def test_the_contact_is_taken_and_half_the_exposure_added() -> None:
     better, boot_ns = clocks.refine(EXPECTED, event(55), CLOCK)
     assert boot_ns == 10**9 + 56 * MS
     assert better.utc_ns == START_NS + boot_ns
-    assert better.source == "hot shoe (CAMERA_FEEDBACK)"
+    assert better.source == TimeSource.HOT_SHOE
     assert MS <= better.sigma_ns < 1.1 * MS
 
 
@@ -71,7 +73,7 @@ def test_what_is_far_off_or_of_two_minds_is_not_taken() -> None:
     assert clocks.choose_feedback([event(152)], EXPECTED, CLOCK) is None
     assert clocks.choose_feedback([event(50), event(71, 1, image=1)], EXPECTED, CLOCK) is None
     assert clocks.choose_feedback([event(55), event(55, 1)], EXPECTED, CLOCK) == event(55)  # the same, on a second link
-    assert clocks.choose_feedback([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, "given"), CLOCK) is None
+    assert clocks.choose_feedback([event(55)], ExposureTime(EXPECTED.utc_ns, 10 * MS, TimeSource.GIVEN), CLOCK) is None
 
 
 @pytest.mark.parametrize("contact_ms", [45, 58, 75])
@@ -79,7 +81,7 @@ def test_a_contact_that_bounces_is_its_first_one(contact_ms: int) -> None:
     """The second one was taken where it was nearer to the expected time: 15 ms wrong with a sigma of 1 ms."""
     bounced = [event(contact_ms + 15, 0, 7), event(contact_ms, 1, 7), event(contact_ms + 31, 2, 7)]
     assert clocks.choose_feedback(bounced, EXPECTED, CLOCK) == bounced[1]
-    trigger = TriggerMessage("CAMERA_FEEDBACK", 7, START_NS + 10**9 + 60 * MS, BodyLatency(60.0, 10.0, "latency"))
+    trigger = TriggerMessage("CAMERA_FEEDBACK", 7, START_NS + 10**9 + 60 * MS, BodyLatency(60.0, 10.0))
     repeated = event(contact_ms - 500, 3, 7)  # another camera's report repeated the contact before, with this number
     assert clocks.own_feedback([*bounced, repeated], trigger) == bounced[1]
 
@@ -87,7 +89,7 @@ def test_a_contact_that_bounces_is_its_first_one(contact_ms: int) -> None:
 @pytest.mark.parametrize("latency_ms", [-25, 0, 25])
 def test_at_five_a_second_a_lost_contact_is_not_replaced_by_the_next_shots(latency_ms: int) -> None:
     """The default latency, 60 ± 30 ms: the next shot's contact is 200 ms after the one that was lost."""
-    expected = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 30.0, "latency"), 0.002)
+    expected = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 30.0), 0.002)
     before, after = event(60 - 200), event(260 + latency_ms, 1)
     assert clocks.choose_feedback([before, after], expected, CLOCK) is None
     own = event(60 + latency_ms, 2)
@@ -100,14 +102,14 @@ def test_at_five_a_second_a_lost_contact_is_not_replaced_by_the_next_shots(laten
 @pytest.mark.parametrize("spacing_ms", [200, 250])
 def test_a_wide_clock_takes_no_other_shots_contact(sigma_ms: int, spacing_ms: int) -> None:
     """The own contact could not be told from the call, and was left out: the next shot's was then the nearest."""
-    expected = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 30.0, "latency"), 0.002)
+    expected = mid_exposure(START_NS + 10**9, BodyLatency(60.0, 30.0), 0.002)
     wide = BootClock("arrival", 0, START_NS, 0.0, sigma_ms * MS)
     contacts = [event(60 + spacing_ms * number, number, number) for number in range(5)]
     assert clocks.choose_feedback(contacts, expected, wide) is None
 
 
 def test_by_a_clock_in_doubt_no_contact_is_chosen() -> None:
-    stepped = BootClock("timesync", 0, START_NS, 0.0, 0.3 * MS, "the autopilot's clock stepped by 0.300 s")
+    stepped = BootClock("timesync", 0, START_NS, 0.0, 0.3 * MS, finding(Code.CLOCK_STEPPED, FRAME, steps=1, by_s=0.3))
     assert clocks.choose_feedback([event(55)], EXPECTED, stepped) is None
 
 
@@ -143,13 +145,13 @@ def test_a_contact_places_the_frame_and_the_time_of_a_command_does_not(kind: str
         if message.get_type() == "SYSTEM_TIME":
             message.time_unix_usec = START_NS // 1000 + round(t_s * 1e6)
         feed(t_s, message)
-    expected = mid_exposure(START_NS + 8 * 10**9, BodyLatency(60.0, 10.0, "latency"), None)
+    expected = mid_exposure(START_NS + 8 * 10**9, BodyLatency(60.0, 10.0), None)
     exposure, pose = telemetry.locate(expected)
     assert telemetry.statistics().feedbacks == 1
     if (kind, epoch) != ("CAMERA_FEEDBACK", "boot"):
         assert exposure == expected
         return
-    assert exposure.source == f"hot shoe ({kind})"
+    assert exposure.source == TimeSource.HOT_SHOE
     assert exposure.utc_ns == pytest.approx(START_NS + contact_s * 1e9, abs=2 * MS)
     assert pose.boot_us is not None
     assert pose.boot_us == pytest.approx(boot.ns(contact_s) / 1e3, abs=1500)
@@ -161,7 +163,7 @@ def test_the_cameras_clock_is_learnt_from_shots() -> None:
     clock, offset_ns = CameraClock(), -3_600_370 * MS
     for number in range(100):
         begin_ns = START_NS + number * 1_370 * MS
-        known = ExposureTime(begin_ns + MS, 10 * MS, "latency", MS)
+        known = ExposureTime(begin_ns + MS, 10 * MS, TimeSource.TRIGGER_CALL, MS)
         assert (exposure_from_camera(clock, 0, 10**9, None) is None) == (number < 3)
         clock = clock.learnt((begin_ns + offset_ns) // 10**9 * 10**9, 10**9, known)
     found = clock.offset_ns()
@@ -178,7 +180,7 @@ def test_a_camera_clock_that_was_set_is_learnt_anew() -> None:
     for number in range(8):
         begin_ns = START_NS + number * 10**9
         offset_ns = 0 if number < 5 else 3_600 * 10**9
-        clock = clock.learnt(begin_ns + offset_ns, 10**9, ExposureTime(begin_ns, MS, "latency"))
+        clock = clock.learnt(begin_ns + offset_ns, 10**9, ExposureTime(begin_ns, MS, TimeSource.TRIGGER_CALL))
         assert (clock.offset_ns() is None) == (number in (0, 1, 5, 6))
     found = clock.offset_ns()
     assert found is not None
@@ -223,12 +225,12 @@ def test_each_sample_of_a_real_flight_is_predicted_by_its_neighbours(shared_data
         assert row["refused"] < 20
 
 
-BODY = BodyLatency(60.0, 15.0, "measured")
+BODY = BodyLatency(60.0, 15.0)
 
 
 def test_mid_exposure_is_latency_and_half_the_exposure_after_the_call() -> None:
     found = clocks.mid_exposure(1_000, BODY, 0.02)
-    assert (found.utc_ns, found.sigma_ns, found.source) == (70_001_000, 15_000_000, "measured")
+    assert (found.utc_ns, found.sigma_ns, found.source) == (70_001_000, 15_000_000, TimeSource.TRIGGER_CALL)
     assert clocks.mid_exposure(0, BODY, None).utc_ns == 60_000_000
 
 
@@ -236,7 +238,7 @@ def test_without_a_trigger_call_the_request_and_the_file_bound_the_exposure() ->
     """The time of the trigger call is unknown: it was made between the request and the file."""
     found = clocks.mid_exposure_by_request(0, 3_070_000_000, BODY, 0.02)
     assert found.utc_ns == 70_000_000
-    assert found.source == "wish + body latency"
+    assert found.source == TimeSource.REQUEST
     assert found.sigma_ns == pytest.approx(2.99e9 / 3**0.5, rel=1e-3)
     assert found.called_utc_ns == 0
     early = clocks.mid_exposure_by_request(0, 10_000_000, BODY, None)

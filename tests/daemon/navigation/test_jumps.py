@@ -12,10 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dappled import findings
 from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.navigation import Telemetry
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
+from dappled.findings import Code, Finding
 from dappled.flight import digest, log_reading
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
@@ -215,11 +217,11 @@ def test_a_jump_is_told_for_a_minute_and_once() -> None:
     telemetry = telemetry_of(changed=stepped(30.0, up_m=-40.0, until_s=AT_S + 5))
     after_ns = START_NS + round(AT_S * 1e9) + 6 * 10**9
     (told,) = telemetry.doubts(after_ns)
-    assert told == "the autopilot's position jumped by 50.0 m against its velocity: poses next to that are in doubt"
+    assert (told.code, round(float(str(told.facts["by_m"])), 1)) == (Code.POSITION_JUMPED, 50.0)
     assert telemetry.doubts(after_ns + 61 * 10**9) == ()
     (other,) = telemetry_of(changed=stepped(7.0)).doubts(after_ns)
     problems = NewProblems()
-    assert [problems.among([text]) for text in (told, other)] == [[told], []]
+    assert [bool(problems.among([findings.told(one)])) for one in (told, other)] == [True, False]
     good = telemetry_of()
     assert (good.doubts(after_ns), good.statistics().jumps) == ((), 0)
 
@@ -309,11 +311,11 @@ def test_a_clock_that_steps_is_no_jump(by_s: float) -> None:
 def test_a_real_flight_has_jumps_only_where_its_home_is_set(shared_data: File) -> None:
     """On the ground: with the first fix, and by the whole height when home was set, in each of its two boots."""
     telemetry, parse = Telemetry(), PacketParser()
-    jumps: list[str] = []
+    jumps: list[Finding] = []
     for number, stamp_us, raw in log_reading.read_telemetry(shared_data / "telemetry" / "dronekit-flight.tlog"):
         message = parse(raw)
         if message is not None:
             telemetry.feed(number, stamp_us, message)
         if len(jumps) < telemetry.statistics().jumps:
-            jumps += [text for text in telemetry.doubts(stamp_us * 1000) if "jumped" in text]
-    assert [text.split()[5] for text in jumps] == ["3.3", "588.0", "590.0"]
+            jumps += [one for one in telemetry.doubts(stamp_us * 1000) if one.code is Code.POSITION_JUMPED]
+    assert [one.facts["by_m"] for one in jumps] == pytest.approx([3.3, 588.0, 590.0], abs=0.05)

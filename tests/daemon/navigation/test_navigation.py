@@ -12,7 +12,7 @@ from dappled.config.settings import PoseSettings, Settings
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import ExposureTime, Navigation
 from dappled.daemon.navigation.navigation import AHEAD_NS
-from dappled.flight import recording
+from dappled.flight import TimeSource, recording
 
 NOW_NS = 1_790_000_000 * 10**9
 
@@ -43,7 +43,7 @@ def test_without_telemetry_the_wait_is_bounded(tmp_path: Path, ahead_ns: int, wa
     flight = recording.begin(tmp_path, clock, {})
     try:
         navigation = Navigation(LiveSettings(settings), clock, flight, utc_known=True)
-        exposure = ExposureTime(NOW_NS + ahead_ns, 10**6, "test")
+        exposure = ExposureTime(NOW_NS + ahead_ns, 10**6, TimeSource.REQUEST)
         found, pose = navigation.pose(0, exposure)
         assert (found, pose.source) == (exposure, "none")
         assert waited_ns <= clock.now_ns - NOW_NS <= waited_ns + 10**7

@@ -7,14 +7,15 @@ import pytest
 from dappled.config.settings import CameraSettings, MavlinkSettings
 from dappled.daemon.navigation import BodyLatency, ExposureTime, Telemetry, clocks
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.flight import Cause, Shot
+from dappled.findings import Code
+from dappled.flight import Cause, Shot, TimeSource
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 
 START_NS = 1_790_000_000 * 10**9
 MS = 10**6
-LATENCY = BodyLatency(60.0, 10.0, "latency", fired_outside=True)
+LATENCY = BodyLatency(60.0, 10.0, fired_outside=True)
 WIRED = CameraPort("wire", pin=True)
 
 
@@ -87,7 +88,7 @@ def test_each_shot_has_its_own_time(personality: str, port: CameraPort, hz: floa
         exposure, pose = vehicle.telemetry.locate(expected)
         truth_ns = START_NS + round((8 + number / hz + 0.061) * 1e9)
         assert abs(exposure.utc_ns - truth_ns) < 3 * MS
-        assert exposure.source.startswith("hot shoe" if port.pin else "autopilot's trigger")
+        assert exposure.source == (TimeSource.HOT_SHOE if port.pin else TimeSource.AUTOPILOT_TRIGGER)
         assert pose.boot_us is not None
         assert pose.boot_us == pytest.approx(vehicle.boot.ns(8 + number / hz + 0.061) / 1e3, abs=1000)
         assert exposure.sigma_ns < (6 if port.pin else 12) * MS
@@ -140,7 +141,7 @@ def test_a_shot_without_a_contact_has_no_other_shots_time() -> None:
     exposure, _ = vehicle.telemetry.locate(expected)
     assert exposure.utc_ns == expected.utc_ns
     assert exposure.sigma_ns >= 300 * MS
-    assert "in doubt: the autopilot's message had no time" in exposure.source
+    assert [one.code for one in exposure.doubts] == [Code.TIME_TRIGGER_UNUSABLE]
 
 
 def test_what_a_trigger_creates_and_the_settings_that_say_so() -> None:

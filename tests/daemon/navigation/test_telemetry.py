@@ -20,6 +20,7 @@ from dappled.daemon.navigation.navigation import HISTORY_NS
 from dappled.daemon.navigation.samples import MOST_SAMPLES
 from dappled.decode.geometry import Pose, from_euler, hermite, metres_per_radian, normalised, slerp, turn_rad
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
+from dappled.findings import Code
 from dappled.flight import digest
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath, TruePose
@@ -361,9 +362,7 @@ def test_an_impossible_message_is_no_pose_and_is_counted(message: MavlinkMessage
         expected.attitude,
     )
     assert (telemetry.statistics().impossible, good.statistics().impossible) == (1, 0)
-    assert telemetry.doubts(at_ns) == (
-        "the autopilot sends impossible positions, attitudes or times: they are not used",
-    )
+    assert [one.code for one in telemetry.doubts(at_ns)] == [Code.POSITION_IMPOSSIBLE]
     assert telemetry.doubts(at_ns + 70 * 10**9) == ()
 
 

@@ -7,11 +7,13 @@ from pathlib import Path
 
 import pytest
 
+from dappled import findings
 from dappled.daemon.navigation import Telemetry, UtcCorrection, machine_clock
 from dappled.daemon.navigation.clocks import UtcLearner
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.utc_choice import RELEASED_NS, ROLLOVER_NS
 from dappled.errors import DappledError
+from dappled.findings import Code
 from dappled.mocks.autopilot.autopilot import BootTime, flight
 from dappled.mocks.autopilot.path import FlightPath
 
@@ -113,9 +115,9 @@ S = 10**9
 @pytest.mark.parametrize(
     ("correction_ns", "sigma_ns", "said"),
     [
-        (3600 * S, S // 100, "3600 s slow"),
-        (-3600 * S, S // 100, "3600 s fast"),
-        (2 * S, S // 100, "2 s slow"),
+        (3600 * S, S // 100, "-3600 s"),
+        (-3600 * S, S // 100, "+3600 s"),
+        (2 * S, S // 100, "-2 s"),
         (S // 2, 0, None),
         (3 * S, S, None),  # nobody knows it that well
     ],
@@ -127,7 +129,7 @@ def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns
     learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     learner.look(None)  # the autopilot was silent for a moment
     told = learner.doubt()
-    assert (told is None) if said is None else (told is not None and said in told)
+    assert (told is None) if said is None else (told is not None and said in findings.told(told))
     assert learner.utc_ns(5) == 5
     assert notes.noted == []
     unsure = UtcLearner(notes, known=False)
@@ -210,4 +212,5 @@ def test_a_gps_week_that_rolled_over_is_mended_where_the_machine_agrees() -> Non
     alone = heard(lambda _: off_s, upto_s=4.0)
     assert alone.utc_correction() is None
     (doubt,) = alone.doubts(104 * S)
-    assert "1024 weeks later would be 2026-09-21" in doubt
+    assert doubt.code is Code.TIME_WEEK_ROLLOVER
+    assert "2026-09-21" in str(doubt.facts["later"])

@@ -11,7 +11,7 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import DECISION, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
-from dappled.flight import Cause, FlightError, Frame, Shot, Tag, layout, recording
+from dappled.flight import Cause, FlightError, Frame, Shot, Tag, TimeSource, layout, recording
 from tests.daemon.fakes import no_pose
 
 SHOT = Shot(0, Cause("test", "console", 1), 10, 20)
@@ -19,7 +19,9 @@ DATA = b"raw bytes"
 
 
 def tag(frame: Frame) -> Tag:
-    return Tag(frame.index, 1, 2, "test", 50.0, 8.0, 0.001, 100.0, "camera", "mask", frame.sha256, no_pose())
+    return Tag(
+        frame.index, 1, 2, TimeSource.HOT_SHOE, 50.0, 8.0, 0.001, 100.0, "camera", "mask", frame.sha256, no_pose()
+    )
 
 
 def recorded(writer: LedgerWriter, index: int | None, data: bytes = DATA) -> Frame:

@@ -21,7 +21,7 @@ from dappled.daemon.pipeline.tagging import tag
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
 from dappled.findings import FRAME, Code, finding
-from dappled.flight import Cause, Frame, Shot
+from dappled.flight import Cause, Frame, Shot, TimeSource
 from tests.daemon.fakes import FakeCamera, eventually, no_pose
 from tests.schemas import schema
 
@@ -57,7 +57,7 @@ class FakeMaker:
 
 def shot(index: int, *, decoded: bool = True) -> PendingShot:
     frame = Frame(index, f"frames/{index}.dng", "IMG.DNG", 10, "0" * 64, 0)
-    exposure = ExposureTime(0, 1, "test")
+    exposure = ExposureTime(0, 1, TimeSource.REQUEST)
     made = tag(frame, exposure, Shown(50.0, 8.0, 0.01, 100.0), camera="c", mask="m", pose=no_pose())
     result = None
     if decoded:

@@ -22,7 +22,7 @@ from dappled.daemon.health import go_no_go
 from dappled.daemon.health import record as health
 from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.health.record import DecodingState
-from dappled.daemon.navigation import Telemetry, clocks
+from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline import capture
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.verdicts import PictureFacts
@@ -30,8 +30,8 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred, Noticed
 from dappled.drivers.raw.recipe import LawDecision, of_flight
-from dappled.findings import FRAME, Code, Subject, finding, text
-from dappled.flight import FlightError, Recording, ShotState, flight_report, layout
+from dappled.findings import FRAME, Code, Finding, Subject, finding, text
+from dappled.flight import FlightError, Recording, ShotState, TimeSource, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import FakeCamera, Rig, arrival, eventually, failed, fired, good, rig
 
@@ -143,10 +143,10 @@ def test_what_a_driver_notices_is_written_down(tmp_path: Path) -> None:
     with rig(tmp_path, script) as one:
         one.request(1)
         one.ended(0)
-        eventually(lambda: any(text.startswith("picture.on_card") for text in one.events()), "both")
-        told = [text for text in one.events() if text.startswith(("card.", "picture."))]
+        eventually(lambda: any(text.startswith("noticed: picture") for text in one.events()), "both")
+        told = [text for text in one.events() if text.startswith("noticed: ")]
     assert told == [
-        f"{each.code.value}: {findings.told(each)}" for each in (finding(Code.CARD_CHANGED, Subject("card")), on_card)
+        f"noticed: {findings.told(each)}" for each in (finding(Code.CARD_CHANGED, Subject("card")), on_card)
     ]
 
 
@@ -408,12 +408,15 @@ def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
     assert told == ["zoom: the focal length is 24 mm; it was 10 mm at frame 1"]
 
 
-@pytest.mark.parametrize(("doubt", "by"), [("", clocks.CAMERA_SOURCE), ("it may be another's", clocks.REQUEST_SOURCE)])
-def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) -> None:
+RIVAL = finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 3), rival=2)
+
+
+@pytest.mark.parametrize(("doubt", "by"), [(None, TimeSource.CAMERA_CLOCK), (RIVAL, TimeSource.REQUEST)])
+def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: Finding | None, by: TimeSource) -> None:
     taken = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime())
 
     def script(shot: int) -> list[CameraEvent | Exception]:
-        came = replace(arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": doubt} if doubt else {})
+        came = replace(arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": doubt.to_json()} if doubt else {})
         return [fired(shot), came] if shot < 3 else [came]
 
     with rig(tmp_path, script) as one:
@@ -422,7 +425,7 @@ def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: str, by: str) ->
             assert index is not None
             last = one.ended(index)
     assert last.tag is not None
-    assert last.tag.time_source.startswith(by)
+    assert last.tag.time_source == by
 
 
 def jpeg_at(focal_length_mm: float, taken: str = "") -> bytes:

@@ -9,7 +9,7 @@ from dappled.daemon.pipeline.tagging import FrameSettings
 from dappled.flight import Frame
 from tests.daemon.fakes import no_pose
 
-LATENCY = BodyLatency(60.0, 15.0, "measured")
+LATENCY = BodyLatency(60.0, 15.0)
 
 
 def test_what_a_file_does_not_say_stays_unknown() -> None:

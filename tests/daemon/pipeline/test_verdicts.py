@@ -28,8 +28,8 @@ from dappled.daemon.pipeline.verdicts import (
     verdict,
 )
 from dappled.decode.geometry import FrameGeometry, Gnss, GroundHeight, Pose, from_euler, image_motion, turned
-from dappled.findings import FRAME, Code, finding, told
-from dappled.flight import Tag
+from dappled.findings import FRAME, Code, Finding, finding, told
+from dappled.flight import Tag, TimeSource
 from tests.daemon.fakes import no_pose
 
 NADIR = (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0)
@@ -72,8 +72,9 @@ def flown(**known: object) -> Pose:
     return replace(pose, **known)  # type: ignore[arg-type]  # a test names the fields
 
 
-def tag(pose: Pose, exposure_s: float | None = 1e-3, *, sigma_ns: int = 0, source: str = "test") -> Tag:
-    return Tag(7, 0, sigma_ns, source, 50.0, 8.0, exposure_s, 100.0, "body", "mask", "0" * 64, pose)
+def tag(pose: Pose, exposure_s: float | None = 1e-3, *, sigma_ns: int = 0, doubts: tuple[Finding, ...] = ()) -> Tag:
+    source = TimeSource.TRIGGER_CALL
+    return Tag(7, 0, sigma_ns, source, 50.0, 8.0, exposure_s, 100.0, "body", "mask", "0" * 64, pose, doubts)
 
 
 def judged(pose: Pose, *, exposure_s: float | None = 1e-3, rates: tuple[float, float, float] | None = (0, 0, 0)):  # type: ignore[no-untyped-def]  # a Verdict
@@ -221,7 +222,8 @@ def test_the_fastest_place_is_fastest_in_pixels_of_views_that_are_not_square() -
 
 
 @pytest.mark.parametrize(
-    ("known", "word"), [({"sigma_ns": 10**9}, "±1000 ms"), ({"source": "hot shoe; in doubt: two files"}, "in doubt")]
+    ("known", "word"),
+    [({"sigma_ns": 10**9}, "±1000 ms"), ({"doubts": (finding(Code.FRAME_RIVAL_SHOTS, FRAME, rival=2),)}, "in doubt")],
 )
 def test_an_uncertain_time_leaves_the_blur_unknown(known: dict[str, Any], word: str) -> None:
     found = Judge(NADIR, on_gimbal=False).judge(tag(flown(), **known), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())

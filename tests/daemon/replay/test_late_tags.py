@@ -21,7 +21,7 @@ from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink import mavlink
-from dappled.flight import FlightsLock, LedgerReader, layout, recovery
+from dappled.flight import FlightsLock, LedgerReader, TimeSource, layout, recovery
 from dappled.flight.checks import flight_check
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually
@@ -104,7 +104,7 @@ def test_a_frame_that_a_kill_left_untagged_is_tagged_by_geotag(
         assert {event.kind for event in ledger.events() if event.index == 1} >= {"tagged late", "unreadable"}
     assert late is not None
     assert math.degrees(late.pose.latitude_rad or 0) == pytest.approx(47)
-    assert late.time_source.startswith("trigger call")
+    assert late.time_source == TimeSource.TRIGGER_CALL
     assert flight_check.check(killed).problems == ()
     assert main(["replay", str(killed), "--verify"]) == 0
     assert main(["geotag", str(killed), "--json"]) == 0
@@ -120,7 +120,7 @@ def test_without_the_ledger_s_times_the_wish_s_time_stands(killed: Path, capsys:
     assert main(["geotag", str(killed)]) == 0
     assert "tagged 2 frames that the recording had left without a tag" in capsys.readouterr().err
     with LedgerReader.open(killed / "flight.sqlite") as ledger:
-        assert {tag.time_source for tag in ledger.tags().values()} == {"wish + body latency"}
+        assert {tag.time_source for tag in ledger.tags().values()} == {TimeSource.REQUEST}
     assert main(["replay", str(killed), "--verify"]) == 0
 
 

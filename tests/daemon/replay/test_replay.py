@@ -19,7 +19,7 @@ from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, Notice
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
 from dappled.findings import Code, Subject, finding, told
-from dappled.flight import Cause, FlightError, Shot
+from dappled.flight import Cause, FlightError, Shot, TimeSource
 from tests.daemon.fakes import FakeCamera, FakeDecoder, eventually, failed, fired, good, rig
 from tests.simulated.finepix import picture
 
@@ -54,7 +54,7 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
         RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0),
         decoder=FakeDecoder(),
         publisher=None,
-        latency=BodyLatency(60.0, 15.0, "test"),
+        latency=BodyLatency(60.0, 15.0),
         names=Names("test", "mask", "geometric"),
         observer=progress,
         decode_queue=100,
@@ -88,6 +88,9 @@ def test_a_missing_frame_is_told_and_ends(tmp_path: Path) -> None:
     assert any("000002.dng can't be read" in text for text in again(flight))
 
 
+LATE = finding(Code.FRAME_UNCONFIRMED, Subject("frame", 0), shot=0)
+
+
 def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> None:
     """A driver that never says when it fired, and a file that may be another shot's: both go into the tag."""
 
@@ -95,7 +98,7 @@ def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> N
         (_, arrival) = good(shot)
         assert isinstance(arrival, Arrival)
         rival = finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2")
-        return [dataclasses.replace(arrival, facts={"doubt": "it came late"}), Noticed(rival, 5)]
+        return [dataclasses.replace(arrival, facts={"doubt": LATE.to_json()}), Noticed(rival, 5)]
 
     with rig(tmp_path, untold) as one:
         one.request(0)
@@ -103,7 +106,7 @@ def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> N
         eventually(lambda: any(text.startswith("later doubt: ") for text in one.events()), "the later doubt")
         told = one.flight.ledger.tag(0)
         assert told is not None
-        assert told.time_source == "wish + body latency; in doubt: it came late"
+        assert (told.time_source, told.doubts) == (TimeSource.REQUEST, (LATE,))
         assert {event.kind for event in one.flight.ledger.events()} >= {"untimed", "doubt"}
     assert again(one.flight.folder.path) == []
 

@@ -11,7 +11,7 @@ import pytest
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
-from dappled.flight import Cause, Frame, Result, Shot, ShotRow, Tag, digest
+from dappled.flight import Cause, Frame, Result, Shot, ShotRow, Tag, TimeSource, digest
 from tests.daemon.fakes import no_pose
 
 SHOT = Shot(0, Cause("test", "console", 1), 10, 20)
@@ -19,7 +19,9 @@ DATA = b"raw bytes"
 
 
 def tag(frame: Frame) -> Tag:
-    return Tag(frame.index, 1, 2, "test", 50.0, 8.0, 0.001, 100.0, "camera", "mask", frame.sha256, no_pose())
+    return Tag(
+        frame.index, 1, 2, TimeSource.HOT_SHOE, 50.0, 8.0, 0.001, 100.0, "camera", "mask", frame.sha256, no_pose()
+    )
 
 
 def replay(tmp_path: Path, **digests: Any) -> tuple[ReplayVerifier, Frame]:

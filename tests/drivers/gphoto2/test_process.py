@@ -317,7 +317,7 @@ def test_lost_in_the_trigger_call_fails_the_shot_and_marks_what_follows_as_doubt
     events = ready.turn(1.0)
     (late,) = arrivals(events)
     assert late.shot == 1
-    assert "shot 1" in late.facts["doubt"]
+    assert late.facts["doubt"]["facts"] == {"shot": 1}
     late.blob.close()
 
 
@@ -444,7 +444,7 @@ def test_without_a_body_s_time_a_file_that_may_be_late_is_marked(ready: Harness)
     ready.turn(30.1)
     (came,) = arrivals(shot_on(ready, 2, None, 1))
     assert came.shot == 2
-    assert came.facts["doubt"] == "it may be of shot 1 as well"
+    assert (came.facts["doubt"]["code"], came.facts["doubt"]["facts"]) == ("frame.rival_shots", {"rival": 1})
     came.blob.close()
     (came,) = arrivals(shot_on(ready, 3, None, 2))
     assert "doubt" not in came.facts  # files come in order

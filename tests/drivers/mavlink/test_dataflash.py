@@ -14,6 +14,7 @@ from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, log_packets
 from dappled.drivers.mavlink.dataflash import DataFlashError
 from dappled.findings import Level, text
+from dappled.flight import TimeSource
 from dappled.mocks.autopilot.path import FlightPath
 from tests.drivers.mavlink.true_logs import (
     BOOT_US,
@@ -70,7 +71,7 @@ def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path
     log.write_bytes(data[: len(data) - cut])
     for at_s, level in ((SPAN_S, Level.CAUTION), (SPAN_S / 2, Level.NOTE)):
         telemetry = RecordedTelemetry(log, {}, wait_s=9.0)
-        telemetry.pose(0, ExposureTime((UTC_US + round(at_s * 1e6)) * 1000, 1_000_000, "test"))
+        telemetry.pose(0, ExposureTime((UTC_US + round(at_s * 1e6)) * 1000, 1_000_000, TimeSource.REQUEST))
         told = telemetry.findings()
         if at_s == SPAN_S or form != "tlog":  # a link's log is not read on after its frames
             assert len(told) == (cut > 0)

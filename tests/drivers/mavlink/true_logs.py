@@ -12,6 +12,7 @@ from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import mavlink, pack
+from dappled.flight import TimeSource
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
 WEEK, WEEK_MS = 2445, 555_321_000  # GPS time
@@ -250,7 +251,7 @@ def add_px4_triggers(log: Path, times_s: Mapping[int, float], *, contacts: bool 
 def poses(path: Path) -> list[Pose]:
     telemetry = RecordedTelemetry(path, {}, wait_s=1.0)
     times = [UTC_US * 1000 + round(t_s * 1e9) for t_s in TIMES_S]
-    return [telemetry.pose(n, ExposureTime(utc_ns, 1_000_000, "test"))[1] for n, utc_ns in enumerate(times)]
+    return [telemetry.pose(n, ExposureTime(utc_ns, 1_000_000, TimeSource.REQUEST))[1] for n, utc_ns in enumerate(times)]
 
 
 def same_fix(here: Pose, there: Pose) -> bool:

@@ -8,7 +8,7 @@ import pytest
 from dappled.decode.depth.ranging import DistanceMap
 from dappled.decode.geometry import Pose
 from dappled.errors import DappledError
-from dappled.flight import Frame, Tag
+from dappled.flight import Frame, Tag, TimeSource
 from dappled.products.exports import point_cloud
 from dappled.products.maps import photographs
 from dappled.products.mounting import Mounting
@@ -31,7 +31,7 @@ def station(altitude_m: float) -> photographs.Station:
         "interpolated", 0, None, float(np.radians(41.6)), float(np.radians(-91.5)), altitude_m, None, None,
         (1.0, 0.0, 0.0, 0.0), 0.1, 0.01, 0.0, 0,
     )  # fmt: skip
-    tag = Tag(1, 0, 0, "", 50.0, 7.4, None, None, "reference-36mm", "reference-5x5", "", pose)
+    tag = Tag(1, 0, 0, TimeSource.HOT_SHOE, 50.0, 7.4, None, None, "reference-36mm", "reference-5x5", "", pose)
     return photographs.station(Frame(1, "frames/000001.dng", "", 0, "", 0), tag, Mounting())
 
 

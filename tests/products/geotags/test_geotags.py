@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import html
 import io
 import json
 import math
+import re
 import shutil
 import struct
 import subprocess
@@ -29,7 +31,7 @@ from dappled.decode.geometry import Gnss, Pose, camera_pose, from_euler
 from dappled.decode.geometry.camera_pose import FORWARD, NADIR, Angles
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.errors import DappledError
-from dappled.findings import Code, Subject, finding
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import recording
 from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import exif_gps, geotags, sidecars
@@ -167,7 +169,7 @@ def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> 
     assert point["properties"]["gnss"]["fix_type"] == 6
 
 
-def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "", kind: str = "doubt") -> Path:
+def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: Finding | None = None, kind: str = "doubt") -> Path:
     """A frame 5 s after the start of two vehicles' telemetry, tagged where the first one was."""
     begun = recording.begin(root / "flights", RecordedClock(START_NS))
     for stamp_us, raw in records(START_NS // 1000, extra=extra):
@@ -176,17 +178,18 @@ def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: str = "", kind:
     made = replace(tag(deliver(begun, 0, b"raw")), utc_ns=START_NS + 5 * 10**9)
     begun.ledger.add_tag(replace(made, pose=replace(pose(), latitude_rad=math.radians(10.0))))
     if doubt:
-        begun.ledger.add_event(kind, doubt, 0)
+        begun.ledger.add_event(kind, findings.json_text(doubt), 0)
     begun.close()
     return begun.folder.path
 
 
 def test_a_doubt_that_came_after_the_tag_is_in_the_sidecar_and_decides_the_exit_code(tmp_path: Path) -> None:
-    doubt = findings.text(finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2"))
+    doubt = finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2")
     flight = flown_by_two(tmp_path, doubt=doubt, kind="later doubt")
     assert main(["geotag", str(flight), "--vehicle", "1"]) == 1
     (sidecar,) = (flight / "frames").glob("*.xmp")
-    assert f"in doubt: {doubt}" in sidecar.read_text()
+    (told,) = re.findall(r'dappled:Doubts="([^"]*)"', sidecar.read_text())
+    assert json.loads(html.unescape(told)) == [doubt.to_json()]
     assert main(["geotag", str(flight), "--vehicle", "1", "--anyway"]) == 0
 
 
@@ -228,11 +231,11 @@ def test_the_vehicle_that_reports_a_camera_is_taken_and_told(
 
 
 def test_a_frame_in_doubt_decides_the_exit_code(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flight = flown_by_two(tmp_path, camera_of_2, "it may be of shot 7 as well")
+    flight = flown_by_two(tmp_path, camera_of_2, finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 0), rival=7))
     assert main(["geotag", str(flight), "--json"]) == 1
     shown = capsys.readouterr()
-    assert json.loads(shown.out)["doubts"] == ["frames/000000.cr2: it may be of shot 7 as well"]
-    assert "in doubt: frames/000000.cr2: it may be of shot 7 as well" in shown.err
+    assert [one["code"] for one in json.loads(shown.out)["doubts"]] == ["frame.rival_shots"]
+    assert "in doubt: frame frames/000000.cr2: it may be of shot 7 as well" in shown.err
     assert (flight / "geotags" / "geo.txt").exists()
     assert main(["geotag", str(flight), "--anyway"]) == 0
 

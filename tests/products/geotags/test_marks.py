@@ -16,7 +16,7 @@ from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import camera_pose, from_euler, metres_per_radian
 from dappled.errors import DappledError
-from dappled.flight import LedgerReader, recording
+from dappled.flight import LedgerReader, TimeSource, recording
 from dappled.flight.layout import FlightFolder
 from dappled.products.geotags import geotags, marks, pos_file
 from dappled.products.geotags.mark_matching import TimedShot, pair
@@ -180,7 +180,7 @@ def test_every_shot_finds_its_mark_and_its_position(tmp_path: Path) -> None:
     assert tagged.vertical_sigma_m == pytest.approx(0.015)
     assert tagged.gnss is not None
     assert tagged.gnss.fix_type == 6
-    assert (tagged.source, first.tag.time_source) == ("mark", marks.MARK_SOURCE)
+    assert (tagged.source, first.tag.time_source) == ("mark", TimeSource.LOGGED_MARK)
 
 
 def test_lost_and_extra_marks_are_named_and_lost_frames_keep_their_place(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from dappled import durable
 from dappled.decode.geometry import camera_pose
 from dappled.errors import DappledError
 from dappled.findings import Code, Subject, finding, told
-from dappled.flight import Frame, Tag
+from dappled.flight import Frame, Tag, TimeSource
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.products.handover import colmap, forms, nerfstudio, stac, view_cameras, view_files
 from dappled.products.handover.view_cameras import FrameCameras, ViewCamera
@@ -39,7 +39,7 @@ def photograph(matrix: list[list[float]], distortion: tuple[float, ...] = (0.0,)
     path = FlightPath(5)
     pose = as_recorded(path.pose(1.0))
     frame = Frame(0, "frames/000000.dng", "a.dng", 1, "00", 0)
-    tag = Tag(0, pose.utc_ns, 10_000, "hot shoe", 50.0, 14.8, 0.001, 100, "c", "m", "00", pose)
+    tag = Tag(0, pose.utc_ns, 10_000, TimeSource.HOT_SHOE, 50.0, 14.8, 0.001, 100, "c", "m", "00", pose)
     camera = camera_pose.of(pose)
     assert camera is not None
     assert pose.attitude is not None

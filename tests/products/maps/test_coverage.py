@@ -22,7 +22,8 @@ from dappled.decode.geometry import area as areas
 from dappled.decode.geometry.area import AreaError, PlannedArea
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
-from dappled.flight import Cause, Frame, Result, Shot, Tag, recording
+from dappled.findings import Code, Subject, finding
+from dappled.flight import Cause, Frame, Result, Shot, Tag, TimeSource, recording
 from dappled.products.maps import coverage, refly
 from dappled.products.maps.coverage import Coverage, FramesSeen
 from dappled.products.maps.earth import Projection
@@ -53,7 +54,7 @@ def frame(index: int, east_m: float, north_m: float, *, heading: float = 0.0, pi
         velocity_ned_m_s=(speed * math.cos(heading), speed * math.sin(heading), 0.0),
     )
     name = f"frames/{index:06d}.cr2"
-    tag = Tag(index, 0, 0, "test", FOCAL_MM, 8.0, 1e-3, 100.0, CAMERA, "mask-2", "0" * 64, pose)
+    tag = Tag(index, 0, 0, TimeSource.HOT_SHOE, FOCAL_MM, 8.0, 1e-3, 100.0, CAMERA, "mask-2", "0" * 64, pose)
     return station(Frame(index, name, "x", 1, "0" * 64, 0), tag, Mounting())
 
 
@@ -372,8 +373,8 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with closing(Blob.of(b"x%d" % index)) as blob:
             kept = writer.record(index, f"{index}.cr2", blob)
         pose = no_pose() if one is frames[1] else replace(one.tag.pose, **doubtful.get(one.name, {}))
-        time_source = "hot shoe; in doubt: two files" if one is frames[15] else "hot shoe"
-        writer.tagged(replace(one.tag, frame_sha256=kept.sha256, pose=pose, time_source=time_source))
+        doubts = (finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 15), rival=2),) if one is frames[15] else ()
+        writer.tagged(replace(one.tag, frame_sha256=kept.sha256, pose=pose, doubts=doubts))
         state = "bad" if one is frames[0] else "unknown" if one is frames[2] else "good"
         details = {"verdict": {"state": state, "reasons": ["motion blur"] * (state == "bad"), "facts": {}}}
         writer.decoded(Result(index, "0" * 64, 1, 1, "fd", "predicted", 1.0, details=details))
@@ -395,7 +396,7 @@ def test_the_command_writes_what_was_seen_and_the_mission(
     facts = json.loads(capsys.readouterr().out)
     assert facts["frames"] == 10
     said = [one["why"] for one in facts["left_out"]]
-    words = ("judged bad", "no position", "8.5 s away", "no 3D fix", "±50 m", "its time is: hot shoe; in doubt")
+    words = ("judged bad", "no position", "8.5 s away", "no 3D fix", "±50 m", "its time is: it may be of shot 2")
     assert len(said) == len(words)
     assert all(sum(word in why for why in said) == 1 for word in words)
     assert facts["unjudged"] == 1

@@ -25,7 +25,7 @@ from dappled.decode.lightfield.light_field import LightField
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Subject, finding
-from dappled.flight import Tag, recording
+from dappled.flight import Tag, TimeSource, recording
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene.masked_camera import Truth
 from dappled.mocks.simulation import CAMERA, MASK
@@ -335,7 +335,7 @@ def true_pose(flight: Flown) -> TruePose:
 
 
 def tagged(sha256: str, index: int) -> Tag:
-    return Tag(index, 1, 1, "hot shoe", 50.0, flown.F_NUMBER, 0.001, 100, CAMERA, MASK, sha256, pose())
+    return Tag(index, 1, 1, TimeSource.HOT_SHOE, 50.0, flown.F_NUMBER, 0.001, 100, CAMERA, MASK, sha256, pose())
 
 
 @pytest.mark.parametrize(

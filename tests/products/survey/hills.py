@@ -9,7 +9,7 @@ from pathlib import Path
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Quaternion
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import Tag, recording
+from dappled.flight import Tag, TimeSource, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene.bench import Bench, TexturedPlane
@@ -43,7 +43,20 @@ def frames(folder: Path, camera: MaskedCamera, poses: Sequence[TruePose]) -> tup
         frame = deliver(begun, index, exposure.file, f"IMG_{index:04d}.DNG")
         told = as_recorded(pose)
         begun.ledger.add_tag(
-            Tag(index, told.utc_ns, 10_000, "hot shoe", 50.0, F_NUMBER, 0.001, 100, CAMERA, MASK, frame.sha256, told)
+            Tag(
+                index,
+                told.utc_ns,
+                10_000,
+                TimeSource.HOT_SHOE,
+                50.0,
+                F_NUMBER,
+                0.001,
+                100,
+                CAMERA,
+                MASK,
+                frame.sha256,
+                told,
+            )
         )
     begun.close()
     calibration = simulation.write_calibration(camera, folder)

@@ -12,6 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
+from dappled import findings
 from dappled.cli import sealing
 from dappled.cli.arguments import Actions
 from dappled.cli.flight import arguments as words
@@ -225,5 +226,5 @@ def _said(values: Any, lines: Iterable[str], as_json: bool) -> int:
 
 def _plain(value: Any) -> dict[str, Any]:
     """A record as JSON values, with paths as text."""
-    plain: dict[str, Any] = json.loads(json.dumps(asdict(value), default=str))
+    plain: dict[str, Any] = json.loads(json.dumps(findings.plain(value), default=str))
     return plain

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 
+from dappled import findings
 from dappled.errors import counted
 from dappled.flight import LIVE
 from dappled.flight.checks.flight_check import CheckReport
@@ -100,8 +101,8 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:
         yield f"  {counted(found.strays, 'file', 6)} without a shot"
-    yield from (f"  {'in doubt':>13}: {text}" for text in found.doubts)
-    yield from (f"  {'card':>13}: {text}" for text in found.card[:_SHOWN])
+    yield from (f"  {'in doubt':>13}: {findings.told(one)}" for one in found.doubts)
+    yield from (f"  {'card':>13}: {findings.told(one)}" for one in found.card[:_SHOWN])
     if len(found.card) > _SHOWN:
         yield f"  {'':13}  and {len(found.card) - _SHOWN} more (--json names all)"
     for text in found.lost_triggers:

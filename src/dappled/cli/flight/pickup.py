@@ -74,7 +74,7 @@ def _print_json(flight: Path, proposal: Proposal, picked: Picked | None) -> None
                     for index, group in proposal.pairs
                 ],
                 "findings": [one.to_json() for one in findings.in_order(proposal.findings)],
-                "doubts": [findings.told(one) for one in findings.in_order(proposal.doubts)],
+                "doubts": findings.to_rows(findings.in_order(proposal.doubts)),
                 "missing": list(proposal.missing),
                 "strangers": list(proposal.strangers),
                 "there_already": proposal.there_already,

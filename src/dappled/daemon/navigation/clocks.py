@@ -26,15 +26,12 @@ import numpy as np
 from dappled.config.settings import CameraSettings
 from dappled.daemon.navigation.samples import MARK, Feedback, UtcCorrection, UtcNotes
 from dappled.decode.array_types import Floats
-from dappled.flight import Shot
+from dappled.findings import FRAME, Code, Finding, Subject, finding
+from dappled.flight import Shot, TimeSource
 
 log = logging.getLogger(__name__)
 
-CONTACT_SOURCE = "hot shoe"
-LATENCY_SOURCE = "trigger call + body latency"
-REQUEST_SOURCE = "wish + body latency"
 _UTC_AGREES_NS = 10**9  # clocks that differ by less are not reported
-CAMERA_SOURCE = "camera clock (EXIF)"
 DRIFT_SIGMA = 50e-6  # crystals of autopilots: some tens of ppm between two machines
 _UNSEEN_NS = 10**9  # how late a trigger call may be, where not even the file's arrival bounds it
 _REACH_SIGMAS = 4
@@ -61,13 +58,13 @@ class BodyLatency:
 
     mean_ms: float
     sigma_ms: float
-    source: str
+    source: TimeSource = TimeSource.TRIGGER_CALL
     fired_outside: bool = False  # something else fires the body: the time counts from its trigger, not from our call
 
     @classmethod
     def of(cls, settings: CameraSettings) -> Self:
         """As configured."""
-        return cls(settings.latency_ms, settings.latency_sigma_ms, LATENCY_SOURCE, settings.fired_outside)
+        return cls(settings.latency_ms, settings.latency_sigma_ms, fired_outside=settings.fired_outside)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +86,16 @@ class ExposureTime:
 
     `half_ns` is half the exposure as far as known. `called_utc_ns` is when the trigger call was made: nothing exposes
     before it; None where that is unknown. `trigger` is the message whose time the shot owns, where there is one.
+    `doubts` are those about the time.
     """
 
     utc_ns: int
     sigma_ns: int
-    source: str
+    source: TimeSource
     half_ns: int = 0
     called_utc_ns: int | None = None
     trigger: TriggerMessage | None = None
+    doubts: tuple[Finding, ...] = ()
 
 
 def owned(exposure: ExposureTime, shot: Shot, latency: BodyLatency) -> ExposureTime:
@@ -134,7 +133,7 @@ def mid_exposure_by_request(
     exposure = mid_exposure(requested_utc_ns, latency, exposure_s)
     late_ns = _UNSEEN_NS if arrived_utc_ns is None else max(0, arrived_utc_ns - exposure.utc_ns - exposure.half_ns)
     sigma_ns = round(math.hypot(exposure.sigma_ns, late_ns / math.sqrt(3)))
-    return replace(exposure, sigma_ns=sigma_ns, source=REQUEST_SOURCE)
+    return replace(exposure, sigma_ns=sigma_ns, source=TimeSource.REQUEST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +165,7 @@ class TimesyncAnswer:
 class BootClock:
     """UTC = boot time + offset + drift × (boot time − reference). Sigma is one standard deviation of UTC.
 
-    `doubt`: a sentence where the clock stepped near the time that it is used for.
+    `stepped`: that the clock stepped near the time that it is used for.
     """
 
     source: Literal["timesync", "arrival"]
@@ -174,7 +173,7 @@ class BootClock:
     offset_ns: int
     drift: float
     sigma_ns: float
-    doubt: str = ""
+    stepped: Finding | None = None
 
     def utc_ns(self, boot_ns: int) -> int:
         """UTC at a boot time."""
@@ -285,7 +284,7 @@ def choose_feedback(events: Sequence[Feedback], exposure: ExposureTime, clock: B
     Contacts that the clocks can't tell from the trigger call are not chosen, but compete: without them the next shot's
     would be the nearest. By a clock in doubt none is chosen.
     """
-    if exposure.called_utc_ns is None or clock.doubt:
+    if exposure.called_utc_ns is None or clock.stepped:
         return None
     within_ns = reach_ns(exposure) + _REACH_SIGMAS * clock.sigma_ns
     expected_ns = clock.boot_ns(exposure.utc_ns - exposure.half_ns)
@@ -335,8 +334,12 @@ def own_feedback(events: Sequence[Feedback], trigger: TriggerMessage) -> Feedbac
 
 def unseen(exposure: ExposureTime) -> ExposureTime:
     """The exposure of a shot whose message had no time: it was before the message was heard, by an unknown delay."""
-    source = f"{REQUEST_SOURCE}; in doubt: the autopilot's message had no time that can be used"
-    return replace(exposure, sigma_ns=round(math.hypot(exposure.sigma_ns, _HEARD_NS)), source=source)
+    return replace(
+        exposure,
+        sigma_ns=round(math.hypot(exposure.sigma_ns, _HEARD_NS)),
+        source=TimeSource.REQUEST,
+        doubts=(*exposure.doubts, finding(Code.TIME_TRIGGER_UNUSABLE, FRAME)),
+    )
 
 
 def by_trigger(
@@ -354,7 +357,7 @@ def by_trigger(
         exposure,
         utc_ns=clock.utc_ns(middle_boot_ns),
         sigma_ns=round(math.hypot(own_ns, clock.sigma_ns)),
-        source=f"autopilot's trigger ({event.kind}) + body latency",
+        source=TimeSource.AUTOPILOT_TRIGGER,
         called_utc_ns=clock.utc_ns(event.boot_ns),
     )
     mark = choose_feedback([one for one in events if one.kind == MARK], better, clock)
@@ -365,7 +368,7 @@ def refine(exposure: ExposureTime, event: Feedback, clock: BootClock) -> tuple[E
     """The exposure as the hot shoe timed it, and mid-exposure in time since boot."""
     middle_boot_ns = event.boot_ns + exposure.half_ns
     sigma_ns = round(math.hypot(event.sigma_ns, clock.sigma_ns))
-    source = f"{CONTACT_SOURCE} ({event.kind})"
+    source = TimeSource.RECEIVER_MARK if event.kind == MARK else TimeSource.HOT_SHOE
     return replace(exposure, utc_ns=clock.utc_ns(middle_boot_ns), sigma_ns=sigma_ns, source=source), middle_boot_ns
 
 
@@ -419,7 +422,7 @@ def exposure_from_camera(
         return None
     half_ns = round((exposure_s or 0.0) / 2 * 1e9)
     sigma_ns = round(math.hypot(offset[1], step_ns / math.sqrt(12)))
-    return ExposureTime(shown_ns - offset[0] + step_ns // 2 + half_ns, sigma_ns, CAMERA_SOURCE, half_ns)
+    return ExposureTime(shown_ns - offset[0] + step_ns // 2 + half_ns, sigma_ns, TimeSource.CAMERA_CLOCK, half_ns)
 
 
 def camera_time(taken: str | None) -> tuple[int, int] | None:
@@ -439,9 +442,9 @@ def camera_time(taken: str | None) -> tuple[int, int] | None:
 
 def in_doubt(exposure: ExposureTime, clock: BootClock | None) -> ExposureTime:
     """The exposure with the doubt of the clock that places it."""
-    if clock is None or not clock.doubt:
+    if clock is None or clock.stepped is None:
         return exposure
-    return replace(exposure, source=f"{exposure.source}; in doubt: {clock.doubt}")
+    return replace(exposure, doubts=(*exposure.doubts, clock.stepped))
 
 
 class UtcLearner:
@@ -471,17 +474,12 @@ class UtcLearner:
             self._notes.learn_utc(found.correction_ns, found.sigma_ns, found.source)
             self.learnt = found
 
-    def doubt(self) -> str | None:
-        """A sentence where the machine's clock is believed, and the autopilot's satellites say something else."""
+    def doubt(self) -> Finding | None:
+        """That the machine's clock is believed, and the autopilot's satellites say something else; else None."""
         last = self._last
         if not self._known or last is None or abs(last.correction_ns) <= 3 * last.sigma_ns + _UTC_AGREES_NS:
             return None
-        way = "slow" if last.correction_ns > 0 else "fast"
-        off_s = abs(last.correction_ns) / 1e9
-        return (
-            f"this machine's clock is {off_s:.0f} s {way}, by the autopilot's satellites, but is used all the same: "
-            'set it, or set record.utc = "autopilot"'
-        )
+        return finding(Code.TIME_MACHINE_DIFFERS, Subject("machine"), off_s=-last.correction_ns / 1e9)
 
     def utc_ns(self, utc_ns: int) -> int | None:
         """A stamp of this flight as UTC; None while that is not known."""

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from dappled import findings
 from dappled.daemon.navigation.vehicle_history import VehicleHistory
+from dappled.findings import Code, Finding, Subject, finding
 
 _SHOWN_NS = 60 * 10**9
 
 
-def doubts(history: VehicleHistory, utc_ns: int) -> Iterator[str]:
-    """A sentence for each thing that was in the telemetry up to a minute before an instant."""
+_AUTOPILOT = Subject("autopilot")
+
+
+def doubts(history: VehicleHistory, utc_ns: int) -> Iterator[Finding]:
+    """What was in the telemetry up to a minute before an instant."""
     counts, time = history.counts, history.time
     step = time.last_step()
     if step is not None and step.step_ns is not None and utc_ns - step.since_ns <= _SHOWN_NS:
         if time.is_unsteady():
-            yield "the autopilot's clock does not run steadily: poses are in doubt"
+            yield finding(Code.CLOCK_UNSTEADY, _AUTOPILOT)
         else:
-            yield f"the autopilot's clock stepped by {step.step_ns / 1e9:+.3f} s: poses next to that are in doubt"
+            yield finding(Code.CLOCK_STEPPED, _AUTOPILOT, steps=1, by_s=step.step_ns / 1e9)
     if (date := time.utc.doubt()) is not None:
-        yield f"{findings.text(date)}: it is not used"
+        yield date
     if counts.impossible and utc_ns - counts.impossible_ns <= _SHOWN_NS:
-        yield "the autopilot sends impossible positions, attitudes or times: they are not used"
+        yield finding(Code.POSITION_IMPOSSIBLE, _AUTOPILOT)
     if counts.jumps and utc_ns - counts.jump_ns <= _SHOWN_NS:
-        by_m = f"{counts.jump_m:.1f} m"
-        yield f"the autopilot's position jumped by {by_m} against its velocity: poses next to that are in doubt"
+        yield finding(Code.POSITION_JUMPED, _AUTOPILOT, by_m=counts.jump_m)

@@ -16,7 +16,6 @@ from dataclasses import replace
 from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import (
-    CONTACT_SOURCE,
     BootClock,
     ExposureTime,
     UtcLearner,
@@ -58,6 +57,7 @@ from dappled.decode.geometry import (
     turned_by_heading,
 )
 from dappled.drivers.mavlink import MavlinkMessage, Packet
+from dappled.findings import Finding
 from dappled.flight import LedgerReader, Recording
 
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
@@ -149,7 +149,7 @@ class Telemetry:
         that sends marks, could report about this exposure.
         """
         later_ns = reach_ns(exposure) if self._counts.feedbacks else 0
-        here = not self._counts.marks or self.locate(exposure)[0].source.startswith(CONTACT_SOURCE)
+        here = not self._counts.marks or self.locate(exposure)[0].source.contact
         return self.bracketed(exposure.utc_ns + (later_ns if here else max(later_ns, _MARK_COMES_NS)))
 
     def locate(self, exposure: ExposureTime, *, upto_packet: int | None = None) -> tuple[ExposureTime, Pose]:
@@ -176,7 +176,7 @@ class Telemetry:
             better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock, events)
         else:
             better, boot_ns = refine(exposure, event, clock)
-        if not clock.doubt:  # the better time may be next to a step, where the expected one was not
+        if not clock.stepped:  # the better time may be next to a step, where the expected one was not
             with self._lock:
                 clock = self._history.clock(limit, better.utc_ns) or clock
         pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns, clock=clock)
@@ -208,8 +208,8 @@ class Telemetry:
             if boot_ns is None:
                 boot_ns, sigma_ns = clock.boot_ns(utc_ns), (utc_sigma_ns**2 + clock.sigma_ns**2) ** 0.5
             else:  # where the clock stepped, the samples around that time may not be those of the exposure
-                sigma_ns = math.hypot(utc_sigma_ns, clock.sigma_ns if clock.doubt else 0.0)
-            at = self._history.around(utc_ns, boot_ns, sigma_ns, limit, placed=not clock.doubt)
+                sigma_ns = math.hypot(utc_sigma_ns, clock.sigma_ns if clock.stepped else 0.0)
+            at = self._history.around(utc_ns, boot_ns, sigma_ns, limit, placed=not clock.stepped)
         return pose_around(at, packets=limit, attitude_sigma_rad=self._attitude_sigma_rad)
 
     def rates(self, pose: Pose) -> Vector3 | None:
@@ -226,8 +226,8 @@ class Telemetry:
             return None
         return turn_rates((a.attitude, b.attitude), rates, span_ns / 1e9, (boot_ns - a.boot_ns) / span_ns)
 
-    def doubts(self, utc_ns: int) -> tuple[str, ...]:
-        """A sentence for each thing in the telemetry of the last minute for which poses are in doubt."""
+    def doubts(self, utc_ns: int) -> tuple[Finding, ...]:
+        """What was in the telemetry of the last minute, for which poses are in doubt."""
         with self._lock:
             return tuple(doubts(self._history, utc_ns))
 

@@ -52,6 +52,7 @@ from dappled.drivers.mavlink.sample_judge import (
     point_m,
     turned,
 )
+from dappled.findings import FRAME, Code, finding
 
 POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
 TIMESYNC_WINDOW_NS, ARRIVAL_WINDOW_NS = 120 * 10**9, 60 * 10**9
@@ -199,7 +200,7 @@ class AutopilotTime:
         """The autopilot's clock against ours at an instant (now), from the packets below `limit`; None while unknown.
 
         By TIMESYNC where there are answers, else by when the samples of `histories` arrived. Next to a step, and while
-        the clock steps again and again, its sigma contains the largest step, and it has a doubt.
+        the clock steps again and again, its sigma contains the largest step, and it says so.
         """
         at = self._place(limit, utc_ns)
         found = self._epoch_clock(at, limit, histories)
@@ -211,10 +212,8 @@ class AutopilotTime:
         if not between and len(near) < 2:
             return found
         widest_ns = max([*near, abs(epoch.step_ns or 0) if between else 0])
-        doubt = f"the autopilot's clock stepped by {widest_ns / 1e9:.3f} s"
-        if len(near) > 1:
-            doubt = f"the autopilot's clock stepped {len(near)} times, by up to {widest_ns / 1e9:.3f} s"
-        return replace(found, sigma_ns=math.hypot(found.sigma_ns, widest_ns), doubt=doubt)
+        stepped = finding(Code.CLOCK_STEPPED, FRAME, steps=max(1, len(near)), by_s=widest_ns / 1e9)
+        return replace(found, sigma_ns=math.hypot(found.sigma_ns, widest_ns), stepped=stepped)
 
     def _epoch_clock(self, at: int, limit: int, histories: Sequence[Sequence[Sample]]) -> BootClock | None:
         """The clock by the packets of one epoch alone."""

@@ -32,7 +32,7 @@ from dappled.drivers.camera import (
 from dappled.errors import report, sentence
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Frame, Shot, Tag
-from dappled.flight.records import DOUBT, LATER_DOUBT
+from dappled.flight.records import DOUBT, LATER_DOUBT, NOTICED
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -66,7 +66,7 @@ class PendingShot:
     decoded: DecodedFrame | None = None
     verdict: Verdict | None = None
     problem: str = ""
-    doubt: str = ""
+    doubt: Finding | None = None
     follows: str = ""
     where: tuple[ExposureTime, Pose] | None = None
     ms: dict[str, float] = field(default_factory=dict)
@@ -366,9 +366,9 @@ class Capture:
         log.warning("%s", findings.told(found))
         about = found.subject
         if about.kind == "frame" and isinstance(about.which, int):
-            self._writer.event(LATER_DOUBT, findings.text(found), about.which)
+            self._writer.event(LATER_DOUBT, findings.json_text(found), about.which)
         else:
-            self._writer.event(found.code.value, findings.told(found))
+            self._writer.event(NOTICED, findings.json_text(found))
 
     def _enter(self, index: int | None) -> None:
         """Write a shot's row before its first event. Raises FlightError; the next event tries again."""
@@ -415,8 +415,8 @@ class Capture:
             return
         pending = self._ends.safe(pending, frame, arrival.name)
         if doubt := arrival.facts.get("doubt"):
-            pending.doubt = str(doubt)
-            self._ends.note(DOUBT, pending.doubt, frame.index)
+            pending.doubt = Finding.from_json(doubt)
+            self._ends.note(DOUBT, findings.json_text(pending.doubt), frame.index)
         if pending.fired:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
         pending.ms["record"] = (self._clock.monotonic_ns() - began) / 1e6

@@ -16,6 +16,7 @@ from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.errors import DappledError, report, sentence
+from dappled.findings import Finding
 from dappled.flight import Frame, Tag
 from dappled.workers import Worker
 
@@ -83,14 +84,14 @@ def tag(
     camera: str,
     mask: str,
     pose: Pose,
-    doubt: str = "",
+    doubt: Finding | None = None,
 ) -> Tag:
     """All that is known of a frame, in one record. `doubt` says why it may be another shot's."""
     return Tag(
         index=frame.index,
         utc_ns=exposure.utc_ns,
         utc_sigma_ns=exposure.sigma_ns,
-        time_source=f"{exposure.source}; in doubt: {doubt}" if doubt else exposure.source,
+        time_source=exposure.source,
         focal_length_mm=settings.focal_length_mm,
         f_number=settings.f_number,
         exposure_s=settings.exposure_s,
@@ -99,6 +100,7 @@ def tag(
         mask=mask,
         frame_sha256=frame.sha256,
         pose=pose,
+        doubts=exposure.doubts if doubt is None else (*exposure.doubts, doubt),
     )
 
 

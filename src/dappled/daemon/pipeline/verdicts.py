@@ -5,19 +5,18 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import findings
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
 from dappled.errors import counted
-from dappled.findings import FRAME, Code, Finding, told
+from dappled.findings import FRAME, Code, Finding, plain, told
 from dappled.flight import Tag
 
 VerdictState = Literal["good", "usable", "bad", "unknown"]
@@ -119,10 +118,8 @@ class Verdict:
 
     def values(self) -> dict[str, Any]:
         """As ledger and stream have it."""
-        if self.facts is None:
-            return {"state": self.state, "reasons": list(self.reasons), "facts": {}}
-        numbers = {name: _plain(one) for name, one in asdict(replace(self.facts, doubts=())).items()}
-        numbers["doubts"] = findings.to_rows(self.facts.doubts)
+        facts = {} if self.facts is None else plain(self.facts)
+        numbers = {name: _plain(one) for name, one in facts.items()}
         return {"state": self.state, "reasons": list(self.reasons), "facts": numbers}
 
 
@@ -326,7 +323,7 @@ class Judge:
             (tag.exposure_s is None, "the frame has no exposure time"),
             (tag.focal_length_mm is None, "the frame has no focal length"),
             (seen.side_mm is None, "the camera has no profile with the size of its sensor"),
-            ("in doubt" in tag.time_source, f"its time is {tag.time_source}"),
+            (bool(tag.doubts), f"its time is in doubt: {'; '.join(told(one, FRAME) for one in tag.doubts)}"),
             (tag.utc_sigma_ns > _LATE_NS, f"its time is known to ±{tag.utc_sigma_ns / 1e6:.0f} ms only"),
             (pose.velocity_ned_m_s is None, "the telemetry has no velocity"),
             (pose.attitude is None, "the telemetry has no attitude"),

@@ -30,9 +30,10 @@ from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, text, told
+from dappled.findings import Code, Finding, Level, Subject, finding, json_text
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
+from dappled.flight.records import DOUBT, NOTICED
 from dappled.flight.seal_key import SealKey
 
 _ANCHORS = 64  # frames whose times tell the camera's clock
@@ -172,13 +173,13 @@ def bring(
         stack.callback(recorder.close)
         for one in proposal.findings:
             if one.code is Code.CARD_CHANGED:
-                ledger.add_event(one.code.value, told(one))
+                ledger.add_event(NOTICED, json_text(one))
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
             ledger.add_event("picked up", f"{group.main.name}: {proposal.reasons[number]}", number)
-            doubt = next((text(one) for one in proposal.doubts if one.subject == Subject("frame", number)), "")
-            if doubt:
-                ledger.add_event("doubt", doubt, number)
+            doubt = next((one for one in proposal.doubts if one.subject == Subject("frame", number)), None)
+            if doubt is not None:
+                ledger.add_event(DOUBT, json_text(doubt), number)
             for other in group.companions:
                 _accompany(recorder, source, number, other, clock.utc_ns())
                 companions += 1

@@ -84,6 +84,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
     texts: dict[int | None, dict[str, str]] = defaultdict(dict)
     for event in events:
         texts[event.index][event.kind] = event.text
+    doubts = {event.index: event.finding for event in events if event.kind == DOUBT}
     expected, files = [], []
     for row in rows:
         index = row.shot.index
@@ -101,7 +102,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 frozenset(texts[index]),
             )
         )
-        files.append(_file(flight, row, frame, texts[index].get(DOUBT)))
+        files.append(_file(flight, row, frame, doubts.get(index)))
     if not frames:
         raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
@@ -393,13 +394,13 @@ def verifier(recording: RecordedFlight, keep: ResultWriter | None = None) -> Rep
     return ReplayVerifier(recording.root, recording.expected, keep, elsewhere=recording.elsewhere)
 
 
-def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: str | None) -> RecordedShot:
+def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: Finding | None) -> RecordedShot:
     called, returned = row.fired_called_monotonic_ns, row.fired_returned_monotonic_ns
     fired = None if called is None or returned is None else (called, returned)
     if frame is None:
         return RecordedShot(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
-    facts = {} if doubt is None else {"doubt": doubt}
+    facts = {} if doubt is None else {"doubt": doubt.to_json()}
     return RecordedShot(row.shot.index, folder.file(frame.name), frame.camera_name, fired, arrived_ns, facts=facts)
 
 

@@ -148,6 +148,7 @@ def frame_header(tag: Tag, frame: Frame, law: str | None) -> dict[str, object]:
         **frame_facts(tag, law),
         "utc_sigma_ns": tag.utc_sigma_ns,
         "time_source": tag.time_source,
+        "time_doubts": findings.to_rows(tag.doubts),
         "exposure_s": tag.exposure_s,
         "iso": tag.iso,
         "name": frame.name,

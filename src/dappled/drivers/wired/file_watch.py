@@ -12,8 +12,9 @@ import threading
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from statistics import median
+from typing import Any
 
-from dappled import durable, findings, picture_order
+from dappled import durable, picture_order
 from dappled.clock import Clock
 from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute
 from dappled.drivers.camera import Arrival, Blob, CameraError, Companion, Noticed, ShotFailed
@@ -243,7 +244,7 @@ class FileWatch:
         with self._lock:
             waiting = [one for one in self._claims if one.fired_ns > self._past_ns]
         made = attribute(clue, self._late, waiting, self._body_clock)
-        facts = {"doubt": findings.text(made.doubt)} if made.doubt else {}
+        facts = {"doubt": made.doubt.to_json()} if made.doubt else {}
         if (yield from self._bring(made.shot, group, facts)):
             self._body_clock = made.clock
             self._late = [] if made.doubt else [one for one in self._late if one.shot != made.shot]
@@ -314,7 +315,7 @@ class FileWatch:
         return self._dates[one]
 
     def _bring(
-        self, shot: int | None, group: FileGroup, facts: dict[str, str]
+        self, shot: int | None, group: FileGroup, facts: dict[str, Any]
     ) -> Generator[Arrival | Companion | Noticed, None, bool]:
         """Yield a frame and its companions. Returns False where the frame can't be read now."""
         main = group.main

@@ -24,7 +24,7 @@ from dappled import __version__, confined, durable, file_lock, findings
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError, sentence
-from dappled.findings import Finding
+from dappled.findings import Finding, plain
 from dappled.flight import Frame, Tag, canonical
 from dappled.products.exports import light_files
 from dappled.products.extras import need
@@ -155,7 +155,7 @@ def plan(
         tag = tags.get(frame.index)
         utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
         said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
-                "tag": None if tag is None else asdict(tag)}  # fmt: skip
+                "tag": plain(tag)}  # fmt: skip
         if frame.index in stations and stations[frame.index].camera.height_ellipsoid_m is not None:
             said["height_ellipsoid_m"] = stations[frame.index].camera.height_ellipsoid_m
         key = hashlib.sha256(canonical(said)).hexdigest()
@@ -383,10 +383,7 @@ class Manifest:
         """Append a result, durably."""
         os.write(
             self._fd,
-            json.dumps(
-                {**asdict(replace(done, doubts=())), "doubts": findings.to_rows(done.doubts)}, sort_keys=True
-            ).encode()
-            + b"\n",
+            json.dumps(plain(done), sort_keys=True).encode() + b"\n",
         )
         os.fsync(self._fd)
         self._note(done)

@@ -15,6 +15,7 @@ from typing import Any
 from dappled import durable
 from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
+from dappled.findings import Finding, Subject, to_rows
 from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, layout
 from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.products.geotags import exif_gps, sidecars
@@ -58,12 +59,12 @@ def read(
     tags: Mapping[int, Tag] | None = None,
 ) -> tuple[list[Placed], list[str]]:
     """A flight's tagged frames in order, and the names of frames without a tag. Where a frame has a mark, its time and
-    position are the mark's. `tags` replace the recorded ones. A doubt whose a frame is that came after
-    its tag is in its time's source too. Raises FlightError and EarthError."""
+    position are the mark's. `tags` replace the recorded ones. Doubts whose a frame is that came after
+    its tag are among the tag's. Raises FlightError and EarthError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         tags = ledger.tags() if tags is None else tags
         frames, correction_ns = ledger.frames(), ledger.utc_correction_ns()
-        doubted = {event.index: event.text for event in ledger.events() if event.kind == LATER_DOUBT}
+        doubted = _doubts(ledger, LATER_DOUBT)
     placed = []
     for frame in frames:
         tag = tags.get(frame.index)
@@ -73,18 +74,24 @@ def read(
         if marked is not None and frame.index in marked.marks:
             tag = marked.tag(tag, geoid)
             utc_ns = tag.utc_ns
-        if doubt := doubted.get(frame.index):
-            tag = replace(tag, time_source=f"{tag.time_source}; in doubt: {doubt}")
+        later = (found for index, found in doubted if index == frame.index)
+        tag = replace(tag, doubts=(*tag.doubts, *later))
         placed.append(Placed(frame, tag, _camera(tag.pose, mounting, geoid), utc_ns))
     return placed, [frame.name for frame in frames if frame.index not in tags]
 
 
-def doubts(flight: Path) -> list[tuple[str, str]]:
-    """(name, sentence) of each frame that may be another shot's, as the ledger has it. Raises FlightError."""
+def _doubts(ledger: LedgerReader, *kinds: str) -> list[tuple[int, Finding]]:
+    """(index, why) of each frame that may be another shot's."""
+    events = (event for event in ledger.events() if event.kind in kinds)
+    return [(one.index, found) for one in events if one.index is not None and (found := one.finding) is not None]
+
+
+def doubts(flight: Path) -> list[Finding]:
+    """Which frames, by their names, may be other shots', as the ledger has it. Raises FlightError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         names = {frame.index: frame.name for frame in ledger.frames()}
-        doubted = [(event.index, event.text) for event in ledger.events() if event.kind in (DOUBT, LATER_DOUBT)]
-    return [(names[index], text) for index, text in doubted if index in names]
+        doubted = _doubts(ledger, DOUBT, LATER_DOUBT)
+    return [replace(found, subject=Subject("frame", names[index])) for index, found in doubted if index in names]
 
 
 def write(
@@ -239,6 +246,7 @@ def geojson(placed: Sequence[Placed]) -> str:
                     "index": one.frame.index,
                     "utc_ns": one.utc_ns,
                     "time_source": one.tag.time_source,
+                    "doubts": to_rows(one.tag.doubts),
                     "pose_source": one.tag.pose.source,
                     "altitude_msl_m": camera.altitude_msl_m,
                     "height_above_home_m": camera.height_above_home_m,

@@ -13,13 +13,12 @@ import numpy as np
 
 from dappled.decode.geometry import Gnss, Vector3, camera_pose, metres_per_radian
 from dappled.errors import DappledError, counted
-from dappled.flight import LedgerReader, ShotRow, Tag, layout
+from dappled.flight import LedgerReader, ShotRow, Tag, TimeSource, layout
 from dappled.products.geotags import pos_file
 from dappled.products.geotags.mark_matching import MarkPairs, TimedShot, pair
 from dappled.products.geotags.pos_file import Mark
 from dappled.products.maps.earth import Geoid
 
-MARK_SOURCE = "GNSS mark"
 _CONTACT_SIGMA_NS = 1_000_000  # contact bounce and shutter: as for the autopilot's hot shoe
 _BOUNCE_NS = 50_000_000
 _PLAUSIBLE_S = 26 * 3600.0  # a time zone, and a clock that was set by hand
@@ -270,7 +269,9 @@ def _applied(tag: Tag, mark: Mark, geoid: Geoid | None, arm_m: Vector3) -> Tag:
         gnss=Gnss(_FIXES.get(mark.quality, 0), mark.satellites, None, None, None, None, None, half_ns / 1e6),
         age_ms=half_ns / 1e6,
     )
-    return replace(tag, utc_ns=placed.utc_ns, utc_sigma_ns=_CONTACT_SIGMA_NS, time_source=MARK_SOURCE, pose=placed)
+    return replace(
+        tag, utc_ns=placed.utc_ns, utc_sigma_ns=_CONTACT_SIGMA_NS, time_source=TimeSource.LOGGED_MARK, pose=placed
+    )
 
 
 def _half_ns(tag: Tag) -> int:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -70,8 +70,7 @@ class FrameCameras:
 
     def encoded(self) -> bytes:
         """The record as JSON."""
-        row = {**asdict(replace(self, doubts=())), "doubts": findings.to_rows(self.doubts)}
-        return (json.dumps(row, indent=1, allow_nan=False) + "\n").encode()
+        return (json.dumps(findings.plain(self), indent=1, allow_nan=False) + "\n").encode()
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from dappled.decode.geometry.area import PlannedArea
 from dappled.decode.optics import Sensor
 from dappled.drivers.raw import reading
 from dappled.errors import DappledError
+from dappled.findings import text
 from dappled.flight import LedgerReader, layout
 from dappled.products.maps import ground as grounds
 from dappled.products.maps.earth import EarthError, Projection, utm
@@ -154,8 +155,8 @@ def doubt_of(station: Station) -> str | None:
     pose = station.tag.pose
     if pose.source not in ("interpolated", "mark"):
         return f"its position is in doubt: the telemetry nearest to it is {(pose.age_ms or 0) / 1e3:.1f} s away"
-    if "in doubt" in station.tag.time_source:
-        return f"its place is in doubt, because its time is: {station.tag.time_source}"
+    if station.tag.doubts:
+        return f"its place is in doubt, because its time is: {'; '.join(map(text, station.tag.doubts))}"
     if pose.source == "mark" or pose.gnss is None or pose.gnss.age_ms > _SILENT_MS:
         return None  # no receiver that says how it is: `unjudged` tells that
     return "its position is in doubt: the receiver had no 3D fix" if pose.gnss.fix_type < _FIX_3D else None
