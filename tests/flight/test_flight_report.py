@@ -6,7 +6,7 @@ import pytest
 
 from dappled import findings
 from dappled.cli import main
-from dappled.findings import Code, Subject, finding
+from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import FlightFolder, Recording, Result, flight_report
 from dappled.flight.flight_report import SourceReport, by_source
 from tests.flight.makers import deliver, request, tag
@@ -73,15 +73,18 @@ def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys
     for index in range(len(states) + 1):
         request(flight, index)
         deliver(flight, index, bytes(1000))
+    dark = finding(Code.FRAME_DARK, FRAME, share=0.01), finding(Code.FRAME_BLACK, FRAME, share=0.8)
     for index, state in enumerate(states):
-        details = {"verdict": {"state": state, "reasons": [f"why {index}", "and more"]}}
+        details = {"verdict": {"state": state, "reasons": findings.to_rows(dark if state != "good" else ())}}
         flight.ledger.add_result(Result(index, "ab", 12, 13, "geometric", "predicted", details=details))
     flight.close()
     assert main(["flight", "report", str(flight.folder.path)]) == 0
     said = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     judged = said.index("judged: 1 good, 0 usable, 1 bad, 2 unknown")
-    assert said[judged + 1 : judged + 4] == [
-        "bad: frame 1: why 1; and more",
-        "unknown: frame 2: why 2; and more",
+    assert said[judged + 1 : judged + 6] == [
+        "bad: frame 1: too dark: 1.0% of white on average",
+        "bad: frame 1: 80% of the pixels are black",
+        "unknown: frame 2: too dark: 1.0% of white on average",
+        "unknown: frame 2: 80% of the pixels are black",
         "unknown: frame 3: not judged in flight",
     ]

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from dappled import findings
-from dappled.findings import Finding
+from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
@@ -26,6 +26,8 @@ from dappled.flight.records import (
     Stray,
     Tag,
 )
+
+FrameVerdict = tuple[str, tuple[Finding, ...]]  # a frame's state, and why
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +61,8 @@ class Balance:
     lost: int = 0
     lost_triggers: tuple[str, ...] = ()
     judged: Mapping[str, int] = field(default_factory=dict)
-    bad: tuple[str, ...] = ()
-    unknown: tuple[str, ...] = ()
+    bad: tuple[Finding, ...] = ()
+    unknown: tuple[Finding, ...] = ()
     doubts: tuple[Finding, ...] = ()
     card: tuple[Finding, ...] = ()
 
@@ -152,16 +154,21 @@ def _found(events: Iterable[LedgerEvent], *kinds: str) -> tuple[Finding, ...]:
     return tuple(found for event in events if event.kind in kinds and (found := event.finding) is not None)
 
 
-def _reasons(wanted: str, judged: Mapping[int, tuple[str, list[str]]], frames: Sequence[Frame]) -> tuple[str, ...]:
+def _reasons(wanted: str, judged: Mapping[int, FrameVerdict], frames: Sequence[Frame]) -> tuple[Finding, ...]:
     """Why each frame has this verdict; none where the flight's frames were not judged."""
     if not judged:
         return ()
-    none: tuple[str, list[str]] = ("unknown", ["not judged in flight"])
+    none: FrameVerdict = ("unknown", (finding(Code.FRAME_UNJUDGED, FRAME, why="not judged in flight"),))
     each = ((frame.index, *judged.get(frame.index, none)) for frame in frames)
-    return tuple(f"frame {index}: {'; '.join(reasons)}" for index, state, reasons in each if state == wanted)
+    return tuple(
+        replace(one, subject=Subject("frame", index))
+        for index, state, reasons in each
+        if state == wanted
+        for one in reasons
+    )
 
 
-def _by_verdict(judged: Mapping[int, tuple[str, list[str]]], frames: int) -> dict[str, int]:
+def _by_verdict(judged: Mapping[int, FrameVerdict], frames: int) -> dict[str, int]:
     """How many frames have each verdict; empty where the flight's frames were not judged."""
     if not judged:
         return {}

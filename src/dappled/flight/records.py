@@ -136,12 +136,12 @@ class Result:
     details: Mapping[str, Any] = field(default_factory=dict)
 
     @property
-    def verdict(self) -> tuple[str, list[str]] | None:
+    def verdict(self) -> tuple[str, tuple[Finding, ...]] | None:
         """How the frame was judged in flight, and why; None where it was not."""
         found = self.details.get("verdict")
         if not isinstance(found, Mapping) or not isinstance(found.get("reasons"), list):
             return None
-        return str(found.get("state")), [str(one) for one in found["reasons"]]
+        return str(found.get("state")), findings.from_rows(found["reasons"])
 
 
 @dataclass(frozen=True, slots=True)

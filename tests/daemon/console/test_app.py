@@ -32,6 +32,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.area import PlannedArea
 from dappled.drivers.child_process import ChannelError, ProcessChannel
+from dappled.findings import FRAME, Code, finding
 from tests import globe
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)
@@ -214,7 +215,9 @@ def test_frames_close_the_holes_of_the_planned_area_and_a_bad_one_opens_them_aga
             return ground.share == 1.0
 
         eventually(decoded, "the area is seen")
-        judged = {"last": [{"frame": 0, "state": "bad", "reasons": ["motion blur"]}]}
+        judged = {
+            "last": [{"frame": 0, "state": "bad", "reasons": [finding(Code.FRAME_DARK, FRAME, share=0.01).to_json()]}]
+        }
         decode = {"mask": "m", "calibration": "c", "running": True, "judged": judged}
         rig.publisher.publish("health", {**HEALTH, "decode": decode})
         eventually(lambda: rig.feed.frames[0].verdict is not None, "the verdict")

@@ -22,7 +22,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
-from dappled.findings import Finding
+from dappled.findings import FRAME, Code, Finding, finding, text
 from dappled.flight import Result, flight_report, layout, recording
 from tests.flight.makers import deliver, request, tag
 
@@ -120,6 +120,9 @@ def test_a_new_page_is_told_everything_and_then_that_the_flight_has_ended() -> N
     assert events[-1]["shots"] == {"wished": 1, "safe": 1}
 
 
+BLACK = finding(Code.FRAME_BLACK, FRAME, share=0.4)
+
+
 class FakeDecoder:
     """Decodes frame 0, and refuses frame 1."""
 
@@ -146,7 +149,7 @@ def flight(tmp_path: Path) -> Path:
         frame = deliver(begun, index, b"raw", f"IMG_{index}.CR2")
         if index < 2:
             begun.ledger.add_tag(tag(frame))
-    verdict = {"verdict": {"state": "usable", "reasons": ["blurred by 2.1 px"]}}
+    verdict = {"verdict": {"state": "usable", "reasons": [BLACK.to_json()]}}
     begun.ledger.add_result(Result(1, "00", 24, 24, "law", "calibrated", details=verdict))
     begun.close()
     return begun.folder.path
@@ -160,7 +163,7 @@ def test_a_flight_s_frames_are_its_tags_and_verdicts_and_slices_are_decoded_when
     shown: Sequence[ShownFrame] = source.frames()
     assert [(one.header["frame"], one.verdict) for one in shown] == [
         (0, None),
-        (1, {"state": "usable", "reasons": ["blurred by 2.1 px"]}),
+        (1, {"state": "usable", "reasons": [text(BLACK)]}),
     ]
     served = Served(source)
     mean, bad, state = served.asked("/api/frames/0/mean.jpg", "/api/frames/1/mean.jpg", "/api/state")
@@ -169,7 +172,7 @@ def test_a_flight_s_frames_are_its_tags_and_verdicts_and_slices_are_decoded_when
     assert bad.json()["error"].endswith("frames/000001.cr2 is damaged")
     assert state.json()["newest"] == 0
     assert served.feed.frames[0].thumb is not None
-    assert served.feed.frames[1].verdict == {"state": "usable", "reasons": ["blurred by 2.1 px"]}
+    assert served.feed.frames[1].verdict == {"state": "usable", "reasons": [text(BLACK)]}
 
 
 def test_all_frames_get_their_small_pictures_and_a_bad_one_stops_none(

@@ -188,7 +188,7 @@ def test_a_doubt_that_came_after_the_tag_is_in_the_sidecar_and_decides_the_exit_
     flight = flown_by_two(tmp_path, doubt=doubt, kind="later doubt")
     assert main(["geotag", str(flight), "--vehicle", "1"]) == 1
     (sidecar,) = (flight / "frames").glob("*.xmp")
-    (told,) = re.findall(r'dappled:Doubts="([^"]*)"', sidecar.read_text())
+    (told,) = re.findall(r"dappled:Doubts='([^']*)'", sidecar.read_text())
     assert json.loads(html.unescape(told)) == [doubt.to_json()]
     assert main(["geotag", str(flight), "--vehicle", "1", "--anyway"]) == 0
 

@@ -22,7 +22,7 @@ from dappled.decode.geometry import area as areas
 from dappled.decode.geometry.area import AreaError, PlannedArea
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
-from dappled.findings import Code, Subject, finding
+from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import Cause, Frame, Result, Shot, Tag, TimeSource, recording
 from dappled.products.maps import coverage, refly
 from dappled.products.maps.coverage import Coverage, FramesSeen
@@ -376,7 +376,13 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         doubts = (finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 15), rival=2),) if one is frames[15] else ()
         writer.tagged(replace(one.tag, frame_sha256=kept.sha256, pose=pose, doubts=doubts))
         state = "bad" if one is frames[0] else "unknown" if one is frames[2] else "good"
-        details = {"verdict": {"state": state, "reasons": ["motion blur"] * (state == "bad"), "facts": {}}}
+        details = {
+            "verdict": {
+                "state": state,
+                "reasons": [finding(Code.FRAME_DARK, FRAME, share=0.01).to_json()] * (state == "bad"),
+                "facts": {},
+            }
+        }
         writer.decoded(Result(index, "0" * 64, 1, 1, "fd", "predicted", 1.0, details=details))
     flight.close()
     ring = [[longitude, latitude] for latitude, longitude in square(60).rings[0]]

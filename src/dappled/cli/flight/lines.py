@@ -91,10 +91,10 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     yield f"  {frames}, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
     if found.judged:
         yield f"  {'judged':>13}: {', '.join(f'{count} {state}' for state, count in found.judged.items())}"
-        for state, texts in (("bad", found.bad), ("unknown", found.unknown)):
-            yield from (f"  {state:>13}: {text}" for text in texts[:_SHOWN])
-            if len(texts) > _SHOWN:
-                yield f"  {'':13}  and {len(texts) - _SHOWN} more {state} ones (--json names all)"
+        for state, why in (("bad", found.bad), ("unknown", found.unknown)):
+            yield from (f"  {state:>13}: {findings.told(one)}" for one in why[:_SHOWN])
+            if len(why) > _SHOWN:
+                yield f"  {'':13}  and {len(why) - _SHOWN} more {state} ones (--json names all)"
     if found.following:
         yield f"  {found.following:6d} of the failed still have their files in the camera: dappled flight pickup"
     if found.companions:

@@ -263,7 +263,10 @@ class Feed:
         for one in judged.get("last", ()):
             seen = self.frames.get(one["frame"])
             if seen is not None and seen.verdict is None:
-                seen.verdict = {"state": one["state"], "reasons": one["reasons"]}
+                seen.verdict = {
+                    "state": one["state"],
+                    "reasons": [told(why, FRAME) for why in from_rows(one["reasons"])],
+                }
                 self._count(one["frame"], seen)
                 self.hub.send(self.frame_event(one["frame"]))
 

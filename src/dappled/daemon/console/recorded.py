@@ -13,6 +13,7 @@ from dappled.daemon.stream.answers import SlicesDecoder
 from dappled.daemon.stream.wire import Message
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
+from dappled.findings import FRAME, told
 from dappled.flight import FlightFolder
 from dappled.flight.flight_report import FlightContents
 
@@ -77,7 +78,9 @@ class FlightFrames:
         for line in self._lines.values():
             if line.tag is not None and line.frame is not None:
                 judged = None if line.result is None else line.result.verdict
-                verdict = None if judged is None else {"state": judged[0], "reasons": judged[1]}
+                verdict = (
+                    None if judged is None else {"state": judged[0], "reasons": [told(one, FRAME) for one in judged[1]]}
+                )
                 shown.append(ShownFrame(self._named(wire.frame_header(line.tag, line.frame, None)), verdict))
         return shown
 

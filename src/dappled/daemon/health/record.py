@@ -62,7 +62,10 @@ class DecodingState:
     def judged(self) -> dict[str, Any]:
         """The verdicts, as JSON values."""
         counts = self.verdicts
-        last = [{"frame": frame, "state": state, "reasons": list(reasons)} for frame, state, reasons in counts.last]
+        last = [
+            {"frame": frame, "state": state, "reasons": findings.to_rows(reasons)}
+            for frame, state, reasons in counts.last
+        ]
         return {
             **{state: counts.by_state.get(state, 0) for state in STATES},
             "bad_in_a_row": counts.bad_in_a_row,

@@ -19,7 +19,7 @@ from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.tagging import PoseSource, Tagging
-from dappled.daemon.pipeline.verdicts import Judge, Verdict, VerdictCounts
+from dappled.daemon.pipeline.verdicts import Judge, Verdict, VerdictCounts, unjudged
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
 from dappled.drivers.camera import Camera
@@ -188,12 +188,12 @@ class Decoding:
             json.dumps(found.values(), allow_nan=False)  # what the ledger can't hold is no verdict
         except Exception as error:  # noqa: BLE001  # a decoded frame must not be lost with its verdict
             report(log, "verdict", error)
-            found = Verdict("unknown", (f"it could not be judged: {sentence(error)}",))
+            found = unjudged(f"it could not be judged: {sentence(error)}")
         return self.judge.count(tag.index, found, self._clock.monotonic_ns(), (tag.focal_length_mm, tag.f_number))
 
     def _unjudged(self, pending: PendingShot, why: str) -> None:
         if pending.verdict is None:
-            found = Verdict("unknown", (why,))
+            found = unjudged(why)
             pending.verdict = self.judge.count(pending.shot.index, found, self._clock.monotonic_ns())
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:

@@ -16,7 +16,7 @@ from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
 from dappled.errors import counted
-from dappled.findings import FRAME, Code, Finding, plain, told
+from dappled.findings import FRAME, Code, Finding, Level, Value, finding, plain, text, to_rows, told
 from dappled.flight import Tag
 
 VerdictState = Literal["good", "usable", "bad", "unknown"]
@@ -109,18 +109,17 @@ class FrameFacts:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """`reasons` are sentences with numbers: why the frame isn't good, the gravest first. `facts` are None where a frame
-    could not be decoded."""
+    """`reasons` say why the frame isn't good, the gravest first. `facts` are None where it could not be decoded."""
 
     state: VerdictState
-    reasons: tuple[str, ...] = ()
+    reasons: tuple[Finding, ...] = ()
     facts: FrameFacts | None = None
 
     def values(self) -> dict[str, Any]:
         """As ledger and stream have it."""
         facts = {} if self.facts is None else plain(self.facts)
         numbers = {name: _plain(one) for name, one in facts.items()}
-        return {"state": self.state, "reasons": list(self.reasons), "facts": numbers}
+        return {"state": self.state, "reasons": to_rows(self.reasons), "facts": numbers}
 
 
 def _plain(value: Any) -> Any:
@@ -135,58 +134,69 @@ def verdict(facts: FrameFacts, bounds: VerdictBounds) -> Verdict:
     found = [*_motion(facts, bounds), *_exposure(facts, bounds), *_focus(facts, bounds), *_rest(facts, bounds)]
     order: tuple[VerdictState, ...] = ("bad", "unknown", "usable")
     found.sort(key=lambda one: order.index(one[0]))
-    return Verdict(found[0][0] if found else "good", tuple(text for _, text in found), facts)
+    return Verdict(found[0][0] if found else "good", tuple(why for _, why in found), facts)
+
+
+def unjudged(why: str) -> Verdict:
+    """Of a frame that can't be judged."""
+    return Verdict("unknown", (finding(Code.FRAME_UNJUDGED, FRAME, why=why),))
 
 
 LensSettings = tuple[float | None, float | None]  # focal length (mm) and f-number; None where the file has none
-Findings = list[tuple[VerdictState, str]]
+Findings = list[tuple[VerdictState, Finding]]
+_LEVELS: Mapping[VerdictState, Level] = {"bad": Level.STOP, "usable": Level.CAUTION, "unknown": Level.NOTE}
+
+
+def _one(state: VerdictState, code: Code, **facts: Value) -> tuple[VerdictState, Finding]:
+    return state, Finding(code, FRAME, {name: _plain(one) for name, one in facts.items()}, _LEVELS[state])
 
 
 def _motion(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
     blur, sensor = facts.blur_view_px, facts.blur_px
     if blur is None or sensor is None:
-        return [("unknown", f"motion blur unknown: {facts.blur_unknown}")]
+        return [_one("unknown", Code.FRAME_BLUR_UNKNOWN, why=facts.blur_unknown)]
     state = _worse(blur, bounds.blur_usable_px, bounds.blur_bad_px)
-    over = f"over flat ground {facts.height_m or 0:.1f} m below ({facts.height_source})"
-    return [(state, f"motion blur {blur:.1f} view pixels ({sensor:.1f} on the sensor) {over}")] if state else []
+    below: dict[str, Value] = {"height_m": facts.height_m or 0.0, "height_by": facts.height_source}
+    return [_one(state, Code.FRAME_BLURRED, view_px=blur, sensor_px=sensor, **below)] if state else []
 
 
 def _exposure(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
     found: Findings = []
     if state := _worse(facts.clipped_share, bounds.clipped_usable, bounds.clipped_bad):
-        found.append((state, f"{facts.clipped_share:.1%} of the pixels are clipped"))
+        found.append(_one(state, Code.FRAME_CLIPPED, share=facts.clipped_share))
     if not facts.mean_share >= bounds.mean_least:
-        found.append(("bad", f"too dark: {facts.mean_share:.1%} of white on average"))
+        found.append(_one("bad", Code.FRAME_DARK, share=facts.mean_share))
     if facts.off_plan:
-        found.append(("usable", f"taken with {'; '.join(facts.off_plan)}"))
+        found.append(_one("usable", Code.FRAME_OFF_PLAN, taken="; ".join(facts.off_plan)))
     if facts.black_share > bounds.black_usable:
-        found.append(("usable", f"{facts.black_share:.0%} of the pixels are black"))
+        found.append(_one("usable", Code.FRAME_BLACK, share=facts.black_share))
     return found
 
 
 def _focus(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
     blur = facts.defocus_view_px
     if blur is None:
-        return [("unknown", f"focus unknown: {facts.focus_unknown}")]
+        return [_one("unknown", Code.FRAME_FOCUS_UNKNOWN, why=facts.focus_unknown)]
     state = _worse(blur, bounds.defocus_usable_px, bounds.defocus_bad_px)
-    return [(state, f"out of focus by {blur:.1f} view pixels against this flight's sharpest frames")] if state else []
+    return [_one(state, Code.FRAME_DEFOCUSED, view_px=blur)] if state else []
 
 
 def _rest(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
-    found: Findings = [("usable", told(one, FRAME)) for one in facts.doubts]
+    found: Findings = [("usable", one) for one in facts.doubts]
     seen, predicted = facts.carriers_found, facts.carriers_predicted
     if seen is not None and seen < bounds.carriers_share * predicted:
-        found.append(("usable", f"{seen} of {predicted} carriers seen where they are predicted"))
+        found.append(_one("usable", Code.CARRIERS_FEW, seen=seen, predicted=predicted))
     sigma_m = facts.position_sigma_m
     if facts.pose_source != "interpolated":
-        found.append(("unknown", f"position {'unknown' if facts.pose_source == 'none' else 'not interpolated'}"))
+        none = facts.pose_source == "none"
+        found.append(_one("unknown", Code.POSITION_UNKNOWN if none else Code.POSITION_NOT_INTERPOLATED))
     elif facts.gnss_fix is None or facts.gnss_fix < _FIX_3D:
-        word = "the receiver is silent" if facts.gnss_fix is None else "the receiver has no 3D fix"
-        found.append(("unknown", f"the position's accuracy is unknown: {word}"))
+        silent = facts.gnss_fix is None
+        found.append(_one("unknown", Code.POSITION_RECEIVER_SILENT if silent else Code.POSITION_NO_FIX))
     elif sigma_m is None or not math.isfinite(sigma_m):
-        found.append(("unknown", "the position's accuracy is unknown"))
+        found.append(_one("unknown", Code.POSITION_SIGMA_UNKNOWN))
     elif sigma_m > bounds.position_sigma_m:
-        found.append(("usable", f"position ±{sigma_m:.1f} m"))
+        found.append(_one("usable", Code.POSITION_COARSE, sigma_m=sigma_m))
     return found
 
 
@@ -205,8 +215,8 @@ class VerdictCounts:
 
     by_state: Mapping[VerdictState, int] = field(default_factory=dict)
     bad_in_a_row: int = 0
-    reason: str = ""
-    last: tuple[tuple[int, VerdictState, tuple[str, ...]], ...] = ()
+    reason: Finding | None = None
+    last: tuple[tuple[int, VerdictState, tuple[Finding, ...]], ...] = ()
     judged_ns: int = 0
     drift: str = ""
     drift_ns: int = 0
@@ -218,9 +228,9 @@ class VerdictCounts:
     def problem(self, now_ns: int) -> str | None:
         """A sentence for the pilot, where three or more frames were bad without a good or usable one between them. It
         lapses a minute after the last frame."""
-        if self.bad_in_a_row < BAD_IN_A_ROW or now_ns - self.judged_ns > _LAPSED_NS:
+        if self.bad_in_a_row < BAD_IN_A_ROW or now_ns - self.judged_ns > _LAPSED_NS or self.reason is None:
             return None
-        return f"{counted(self.bad_in_a_row, 'bad frame')} in a row, the first: {self.reason}"
+        return f"{counted(self.bad_in_a_row, 'bad frame')} in a row, the first: {text(self.reason)}"
 
 
 class Judge:
@@ -250,7 +260,7 @@ class Judge:
         """Judge a frame. `rates` are the body's at mid-exposure (rad/s), None where unknown; `carriers` were found, and
         are predicted."""
         if seen is None:
-            return Verdict("unknown", ("the decoder said nothing about its pixels",))
+            return unjudged("the decoder said nothing about its pixels")
         blur, blur_unknown = self._blur(tag, rates, seen)
         circle, focus_unknown = self._defocus((tag.focal_length_mm, tag.f_number), seen)
         height_m, height_source = _height(tag.pose)
@@ -287,7 +297,7 @@ class Judge:
         if found.state == "bad" and not late:
             in_a_row, reason = in_a_row + 1, reason if in_a_row else found.reasons[0]
         elif found.state != "unknown" and not late:
-            in_a_row, reason = 0, ""
+            in_a_row, reason = 0, None
         last = (*before.last, (frame, found.state, found.reasons))[-LAST:]
         judged_ns = before.judged_ns if late else now_ns
         drift, drift_ns = before.drift, before.drift_ns
