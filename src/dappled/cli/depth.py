@@ -27,10 +27,9 @@ from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs, terrain
 from dappled.products.maps.georeference import Progress, Survey
-from dappled.products.maps.terrain import TerrainModel
 from dappled.products.mounting import Mounting
 from dappled.products.opened import OpenedLightField, OpenError
-from dappled.products.survey import flight_sweep, frame_terrain
+from dappled.products.survey import frame_terrain
 from dappled.products.survey.frame_depths import FrameDepths
 
 _POINTS = (".ply", ".las", ".laz")
@@ -133,8 +132,8 @@ def _together(arguments: argparse.Namespace, made: Survey, progress: Progress) -
     """Heights of a flight where all of its frames agree."""
     for _, why in made.left:
         print(why, file=sys.stderr)
-    surface = flight_sweep.surface(made, progress, cell_m=arguments.cell)
-    found = TerrainModel(surface, flight_sweep.difference(made, surface))
+    found = terrain.of(made, progress, cell_m=arguments.cell)
+    surface = found.surface
     for path in arguments.output:
         if path.suffix.lower() in _RASTERS:
             terrain.write_raster(made, found, path)
