@@ -231,7 +231,7 @@ def test_the_index_names_flights_of_its_own_folder_only(flight: Path, tmp_path: 
 def test_a_manifest_names_outputs_of_its_own_folder_only(tmp_path: Path) -> None:
     (tmp_path / "victim.txt").write_bytes(SECRET)
     with Manifest(tmp_path / "batch") as manifest:
-        outputs = (BatchOutput("../victim.txt", len(SECRET), "ab"),)
+        outputs = (BatchOutput("../victim.txt", len(SECRET), "ab", "npz"),)
         manifest.add(Done("key", "flight", "frame", outputs, None, 0.0, 0.0, 0.0))
         with pytest.raises(OutsideError, match=r"manifest.jsonl names '../victim.txt'"):
             manifest.holds("key")

@@ -91,9 +91,7 @@ def test_frames_are_missed_whatever_a_fact_says(sealed: Path, key: SealKey) -> N
         forger.fact("offloaded", {"files": 2, "destination": "/elsewhere"})
     for path in (sealed / "frames").glob("*.cr2"):
         path.unlink()
-    problems = check(sealed, key).problems
-    assert sum("the file is missing" in text for text in problems) == 2
-    assert any("a fact that dappled didn't write" in text for text in problems)
+    assert sum("the file is missing" in text for text in check(sealed, key).problems) == 2
 
 
 @pytest.mark.parametrize("count", [10**6, 10**12])

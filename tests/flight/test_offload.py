@@ -37,7 +37,6 @@ from dappled.flight import (
 from dappled.flight.checks import flight_check as checks
 from dappled.flight.checks.flight_check import check
 from dappled.flight.trees import Tree
-from tests.flight.checks.test_chain_check import without_chain
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, held, mavlink_2, request
 
@@ -384,20 +383,6 @@ def test_a_user_who_may_only_read_copies_without_the_lock(
     assert go(closed, tmp_path / "disk").copied == 7
     with pytest.raises(FlightError, match="cannot make the lock"):
         go(closed, tmp_path / "disk", prune=True)
-
-
-def test_a_flight_pruned_by_an_earlier_version_is_not_copied_again(closed: Path, tmp_path: Path) -> None:
-    without_chain(layout.open_folder(closed))
-    with closing(sqlite3.connect(closed / "flight.sqlite")) as db, db:
-        fact = json.dumps({"destination": "/media/disk", "utc_ns": START_UTC_NS, "files": 2})
-        db.execute("INSERT INTO facts VALUES ('offloaded', ?)", (fact,))
-    for name in frames(closed):
-        os.unlink(closed / "frames" / name)
-    report = check(closed)
-    assert report.problems == ()
-    assert any("offloaded to /media/disk" in note for note in report.notes)
-    with pytest.raises(FlightError, match="pruned already"):
-        go(closed, tmp_path / "disk")
 
 
 def test_a_flight_that_was_never_closed_is_refused(flight: Recording, tmp_path: Path) -> None:

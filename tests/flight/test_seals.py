@@ -28,7 +28,7 @@ from dappled.flight import (
     seals,
 )
 from dappled.flight.checks.flight_check import check
-from tests.flight.checks.test_chain_check import attacked, fly, without_chain
+from tests.flight.checks.test_chain_check import attacked, fly
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import flip
 
@@ -295,19 +295,6 @@ def test_an_open_flight_is_not_sealed(flight: Recording) -> None:
     seals.seal(flight.folder, LATER, "geotag")
     assert not flight.folder.seals.exists()
     assert check(flight.folder.path).vouched == "not sealed"
-
-
-def test_a_flight_without_a_chain_is_sealed_by_later_work(sealed: FlightFolder) -> None:
-    sealed.seals.unlink()
-    without_chain(sealed)
-    assert check(sealed.path).vouched == "no chain"
-    with seals.reopened(sealed, LATER, "geotag"):
-        pass
-    report = check(sealed.path)
-    assert report.problems == ()
-    assert report.vouched == "not signed"
-    with LedgerReader.open(sealed.ledger) as reader:
-        assert seals.announced(reader.facts()) == (1, frozenset())
 
 
 def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from dappled.flight.records import ShotState
 
 FILE_NAME = "index.sqlite"
 _APPLICATION_ID = 0x44505049  # "DPPI"
-_VERSION = 2
+_VERSION = 1
 _SCHEMA = f"""
 BEGIN IMMEDIATE;
 PRAGMA application_id={_APPLICATION_ID};
@@ -36,15 +36,9 @@ CREATE TABLE flights (
 CREATE TABLE images (
     idx INTEGER PRIMARY KEY, flight TEXT NOT NULL REFERENCES flights (name), frame TEXT, state TEXT NOT NULL
 ) STRICT;
-COMMIT;
-"""
-# Tables that an index of this version may lack. The shots whose outcomes were reported stand in the first until their
-# flight is sealed; the others stand in the second from then on. What is in an index without the tables was reported.
-_REPORTS = """
-BEGIN IMMEDIATE;
+-- The shots whose outcomes were reported stand in the first until their flight is sealed, the others in the second then
 CREATE TABLE reported (idx INTEGER PRIMARY KEY) STRICT;
 CREATE TABLE unreported (idx INTEGER PRIMARY KEY, counted INTEGER NOT NULL DEFAULT 0) STRICT;
-INSERT INTO reported SELECT idx FROM images WHERE flight IN (SELECT name FROM flights WHERE NOT sealed);
 COMMIT;
 """
 
@@ -78,8 +72,6 @@ class ImageIndex(Database):
         self._db.execute("PRAGMA synchronous=NORMAL")  # the ledgers are the truth: a lost row is found again there
         if empty:
             self._db.executescript(_SCHEMA)
-        if not self._db.execute("SELECT 1 FROM sqlite_master WHERE name = 'reported'").fetchone():
-            self._db.executescript(_REPORTS)
 
     def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
         if getattr(error, "sqlite_errorname", "") == "SQLITE_CANTOPEN":

@@ -26,7 +26,6 @@ from dappled.flight.logs import TelemetryLog
 from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag, TimeSource
 from dappled.flight.tables import (
     APPLICATION_ID,
-    CHAIN,
     DEFINITIONS,
     KEYS,
     SCHEMA,
@@ -218,7 +217,7 @@ class LedgerReader(Database):
         return [(row[: len(key)], row[len(key) :]) for row in rows]
 
     def last_link(self) -> ChainLink | None:
-        """The head of the chain. Raises FlightError in a ledger that was written before there were chains."""
+        """The head of the chain. Raises FlightError."""
         rows = self._rows("SELECT number, subject, key, sha256, link FROM chain ORDER BY number DESC LIMIT 1")
         return ChainLink(*rows[0]) if rows else None
 
@@ -443,27 +442,21 @@ class Ledger(LedgerReader):
         return link
 
     def _set_up(self) -> None:
-        """Make the tables of a new ledger. A ledger that was written before there were chains gets one from here on: it
-        covers its rows as they are now, and the fact `chain` tells how many these were."""
+        """Make the tables of a new ledger. Raises FlightError for one that has lost its chain."""
         with self._transaction():
             found = {row[0] for row in self._db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
             if "chain" in found:
                 return
-            for statement in (CHAIN if found else SCHEMA).split(";\n"):
+            if found:
+                raise FlightError(f"the chain was removed from the ledger {self.path}: nothing is added to it")
+            for statement in SCHEMA.split(";\n"):
                 self._db.execute(statement)
-            if not found:
-                self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
-                self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+            self._db.execute(f"PRAGMA application_id={APPLICATION_ID}")
+            self._db.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
             last = None
             for row in self._db.execute("SELECT name, type, tbl_name, sql FROM sqlite_master ORDER BY name").fetchall():
                 last = self._link(last, DEFINITIONS, row[:1], chain.row_digest(row))
-            rows_before = 0
-            for table in KEYS if found else ():
-                if table in found:
-                    for key, row in self.keyed_rows(table):
-                        last = self._link(last, table, key, chain.row_digest(row))
-                        rows_before += 1
-            self._fact("chain", {"flight": self.path.absolute().parent.name, "rows_before": rows_before})
+            self._fact("chain", {"flight": self.path.absolute().parent.name})
 
 
 def _shot_row(row: Sequence[Any]) -> ShotRow:

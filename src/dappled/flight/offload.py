@@ -30,7 +30,6 @@ from dappled.flight.seal_key import SealKey
 from dappled.flight.trees import FileIdentity, Tree
 
 PRUNES = "offload --prune"
-FACT = "offloaded"  # of flights that a version before 1.0 pruned
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,8 +353,6 @@ def _refuse_unready(folder: FlightFolder) -> None:
         raise FlightError(
             f"{folder.path} is still being recorded, or was never closed: stop the daemon, or start it once to close it"
         )
-    if FACT in facts:
-        raise FlightError(f"{folder.path} was offloaded to {facts[FACT]['destination']} and pruned already")
 
 
 def _finish_seal(folder: FlightFolder, clock: Clock) -> None:

@@ -99,7 +99,7 @@ def note(
     folder: FlightFolder, there: Path, sure: Mapping[str, Proved], elsewhere: Mapping[str, Proved], clock: Clock
 ) -> None:
     """Write down which files will be removed (`sure`), and which were never here (`elsewhere`), durably: first the
-    ledger's event; an older record has one of its own. Raises FlightError."""
+    ledger's event. Raises FlightError."""
     now = clock.utc_ns()
     rows = removed(folder) | {
         name: Removed(name, one.identity.size, one.sha256, str(there), now)

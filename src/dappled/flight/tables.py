@@ -7,16 +7,7 @@ from dappled.flight.records import ShotState
 APPLICATION_ID = 0x4450504C  # "DPPL"
 SCHEMA_VERSION = 1
 
-CHAIN = """
-CREATE TABLE chain (
-    number INTEGER PRIMARY KEY,        -- from 1, without gaps
-    subject TEXT NOT NULL,             -- a table, or a file that is appended to
-    key TEXT NOT NULL,                 -- JSON array: the row's primary key, or the first byte and the end of a block
-    sha256 TEXT NOT NULL,              -- of the row as JSON array of its columns, or of the block's bytes
-    link TEXT NOT NULL                 -- SHA-256 of the link before, number, subject, key, sha256, a line break between
-) STRICT;
-"""
-SCHEMA = f"""
+SCHEMA = """
 CREATE TABLE shots (
     idx INTEGER PRIMARY KEY,           -- the image index, going on over flights
     source TEXT NOT NULL, kind TEXT NOT NULL, sequence INTEGER,
@@ -49,7 +40,14 @@ CREATE TABLE events (
     number INTEGER PRIMARY KEY, utc_ns INTEGER NOT NULL, kind TEXT NOT NULL, idx INTEGER, text TEXT NOT NULL
 ) STRICT;
 CREATE TABLE facts (key TEXT PRIMARY KEY, value TEXT NOT NULL) STRICT;
-{CHAIN}"""
+CREATE TABLE chain (
+    number INTEGER PRIMARY KEY,        -- from 1, without gaps
+    subject TEXT NOT NULL,             -- a table, or a file that is appended to
+    key TEXT NOT NULL,                 -- JSON array: the row's primary key, or the first byte and the end of a block
+    sha256 TEXT NOT NULL,              -- of the row as JSON array of its columns, or of the block's bytes
+    link TEXT NOT NULL                 -- SHA-256 of the link before, number, subject, key, sha256, a line break between
+) STRICT;
+"""
 KEYS: dict[str, tuple[str, ...]] = {  # the primary key of each table that the chain covers
     "shots": ("idx",),
     "frames": ("idx",),

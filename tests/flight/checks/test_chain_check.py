@@ -11,8 +11,9 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Recording, Result, Stray
+from dappled.flight import FlightFolder, Frame, Ledger, Recording, Result, Stray
 from dappled.flight.checks.flight_check import check
+from dappled.flight.errors import FlightError
 from dappled.flight.tables import KEYS
 from tests.flight.makers import deliver, held, mavlink_2, request, tag
 
@@ -174,31 +175,10 @@ def test_rows_of_a_transaction_that_failed_leave_no_link(tmp_path: Path) -> None
         assert ledger.last_link() != before
 
 
-def without_chain(folder: FlightFolder) -> None:
-    """As an earlier version left it."""
-    folder.seals.unlink(missing_ok=True)
-    with attacked(folder) as db:
-        db.execute("DROP TABLE chain")
-        db.execute("DELETE FROM facts WHERE key IN ('chain', 'seals')")
-
-
-def test_a_flight_without_a_chain_says_what_is_not_vouched_for(recorded: FlightFolder) -> None:
-    without_chain(recorded)
-    report = check(recorded.path)
-    assert report.problems == ()
-    assert any("before ledgers had a chain" in note for note in report.notes)
-    assert (report.vouched, report.verdict) == ("no chain", "consistent; recorded without seals")
-
-
-def test_later_work_on_a_flight_without_a_chain_begins_one(recorded: FlightFolder) -> None:
-    without_chain(recorded)
-    with Ledger(recorded.ledger, RecordedClock(78)) as ledger:
-        ledger.add_event("tagged late", "as told")
-    with LedgerReader.open(recorded.ledger) as reader:
-        assert reader.facts()["chain"]["rows_before"] > 20
-    report = check(recorded.path)
-    assert report.problems == ()
-    assert any("rows were there before" in note for note in report.notes)
+def test_a_flight_that_lost_its_chain_is_found_out_and_gets_no_new_one(recorded: FlightFolder) -> None:
     with attacked(recorded) as db:
-        db.execute("UPDATE shots SET sequence = 8 WHERE idx = 0")
-    assert "the row of shots 0 was changed since dappled wrote it" in check(recorded.path).problems
+        db.execute("DROP TABLE chain")
+        db.execute("DELETE FROM facts WHERE key = 'chain'")
+    assert "the chain was removed from the ledger" in check(recorded.path).problems
+    with pytest.raises(FlightError, match="the chain was removed from the ledger"):
+        Ledger(recorded.ledger, RecordedClock(78))

@@ -309,7 +309,9 @@ def test_two_batches_cant_share_a_folder(tmp_path: Path) -> None:
 
 def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
     with Manifest(tmp_path) as manifest:
-        manifest.add(Done("a", "flight", "frames/0.dng", (batch.BatchOutput("x", 3, "00"),), None, 1.0, 1.0, 2.0))
+        manifest.add(
+            Done("a", "flight", "frames/0.dng", (batch.BatchOutput("x", 3, "00", "npz"),), None, 1.0, 1.0, 2.0)
+        )
     path = tmp_path / "manifest.jsonl"
     path.write_bytes(path.read_bytes() + b'{"key": "b", "fli')
     with Manifest(tmp_path) as manifest:

@@ -72,7 +72,7 @@ def _camera(camera: Mapping[str, Any]) -> Check:
 
 
 def _body(health: Mapping[str, Any]) -> list[Check]:
-    """The body's settings against the plan; none while no camera is ready, and in a record of an earlier version."""
+    """The body's settings against the plan; none while no camera is ready."""
     body = health.get("body")
     if body is None:
         return []

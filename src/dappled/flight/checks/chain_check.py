@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
-from dappled.errors import counted
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column
 from dappled.flight.errors import FlightError
@@ -16,22 +14,18 @@ from dappled.flight.tables import CHANGED_LATER, DEFINITIONS, KEYS
 
 @dataclass(frozen=True, slots=True)
 class ChainFindings:
-    """What the chain shows. `links` are as they are stored, by number; None in a flight without a chain. `begun` counts
-    the rows that were there before the chain."""
+    """What the chain shows. `links` are as they are stored, by number."""
 
-    links: dict[int, ChainLink] | None
+    links: dict[int, ChainLink]
     problems: tuple[str, ...]
-    notes: tuple[str, ...] = ()
-    begun: int = 0
 
 
 def compare(stored: StoredRows) -> ChainFindings:
     """Follow the chain, and compare each row of each table with its last link. Raises FlightError where the chain
     itself can't be read."""
     definitions = stored.definitions()
-    begun = _begun(stored)
     if "chain" not in {row[0] for row in definitions}:
-        return ChainFindings(None, ("the chain was removed from the ledger",) if begun is not None else ())
+        return ChainFindings({}, ("the chain was removed from the ledger",))
     links = [ChainLink(*row) for row in stored.links()]  # type: ignore[arg-type]  # a damaged one has other types; it won't match
     problems = [*_broken(links)]
     latest: dict[str, dict[str, str]] = {}
@@ -46,21 +40,7 @@ def compare(stored: StoredRows) -> ChainFindings:
             problems += _differences(f"row of {table}", latest.get(table, {}), stored.keyed_rows(table))
         except FlightError as error:
             problems.append(f"the rows of {table} can't be compared with the chain: {error}")
-    notes = []
-    if begun:
-        notes.append(
-            f"the chain was begun by later work: {counted(begun, 'row')} were there before, and are vouched for since"
-        )
-    return ChainFindings({link.number: link for link in links}, tuple(problems), tuple(notes), begun or 0)
-
-
-def _begun(stored: StoredRows) -> int | None:
-    """How many rows were there when the chain was begun; None where the ledger doesn't tell of a chain."""
-    try:
-        facts = {key: value for (key,), (_, value) in stored.keyed_rows("facts")}
-        return int(json.loads(str(facts["chain"]))["rows_before"])
-    except (FlightError, ValueError, TypeError, KeyError, RecursionError):
-        return None
+    return ChainFindings({link.number: link for link in links}, tuple(problems))
 
 
 def _broken(links: Sequence[ChainLink]) -> Iterator[str]:

@@ -25,11 +25,6 @@ from dappled.flight.pruning import Removed
 from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import StoredRows
 
-_WITHOUT_CHAIN = (
-    "the flight was recorded before ledgers had a chain: a change of frames, telemetry, poses, tags, flight.toml or "
-    "inputs would be seen, a change of shots, times, events, facts or results would not"
-)
-
 
 @dataclass(frozen=True, slots=True)
 class CheckReport:
@@ -80,10 +75,9 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
             raise FlightError(place.rollback)
         before = LedgerBytes.of(folder)
         chained = _chained(folder, problems)
-        notes += [_WITHOUT_CHAIN] if chained.links is None else chained.notes
         with _examining("the flight", problems), LedgerReader.open(folder.ledger) as ledger:
             closed, recorded_as = "closed_utc_ns" in ledger.facts(), seals.of_flight(ledger.facts())
-            _compare(folder, ledger, counts, problems, notes, chain=chained)
+            _compare(folder, ledger, counts, problems, notes)
             with _examining("the telemetry", problems):
                 problems += telemetry_check.compare(folder.telemetry, chained.links)
             with _examining("the seals", problems):
@@ -110,8 +104,6 @@ def _compare(
     counts: _Counts,
     problems: list[str],
     notes: list[str],
-    *,
-    chain: ChainFindings,
 ) -> None:
     """Compare files, journal and telemetry with the ledger. Raises FlightError where that can't be read."""
     facts = ledger.facts()
@@ -120,17 +112,11 @@ def _compare(
         (notes if layout.is_locked(folder.path.parent) else problems).append(
             "the flight is still being recorded, or was never closed: the next `dappled run` repairs it"
         )
-    gone = facts.get("offloaded")  # of a version that had no chain: it excuses no missing file in a flight with one
-    if gone is not None and chain.links is not None and not chain.begun:
-        gone = None
-        problems.append("the ledger has a fact that dappled didn't write: offloaded")
-    if gone is not None:
-        notes.append(f"its {gone['files']} frames were offloaded to {gone['destination']}, and removed here")
     with _examining("the offloaded files", problems):
         counts.elsewhere = _elsewhere(folder, ledger)
         notes += _where(counts.elsewhere)
     with _examining("the files", problems):
-        for size, problem in _files(folder, ledger, counts.elsewhere, pruned=gone is not None):
+        for size, problem in _files(folder, ledger, counts.elsewhere):
             counts.files, counts.size = counts.files + 1, counts.size + size
             problems += [problem] if problem else []
         problems += _names(folder, ledger, closed)
@@ -196,18 +182,13 @@ def _where(elsewhere: Mapping[str, Removed]) -> Iterator[str]:
         )
 
 
-def _files(
-    folder: FlightFolder, ledger: LedgerReader, elsewhere: Collection[str], *, pruned: bool
-) -> Iterator[tuple[int, str | None]]:
-    """(bytes read, problem) for every file that the ledger acknowledges and that was not offloaded `elsewhere`; in a
-    flight that an early version pruned, all may be gone."""
+def _files(folder: FlightFolder, ledger: LedgerReader, elsewhere: Collection[str]) -> Iterator[tuple[int, str | None]]:
+    """(bytes read, problem) for every file that the ledger acknowledges and that was not offloaded `elsewhere`."""
     for row in ledger.files():
         if row.name in elsewhere:
             continue
         try:
             path = folder.file(row.name)
-            if pruned and not path.exists():
-                continue
             size = path.stat().st_size
             if size != row.size:
                 yield size, f"{row.name} has {size} bytes, the ledger says {row.size}"

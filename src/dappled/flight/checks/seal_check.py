@@ -16,7 +16,7 @@ from dappled.flight.ledger import LedgerReader
 from dappled.flight.seal_key import SealKey
 from dappled.flight.seals import Seal
 
-Vouched = Literal["signed", "not verified", "not signed", "not sealed", "no chain"]
+Vouched = Literal["signed", "not verified", "not signed", "not sealed"]
 _NOT_SIGNED = "not signed: someone who edits on purpose can make the seals anew"
 
 
@@ -53,14 +53,14 @@ class SealFindings:
 def compare(
     folder: FlightFolder,
     ledger: LedgerReader,
-    links: Mapping[int, ChainLink] | None,
+    links: Mapping[int, ChainLink],
     before: LedgerBytes,
     key: SealKey | None,
 ) -> SealFindings:
-    """Compare seals, chain and files. `links` is the chain, None without one; `key` verifies signatures. Raises
+    """Compare seals, chain and files. `links` is the chain; `key` verifies signatures. Raises
     FlightError and OSError."""
     file, facts = seals.read(folder), ledger.facts()
-    problems = [*file.problems, *_numbers(file.seals, links or {}, facts), *_heads(file.seals, links or {}, facts)]
+    problems = [*file.problems, *_numbers(file.seals, links, facts), *_heads(file.seals, links, facts)]
     problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
     notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
     notes += [
@@ -72,10 +72,8 @@ def compare(
     notes += [event.text for event in ledger.events() if event.kind == seals.CHANGED]
     last = file.last
     if last is None:
-        vouched: Vouched = "no chain" if links is None else "not sealed"
-        verdict = "recorded without seals" if links is None else "not sealed yet"
-        return SealFindings(vouched, f"consistent; {verdict}", tuple(problems), tuple(notes))
-    unsealed = max(0, len(links or {}) - last.links)
+        return SealFindings("not sealed", "consistent; not sealed yet", tuple(problems), tuple(notes))
+    unsealed = max(0, len(links) - last.links)
     if unsealed:
         notes.append(
             f"the flight was opened again after seal {last.seal} ({last.why}): {counted(unsealed, 'link')} "

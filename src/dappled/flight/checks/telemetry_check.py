@@ -15,9 +15,9 @@ from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.tables import TELEMETRY
 
 
-def compare(path: Path, links: Mapping[int, ChainLink] | None) -> Iterator[str]:
+def compare(path: Path, links: Mapping[int, ChainLink]) -> Iterator[str]:
     """A sentence for each block of the log that differs from its link. Raises FlightError when it can't be read."""
-    blocks = [link for link in (links or {}).values() if link.subject == TELEMETRY]
+    blocks = [link for link in links.values() if link.subject == TELEMETRY]
     if not blocks:
         return
     try:

@@ -79,7 +79,7 @@ class BatchOutput:
     name: str
     size: int
     sha256: str
-    kind: str = ""  # of a manifest that an older version wrote
+    kind: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -398,7 +398,7 @@ class Manifest:
         done = self.done.get(key)
         if done is None or done.lacks(kind):
             return False
-        return all(self._there(one) for one in done.outputs if one.kind in (kind, ""))
+        return all(self._there(one) for one in done.outputs if one.kind == kind)
 
     def _there(self, one: BatchOutput) -> bool:
         """Jobs with other options write under the same names: what the last one wrote is there."""
