@@ -134,8 +134,8 @@ class VirtualClock:
         self._turns += 1
         if self._turns > _TURNS:
             return self._give_up(f"{_TURNS} turns at one moment")
-        paused = self._paused
-        if not (ready := [one for one in paused if one.until_ns <= self._now_ns or one.holds()]):
+        paused, now_ns = self._paused, self._now_ns
+        if not (ready := [one for one in paused if one.until_ns <= now_ns or one.holds()]):
             earliest_ns = min([one.until_ns for one in paused], default=inf)
             if earliest_ns == inf:
                 return self._give_up("all wait without end")

@@ -364,7 +364,7 @@ class Service:
         return self._after is not None and self._after.next is not None
 
     def _tick(self) -> None:
-        self.component.tick(healthy=self.healthy())
+        self.component.tick(healthy=self.healthy)
 
     def _follow_body(self) -> None:
         """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
@@ -481,7 +481,8 @@ class PeriodicTask:
         else:
             self.problem = ""
             self._due_ns = now_ns + self._every_ns
-            self._new.among([])
+            if self._new:
+                self._new.among([])
 
 
 def _close(recording: Recording) -> None:

@@ -155,7 +155,7 @@ class Rig:
     def tick(self, seconds: float = 0.0) -> list[str]:
         self.clock.advance(seconds)
         self.sent.clear()
-        self.component.tick(healthy=self.well)
+        self.component.tick(healthy=lambda: self.well)
         return [m.get_type() for m in self.sent]
 
 

@@ -403,14 +403,14 @@ class Component:
         """Whether a ground station has connected that missed earlier lines; True once."""
         return self._stations.new_one(self._clock.monotonic_ns())
 
-    def tick(self, *, healthy: bool = True) -> None:
+    def tick(self, *, healthy: Callable[[], bool] = lambda: True) -> None:
         """Send what is due by now: time requests, stream requests, status, periodic messages, old images, outcomes of
-        earlier flights; and, while the daemon is `healthy`, the heartbeat."""
+        earlier flights; and, where the daemon is `healthy`, the heartbeat."""
         now_ns = self._clock.monotonic_ns()
         if not self._identity.decide(now_ns):
             return
         self._links.system_id = self._identity.system_id
-        if now_ns >= self._heartbeat_due_ns and healthy:
+        if now_ns >= self._heartbeat_due_ns and healthy():
             on_time_ns = self._heartbeat_due_ns + HEARTBEAT_NS
             self._heartbeat_due_ns = on_time_ns if on_time_ns > now_ns else now_ns + HEARTBEAT_NS
             state = mavlink.MAV_STATE_CRITICAL if self._model.troubled() else mavlink.MAV_STATE_ACTIVE

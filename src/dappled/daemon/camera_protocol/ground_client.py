@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -67,7 +67,7 @@ class GroundClient:
             transport=transport,
         )
         self._changed = threading.Condition()
-        self._heard: deque[MavlinkMessage] = deque(maxlen=_KEPT)
+        self._listeners: list[deque[MavlinkMessage]] = []
         self._camera: tuple[int, int] | None = None
         self._heart = Loop("ground heartbeat", self._beat, clock=clock)
         self._sequence = clock.utc_ns() // 10**8 % 2**23  # differs from a run just before; exact as a float
@@ -193,7 +193,7 @@ class GroundClient:
         return message.target_system in (0, own.system_id) and message.target_component in (0, own.component_id)
 
     def _listening(self) -> _Listening:
-        return _Listening(self._changed, self._heard, self._clock)
+        return _Listening(self._changed, self._listeners, self._clock)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
         """See `PacketLog`: a ground client keeps no log."""
@@ -208,7 +208,8 @@ class GroundClient:
             if message.get_type() == "HEARTBEAT" and message.type == mavlink.MAV_TYPE_CAMERA and self._camera is None:
                 self._camera = sender
             if sender == self._camera:
-                self._heard.append(message)
+                for heard in self._listeners:
+                    heard.append(message)
             self._changed.notify_all()
 
     def _beat(self) -> None:
@@ -234,23 +235,23 @@ def _refusal(
 class _Listening:
     """A context in which no message is missed: it searches those that arrived since `with`."""
 
-    def __init__(self, changed: threading.Condition, heard: deque[MavlinkMessage], clock: Clock) -> None:
-        self._changed, self._clock = changed, clock
-        self._heard = heard
+    def __init__(self, changed: threading.Condition, listeners: list[deque[MavlinkMessage]], clock: Clock) -> None:
+        self._changed, self._listeners, self._clock = changed, listeners, clock
+        self._heard: deque[MavlinkMessage] = deque(maxlen=_KEPT)
 
     def __enter__(self) -> Callable[[Callable[[MavlinkMessage], bool], float], MavlinkMessage | None]:
         with self._changed:
-            self._known = {id(message) for message in self._heard}
-            self._keep = list(self._heard)  # so that no id is used twice
+            self._listeners.append(self._heard)
         return self._wait
 
     def __exit__(self, *_: object) -> None:
-        self._keep.clear()
+        with self._changed:
+            self._listeners[:] = [one for one in self._listeners if one is not self._heard]
 
     def _wait(self, wanted: Callable[[MavlinkMessage], bool], timeout_s: float) -> MavlinkMessage | None:
-        def newer() -> Iterator[MavlinkMessage]:
-            return (m for m in self._heard if id(m) not in self._known and wanted(m))
+        def found() -> MavlinkMessage | None:
+            return next((message for message in self._heard if wanted(message)), None)
 
         with self._changed:
-            self._clock.wait_for(self._changed, lambda: next(newer(), None) is not None, timeout_s)
-            return next(newer(), None)
+            self._clock.wait_for(self._changed, lambda: found() is not None, timeout_s)
+            return found()

@@ -295,6 +295,8 @@ class TriggerNumbers:
 
     def lost(self, now_ns: int, *, at_once: bool = False) -> list[Finding]:
         """Those that have not come in time, each told once; `at_once`: those that are waited for too."""
+        if not (at_once or self._missing or self._jumps or self._over or self._unnumbered):
+            return []
         with self._lock:
             found, self._over = [*self._over, *self._take(now_ns, at_once=at_once)], []
         return found
