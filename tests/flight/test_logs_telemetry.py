@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.findings import Finding
+from dappled.findings import Code, Finding
 from dappled.flight import FlightError, log_reading
 from dappled.flight.log_reading import split
 from dappled.flight.logs import BLOCK_BYTES, TelemetryLog, packet_length
@@ -29,7 +29,7 @@ def test_what_is_logged_is_read(tmp_path_factory: pytest.TempPathFactory, record
     log = TelemetryLog(path)
     assert [log.append(*record) for record in records] == list(range(len(records)))
     summary = log.close()
-    problems: list[str] = []
+    problems: list[Finding] = []
     assert list(log_reading.read_telemetry(path, problems.append)) == [(n, *record) for n, record in enumerate(records)]
     assert problems == []
     assert summary == log_reading.summarise(path)
@@ -123,7 +123,7 @@ def test_a_full_disk_uses_up_no_number(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.undo()
     assert log.append(3, mavlink_1(b"c")) == 1
     summary = log.close()
-    problems: list[str] = []
+    problems: list[Finding] = []
     assert [stamp for _, stamp, _ in log_reading.read_telemetry(log.path, problems.append)] == [1, 3]
     assert problems == []
     assert log_reading.summarise(log.path) == summary
@@ -178,10 +178,10 @@ def test_faults_of_the_file_are_told(tmp_path: Path) -> None:
 
 
 def test_a_real_flight_reads_but_for_its_torn_end(shared_data: Path) -> None:
-    problems: list[str] = []
+    problems: list[Finding] = []
     path = shared_data / "telemetry" / "dronekit-flight.tlog"
     stamps = [stamp for _, stamp, _ in log_reading.read_telemetry(path, problems.append)]
-    assert problems == [f"{path}: 19 bytes at the end are not telemetry and were skipped"]
+    assert [(one.code, one.facts["bytes"]) for one in problems] == [(Code.LOG_BYTES_SKIPPED, 19)]
     assert len(stamps) > 10_000
     assert round((stamps[-1] - stamps[0]) / 1e6) == 1377
 

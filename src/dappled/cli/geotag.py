@@ -198,8 +198,8 @@ def _marks_json(marked: Marked) -> dict[str, Any]:
     return {
         "placed": sorted(marked.marks),
         "lost": list(marked.lost),
-        "extra": list(marked.extra),
-        "doubts": list(marked.doubts),
+        "extra": to_rows(marked.extra),
+        "doubts": to_rows(marked.doubts),
         "offset_s": marked.offset_s,
         "spread_s": marked.spread_s,
         "shift_m": None if marked.shift_m is None else dict(zip(("north", "east", "up"), marked.shift_m, strict=True)),

@@ -15,7 +15,7 @@ from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored, parse_json, read_log
 from dappled.errors import counted
-from dappled.findings import Code, Finding, Subject, finding, text
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
 from dappled.flight.records import Cause, Shot
@@ -80,17 +80,14 @@ def _parse(line: bytes) -> Shot | None:
     return shot if whole and shot.index >= 0 and (sequence is None or type(sequence) is int) else None
 
 
-def read_telemetry(path: Path, report: Callable[[str], object] = lambda _: None) -> Iterator[tuple[int, int, bytes]]:
+def read_telemetry(
+    path: Path, report: Callable[[Finding], object] = lambda _: None
+) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet) of a .tlog, in the file's order.
 
     Bytes that are not a packet are skipped up to the next place where two records follow each other, or one ends the
-    file. `report` gets a sentence for each such gap. Raises FlightError when the file can't be read.
+    file. `report` gets each such gap. Raises FlightError when the file can't be read.
     """
-    return read_records(path, lambda gap: report(f"{path}: {text(gap)}"))
-
-
-def read_records(path: Path, report: Callable[[Finding], object]) -> Iterator[tuple[int, int, bytes]]:
-    """See `read_telemetry`; `report` gets a finding for each gap."""
     try:
         with open(path, "rb", opener=durable.without_waiting) as file:
             size = check_stored(file.fileno())
@@ -125,7 +122,7 @@ def split(
         at = end
 
 
-def summarise(path: Path, report: Callable[[str], object] = lambda _: None) -> TelemetrySummary:
+def summarise(path: Path, report: Callable[[Finding], object] = lambda _: None) -> TelemetrySummary:
     """Read a whole log and summarise it. Raises FlightError."""
     packets = sum(1 for _ in read_telemetry(path, report))
     try:

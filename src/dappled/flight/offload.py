@@ -16,6 +16,7 @@ from pathlib import Path
 
 from dappled import durable
 from dappled.clock import Clock
+from dappled.findings import Code, Finding, Subject, finding, told
 from dappled.flight import later_copy, layout, ledger_copies, places, pruning, read_back, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.errors import FlightError, disk_error
@@ -36,7 +37,7 @@ PRUNES = "offload --prune"
 class Offloaded:
     """What was done. `copied` and `there_already` count files, `size` is their total in bytes; `pruned` counts the
     files that were removed here, `brought_home` the rows that work at the copy had added to its ledger and that are now
-    here too. `file_system` is that of the copy, `read_back` how its files were read, and `doubts` are sentences: what
+    here too. `file_system` is that of the copy, `read_back` how its files were read, and `doubts` are what
     this copy can't prove."""
 
     flight: str
@@ -48,7 +49,7 @@ class Offloaded:
     brought_home: int
     file_system: str
     read_back: tuple[ReadBack, ...]
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
 
 
 def offload(
@@ -135,7 +136,9 @@ class _Copying:
         pruned = 0
         if prune:
             if "page cache" in ways:
-                raise FlightError(f"{doubts[0]}: nothing was removed; offload without --prune, or to another disk")
+                raise FlightError(
+                    f"{told(doubts[0])}: nothing was removed; offload without --prune, or to another disk"
+                )
             sure = {
                 name: manifest[name]
                 for name, row in rows.items()
@@ -417,15 +420,15 @@ def _refuse_unprovable(copy: Tree, system: str, *, same_device: bool) -> None:
         )
 
 
-def _doubts(there: Path, system: str, ways: tuple[ReadBack, ...]) -> list[str]:
-    """What a copy can't prove, in sentences; the way of reading first."""
-    found = []
+def _doubts(there: Path, system: str, ways: tuple[ReadBack, ...]) -> list[Finding]:
+    """What a copy can't prove; the way of reading first."""
+    found, copy = [], Subject("copy", str(there))
     if "page cache" in ways:
-        found.append(f"{there} could only be read back from memory, which proves nothing about its disk ({system})")
+        found.append(finding(Code.COPY_IN_MEMORY, copy, system=system))
     if system in places.NETWORK:
-        found.append(f"{there} is on another machine ({system}), which is believed where it says what is on its disk")
+        found.append(finding(Code.COPY_REMOTE, copy, system=system))
     elif system not in places.KEEPS_FSYNC:
-        found.append(f"{there} may not survive a power cut: its file system is {system}")
+        found.append(finding(Code.COPY_MAY_NOT_LAST, copy, system=system))
     return found
 
 

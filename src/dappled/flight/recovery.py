@@ -14,6 +14,7 @@ from pathlib import Path
 from dappled import durable
 from dappled.clock import Clock
 from dappled.errors import DappledError
+from dappled.findings import told
 from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
@@ -95,7 +96,7 @@ def close_ledger(
 ) -> None:
     """Store in the ledger the telemetry's summary (read from the file when not given) and the flight's end."""
     if telemetry is None and folder.telemetry.exists():
-        telemetry = log_reading.summarise(folder.telemetry, report.append)
+        telemetry = log_reading.summarise(folder.telemetry, lambda gap: report.append(told(gap)))
     if telemetry is not None:
         ledger.set_fact("telemetry_packets", telemetry.packets)
         ledger.set_fact("telemetry_bytes", telemetry.size)

@@ -265,7 +265,7 @@ def test_files_that_come_late_raise_no_alarm_of_long_ago_and_end_none() -> None:
     judge.count(5, Verdict("good"), 30)
     judge.count(21, bad, 31)
     judge.count(22, bad, 32)
-    assert judge.counts.problem(33) == "3 bad frames in a row, the first: clipped"
+    assert (judge.counts.problem(33) or "").startswith("3 bad frames in a row")
     assert judge.counts.by_state == {"bad": 7, "good": 1}
 
 

@@ -16,6 +16,7 @@ from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import camera_pose, from_euler, metres_per_radian
 from dappled.errors import DappledError
+from dappled.findings import Code, text, told
 from dappled.flight import LedgerReader, TimeSource, recording
 from dappled.flight.layout import FlightFolder
 from dappled.products.geotags import geotags, marks, pos_file
@@ -112,7 +113,7 @@ def test_a_torn_last_line_is_said_and_left_out(tmp_path: Path) -> None:
     line = "2026/11/21 10:00:00.000 35.0 139.0 1.0 1 9 0.01 0.01 0.02 0 0 0 0 9\n"
     found = pos_file.read(pos(tmp_path, HEAD + line + line[:30]))
     assert len(found.marks) == 1
-    assert "cut short" in found.doubts[0]
+    assert [one.code for one in found.doubts] == [Code.MARKS_CUT_SHORT]
 
 
 def fly(root: Path, *, utc_known: bool = True, times_s: Sequence[float] = TIMES_S, latency_s: float = 0.02) -> Path:
@@ -190,8 +191,8 @@ def test_lost_and_extra_marks_are_named_and_lost_frames_keep_their_place(tmp_pat
     assert sorted(found.marks) == [0, 1, 2, 4, 5]
     assert found.lost == (3,)
     (extra,) = found.extra
-    assert extra.startswith("mark 1 at 10:14:33.012 UTC")
-    assert found.doubts == ("1 mark of 5 not fixed: 4 (frame 2, float)",)
+    assert (extra.code, extra.facts["at"]) == (Code.MARK_OF_NO_SHOT, "10:14:33.012 UTC")
+    assert [text(one) for one in found.doubts] == ["1 mark of 5 not fixed: 4 (frame 2, float)"]
     placed, _ = geotags.read(flight, Mounting(), GEOID, found)
     assert placed[3].tag.pose.source == "interpolated"
 
@@ -201,7 +202,7 @@ def test_a_flight_without_utc_is_matched_by_intervals_and_says_so(tmp_path: Path
     found = find(flight, [line(at_s + 3000.0) for at_s in TIMES_S])
     assert sorted(found.marks) == list(range(6))
     assert found.offset_s == pytest.approx(-2999.98, abs=1e-3)
-    assert "intervals alone: the flight never knew UTC" in found.doubts[0]
+    assert found.doubts[0].code is Code.MARKS_UNTIMED
 
 
 def test_even_intervals_that_fit_twice_are_refused(tmp_path: Path) -> None:
@@ -228,7 +229,8 @@ def test_marks_of_another_flight_are_refused(lines: list[str], says: str, tmp_pa
 
 def test_heights_that_are_off_by_a_geoid_are_doubted(tmp_path: Path) -> None:
     found = find(fly(tmp_path), [line(at_s, up_m=30.2) for at_s in TIMES_S])
-    assert "30.2 m above" in found.doubts[0]
+    assert found.doubts[0].code is Code.MARKS_HEIGHTS_DIFFER
+    assert found.doubts[0].facts["up_m"] == pytest.approx(30.2, abs=0.05)
 
 
 def test_doubts_of_the_marks_decide_the_exit_code(tmp_path: Path) -> None:
@@ -264,13 +266,13 @@ def test_a_mark_far_from_the_others_is_left_out_and_named(tmp_path: Path) -> Non
     found = find(fly(tmp_path), lines)
     assert sorted(found.marks) == [0, 2, 3, 5]
     assert found.lost == (1, 4)
-    assert [text.split(" lies")[0] for text in found.doubts] == ["mark 2 (frame 1)", "mark 5 (frame 4)"]
+    assert [(one.subject.which, one.facts["frame"]) for one in found.doubts] == [(2, 1), (5, 4)]
 
 
 def test_a_contact_that_bounces_counts_once(tmp_path: Path) -> None:
     found = find(fly(tmp_path), [line(at_s) for at_s in sorted([*TIMES_S, TIMES_S[2] + 0.01])])
     assert sorted(found.marks) == list(range(6))
-    assert found.extra == ("mark 4 is 10 ms after mark 3: it was left out",)
+    assert [told(one) for one in found.extra] == ["mark 4: it is 10 ms after mark 3: it was left out"]
 
 
 def test_the_marks_antenna_has_a_lever_arm_of_its_own(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from dappled.cli.arguments import refuse_existing
 from dappled.drivers.gnss import recorded
 from dappled.drivers.gnss.ubx import RXM_RAWX, TIM_TM2, UbxStream
 from dappled.errors import counted
+from dappled.findings import Code, Finding, Subject, finding, to_rows, told
 from dappled.flight import FlightError, disk_error, layout, log_reading
 
 
@@ -20,7 +21,7 @@ def run(flight: Path, arguments: argparse.Namespace) -> int:
     folder = layout.open_folder(flight)
     output: Path = arguments.output or Path(f"{folder.name}.ubx")
     refuse_existing(arguments, output)
-    doubts: list[str] = []
+    doubts: list[Finding] = []
     stream, kinds = UbxStream(), Counter[tuple[int, int]]()
     size = 0
 
@@ -43,17 +44,17 @@ def run(flight: Path, arguments: argparse.Namespace) -> int:
     except OSError as error:
         raise disk_error("write", output, error) from error
     if not kinds[RXM_RAWX]:
-        doubts.append("it holds no raw measurements (UBX-RXM-RAWX): PPK is not possible with it")
+        doubts.append(finding(Code.GNSS_NO_RAW, Subject("file", str(output))))
     if stream.bad:
-        doubts.append(f"{counted(stream.bad, 'message')} came damaged from the receiver")
+        doubts.append(finding(Code.GNSS_DAMAGED, Subject("file", str(output)), messages=stream.bad))
     values = {"bytes": size, "messages": kinds.total(), "raw": kinds[RXM_RAWX], "marks": kinds[TIM_TM2]}
     if arguments.json:
-        print(json.dumps({"file": str(output), **values, "doubts": doubts}, indent=2))
+        print(json.dumps({"file": str(output), **values, "doubts": to_rows(doubts)}, indent=2))
         return 0
     print(
         f"{output}: {size / 1e6:.2f} MB, {counted(kinds.total(), 'UBX message')}, "
         f"{kinds[RXM_RAWX]} of raw measurements, {kinds[TIM_TM2]} of time marks"
     )
     for doubt in doubts:
-        print(f"in doubt: {doubt}")
+        print(f"in doubt: {told(doubt)}")
     return 0

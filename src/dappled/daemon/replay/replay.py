@@ -425,7 +425,7 @@ def _logged(
 ) -> Iterator[tuple[int, int, bytes]]:
     kind = own_log(path)
     if kind is None:
-        return log_reading.read_records(path, report)
+        return log_reading.read_telemetry(path, report)
     if kind == "ulog":
         from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
 

@@ -90,7 +90,7 @@ def _evidence(log: Path) -> dict[int, _Evidence]:
 
 def _headers(log: Path) -> Iterator[tuple[int, int, int, bytes]]:
     """(system id, component id, message id, packet) of each packet."""
-    for _, _, raw in log_reading.read_records(log, lambda _: None):
+    for _, _, raw in log_reading.read_telemetry(log):
         if raw[0] == MAVLINK_2:
             yield raw[5], raw[6], int.from_bytes(raw[7:10], "little"), raw
         else:

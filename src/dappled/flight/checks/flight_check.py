@@ -13,6 +13,7 @@ from pathlib import Path
 from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import DappledError, counted
+from dappled.findings import Finding, told
 from dappled.flight import layout, log_reading, provenance, pruning, seals
 from dappled.flight.checks import chain_check, place_check, seal_check, telemetry_check
 from dappled.flight.checks.chain_check import ChainFindings
@@ -269,12 +270,12 @@ def _telemetry(folder: FlightFolder, ledger: LedgerReader, problems: list[str], 
         else:
             notes.append("the flight has no telemetry")
         return 0
-    gaps: list[str] = []
+    gaps: list[Finding] = []
     found = log_reading.summarise(folder.telemetry, gaps.append)
     noted = facts.get("telemetry_sha256")
     if noted is not None and noted != found.sha256:
         problems.append("telemetry.tlog was changed: its SHA-256 is not the ledger's")
-        problems.extend(gaps)
+        problems.extend(map(told, gaps))
     else:
-        notes.extend(gaps)  # they were there when the flight was closed
+        notes.extend(map(told, gaps))  # they were there when the flight was closed
     return found.packets

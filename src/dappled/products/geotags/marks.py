@@ -13,6 +13,7 @@ import numpy as np
 
 from dappled.decode.geometry import Gnss, Vector3, camera_pose, metres_per_radian
 from dappled.errors import DappledError, counted
+from dappled.findings import Code, Finding, Subject, finding, told
 from dappled.flight import LedgerReader, ShotRow, Tag, TimeSource, layout
 from dappled.products.geotags import pos_file
 from dappled.products.geotags.mark_matching import MarkPairs, TimedShot, pair
@@ -24,6 +25,7 @@ _BOUNCE_NS = 50_000_000
 _PLAUSIBLE_S = 26 * 3600.0  # a time zone, and a clock that was set by hand
 _SOME = 0.6  # share of shots or marks that must be paired
 _LEAST_PAIRS = 3  # for a match without the time
+MARKS = Subject("marks")
 _OFFSET_S = 0.15  # a larger offset of the clocks is a doubt, if it isn't explained by the shots' sigmas
 _EPOCH_NS, _EPOCHS, _EPOCH_SHARE = (
     50_000_000,
@@ -41,7 +43,7 @@ _FIXES = {1: 6, 2: 5, 3: 4, 4: 4, 5: 3, 6: 8}  # RTKLIB's Q → MAVLink's GPS_FI
 class Marked:
     """The marks of a flight's frames by image index, and what was found.
 
-    `lost`: frames without a mark. `extra`: sentences about marks without a frame. `offset_s`: the flight's clock minus
+    `lost`: frames without a mark. `extra`: marks without a frame. `offset_s`: the flight's clock minus
     the marks' time (median), `spread_s` how far a mark's time is from that. `shift_m`: the marks minus the autopilot's
     positions, (north, east, up), medians; None where none has both. `arm_m` goes from the autopilot's antenna to the
     marks' (forward, right, down): positions are moved back by it, so that one lever arm leads to the camera.
@@ -50,8 +52,8 @@ class Marked:
     marks: Mapping[int, Mark]
     above_geoid: bool
     lost: tuple[int, ...]
-    extra: tuple[str, ...]
-    doubts: tuple[str, ...]
+    extra: tuple[Finding, ...]
+    doubts: tuple[Finding, ...]
     offset_s: float
     spread_s: float
     shift_m: Vector3 | None
@@ -87,8 +89,9 @@ def find(flight: Path, path: Path, geoid: Geoid | None, arm_m: Vector3 = (0.0, 0
     taken = {mark.number for mark in paired.values()}
     geoid = None if found.above_geoid else geoid
     marks, shift_m, far = _placed(path, {index: one for index, one in paired.items() if index in tags}, tags, geoid)
-    extra = [f"mark {one.number} at {_clock(one)} belongs to no shot" for one in heard if one.number not in taken]
-    extra += [f"mark {one.number} is of shot {n}, which left no frame" for n, one in paired.items() if n not in tags]
+    free = (one for one in heard if one.number not in taken)
+    extra = [finding(Code.MARK_OF_NO_SHOT, _mark(one), at=_clock(one)) for one in free]
+    extra += [finding(Code.MARK_OF_NO_FRAME, _mark(one), shot=n) for n, one in paired.items() if n not in tags]
     return Marked(
         marks,
         found.above_geoid,
@@ -110,7 +113,11 @@ def sentences(marked: Marked) -> list[str]:
         north, east, up = marked.shift_m
         lines.append(f"marks less autopilot (median): {north:+.2f} m north, {east:+.2f} m east, {up:+.2f} m up")
     lost = [f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost]
-    return [*lines, *lost, *marked.extra, *(f"in doubt: {text}" for text in marked.doubts)]
+    return [*lines, *lost, *map(told, marked.extra), *(f"in doubt: {told(one)}" for one in marked.doubts)]
+
+
+def _mark(mark: Mark) -> Subject:
+    return Subject("mark", mark.number)
 
 
 def _shots(rows: Sequence[ShotRow], tags: Mapping[int, Tag], correction_ns: int) -> list[TimedShot]:
@@ -130,16 +137,15 @@ def _shots(rows: Sequence[ShotRow], tags: Mapping[int, Tag], correction_ns: int)
     return sorted(shots, key=lambda shot: (shot.begins_s, shot.index))
 
 
-def _without_bounces(marks: Sequence[Mark]) -> tuple[list[Mark], list[str]]:
-    """The marks without those that follow another at once, and a sentence for each of these."""
+def _without_bounces(marks: Sequence[Mark]) -> tuple[list[Mark], list[Finding]]:
+    """The marks without those that follow another at once, and each of these."""
     heard: list[Mark] = []
     bounced = []
     for mark in marks:
         after_ns = mark.utc_ns - heard[-1].utc_ns if heard else _BOUNCE_NS
         if after_ns < _BOUNCE_NS:
-            bounced.append(
-                f"mark {mark.number} is {after_ns / 1e6:.0f} ms after mark {heard[-1].number}: it was left out"
-            )
+            after = finding(Code.MARK_BOUNCED, _mark(mark), after_ms=after_ns / 1e6, before=heard[-1].number)
+            bounced.append(after)
         else:
             heard.append(mark)
     return heard, bounced
@@ -147,7 +153,7 @@ def _without_bounces(marks: Sequence[Mark]) -> tuple[list[Mark], list[str]]:
 
 def _matched(
     path: Path, marks: Sequence[Mark], shots: Sequence[TimedShot], *, utc_known: bool
-) -> tuple[MarkPairs, list[str]]:
+) -> tuple[MarkPairs, list[Finding]]:
     """The pairs by time, count and interval, with doubts. Raises DappledError."""
     times_s = [mark.utc_ns / 1e9 for mark in marks]
     if abs(shots[len(shots) // 2].begins_s - times_s[len(times_s) // 2]) > _PLAUSIBLE_S:
@@ -167,7 +173,7 @@ def _matched(
     if by_time:
         return matched, []
     why = f"their times are {-matched.offset_s:.3f} s from the shots'" if utc_known else "the flight never knew UTC"
-    return matched, [f"the marks were matched by count and intervals alone: {why}; compare a picture with its place"]
+    return matched, [finding(Code.MARKS_UNTIMED, MARKS, why=why)]
 
 
 def _not_epochs(path: Path, marks: Sequence[Mark]) -> None:
@@ -180,27 +186,28 @@ def _not_epochs(path: Path, marks: Sequence[Mark]) -> None:
         )
 
 
-def _solutions(marks: Mapping[int, Mark]) -> list[str]:
-    """A sentence that names the marks that are not fixed."""
+def _solutions(marks: Mapping[int, Mark]) -> list[Finding]:
+    """The marks that are not fixed."""
     worse = [f"{mark.number} (frame {n}, {mark.solution})" for n, mark in marks.items() if mark.quality != 1]
     more = ", …" if len(worse) > _NAMED else ""
-    many = counted(len(worse), "mark")
-    return [f"{many} of {len(marks)} not fixed: {', '.join(worse[:_NAMED])}{more}"] if worse else []
+    if not worse:
+        return []
+    which = f"{', '.join(worse[:_NAMED])}{more}"
+    return [finding(Code.MARKS_NOT_FIXED, MARKS, worse=len(worse), marks=len(marks), which=which)]
 
 
-def _unmoved(marks: Mapping[int, Mark], tags: Mapping[int, Tag], arm_m: Vector3) -> list[str]:
-    """Sentences about frames whose mark can't be brought to mid-exposure, or to the other antenna."""
+def _unmoved(marks: Mapping[int, Mark], tags: Mapping[int, Tag], arm_m: Vector3) -> list[Finding]:
+    """Frames whose mark can't be brought to mid-exposure, or to the other antenna."""
     poses = {index: tags[index].pose for index in marks}
     unknown = sum(tags[index].exposure_s is None or poses[index].velocity_ned_m_s is None for index in marks)
     untold = sum(pose.attitude is None for pose in poses.values()) if any(arm_m) else 0
-    said = "exposure or speed unknown for {}: the position is that of the contact, not of mid-exposure"
-    armless = "no attitude for {}: the lever arm of the marks' antenna was not applied"
-    return [text.format(counted(n, "frame")) for text, n in ((said, unknown), (armless, untold)) if n]
+    told_of = (Code.MARKS_NOT_MOVED, unknown), (Code.MARKS_ARMLESS, untold)
+    return [finding(code, MARKS, frames=n) for code, n in told_of if n]
 
 
 def _placed(
     path: Path, marks: Mapping[int, Mark], tags: Mapping[int, Tag], geoid: Geoid | None
-) -> tuple[dict[int, Mark], Vector3 | None, list[str]]:
+) -> tuple[dict[int, Mark], Vector3 | None, list[Finding]]:
     """The marks that are where the others and the autopilot are, the medians of marks minus autopilot, and doubts: each
     mark that lies elsewhere, and heights. Raises DappledError where all are too far away to be of this flight."""
     steps: dict[int, Vector3] = {}
@@ -213,7 +220,7 @@ def _placed(
         up = mark.height_m - _undulation_m(mark, geoid) - pose.altitude_msl_m
         steps[index] = ((mark.latitude_rad - pose.latitude_rad) * north, turn * east, up)
     if not steps:
-        return dict(marks), None, ["no position of the autopilot is known: whether the marks are of this place is not"]
+        return dict(marks), None, [finding(Code.MARKS_UNPLACED, MARKS)]
     north_m, east_m, up_m = (float(median(part)) for part in zip(*steps.values(), strict=True))
     if math.hypot(north_m, east_m) > _FAR_M:
         raise DappledError(
@@ -226,13 +233,9 @@ def _placed(
         sigma_m = math.hypot(pose.position_sigma_m or _AUTOPILOT_SIGMA_M, pose.vertical_sigma_m or _AUTOPILOT_SIGMA_M)
         away_m = math.dist((north, east, up), (north_m, east_m, up_m))
         if away_m > max(_LEAST_OUT_M, _SIGMAS * sigma_m):
-            number = kept.pop(index).number
-            doubts.append(f"mark {number} (frame {index}) lies {away_m:,.0f} m from where the others would have it")
+            doubts.append(finding(Code.MARK_AWAY, _mark(kept.pop(index)), frame=index, away_m=away_m))
     if abs(up_m) > _VERTICAL_M:
-        doubts.append(
-            f"the marks are {abs(up_m):.1f} m {'above' if up_m > 0 else 'below'} the autopilot's heights: was the "
-            "base's height above sea level in place of above the ellipsoid, or is the geoid wrong?"
-        )
+        doubts.append(finding(Code.MARKS_HEIGHTS_DIFFER, MARKS, up_m=up_m))
     return kept, (north_m, east_m, up_m), doubts
 
 

@@ -18,6 +18,7 @@ from dappled.bounds.parsing import read_bytes
 from dappled.decode.geometry import Symmetric, camera_pose
 from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
 from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import disk_error
 
 _MOST_BYTES = 64 << 20
@@ -53,11 +54,11 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class PosFile:
-    """The marks of a file in the order of time, and sentences about what could not be read."""
+    """The marks of a file in the order of time, and what could not be read."""
 
     marks: tuple[Mark, ...]
     above_geoid: bool
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
 
 
 def read(path: Path) -> PosFile:
@@ -73,7 +74,7 @@ def read(path: Path) -> PosFile:
     columns, system = _columns(path, comments)
     _check_datum(path, comments, columns)
     marks: list[Mark] = []
-    doubts: list[str] = []
+    doubts: list[Finding] = []
     for at, line in enumerate(lines, 1):
         if line.startswith("%") or not line.strip():
             continue
@@ -84,7 +85,7 @@ def read(path: Path) -> PosFile:
                 raise DappledError(
                     f"{path}, line {at} is not a position under the header's columns: compute the file again"
                 ) from None
-            doubts.append(f"the last line of {path} is cut short and was left out: is the file whole?")
+            doubts.append(finding(Code.MARKS_CUT_SHORT, Subject("file", str(path))))
     if not marks:
         raise DappledError(
             f"{path} holds no mark: was the camera's contact wired to the receiver, and the event file kept?"
