@@ -51,13 +51,20 @@ def pytest_fixture_setup(fixturedef: pytest.FixtureDef[Any]) -> Iterator[None]:
 TIDY = tuple(
     f"tests/{room}"
     for room in (
+        "bounds",
+        "config",
+        "daemon/camera_protocol",
         "daemon/health",
         "daemon/navigation",
         "daemon/pipeline",
         "daemon/replay",
         "daemon/stream",
         "daemon/test_",
+        "drivers/gnss",
+        "drivers/test_",
+        "drivers/wired",
         "mocks",
+        "test_",
     )
 )
 

@@ -72,6 +72,15 @@ def test_the_order_is_file_then_name_then_folder(tmp_path: Path, monkeypatch: py
     assert seen == ["fsync .a.part", "rename .a.part a", f"fsync {tmp_path.name}"]
 
 
+def test_each_folder_that_is_made_stands_in_its_parent_for_good(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced: list[str] = []
+    monkeypatch.setattr(os, "fsync", lambda fd: synced.append(Path(os.readlink(f"/proc/self/fd/{fd}")).name))
+    durable.make_folder(tmp_path / "a" / "b")
+    assert synced == [tmp_path.name, "a"]
+
+
 def test_writing_replaces_whole(tmp_path: Path) -> None:
     durable.write_file(tmp_path / "a", b"old")
     durable.write_file(tmp_path / "a", b"new")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,13 @@ import usb.core
 from dappled.drivers.camera import CameraError
 from dappled.drivers.usb_bus import bodies, changes, holders, reset
 from tests.simulated.usb_devices import EOS_450D, FINEPIX_DISK, MOUSE, UsbDevices
+
+
+@pytest.fixture(scope="module", autouse=True)
+def libusb() -> None:
+    """PyUSB opens libusb once for the life of the process, with a socket that tells of devices."""
+    with suppress(CameraError):
+        bodies()
 
 
 def test_cameras_are_distinguished_from_mice() -> None:

@@ -46,7 +46,8 @@ def requested(
 def fly(tmp_path: Path) -> Callable[..., Path]:
     """Record a flight of these shots; those in `failed` (places in the list) have no file. `heard` are requests in the
     telemetry; `late_s` is when the autopilot was started, after that of the logs; `ahead_s` its UTC in the telemetry
-    against that of the logs. SYSTEM_TIME comes later by `time_delays_s`, in turn."""
+    against that of the logs. SYSTEM_TIME comes later by `time_delays_s`, in turn. `fed_back`: (time, number, camera) of
+    each CAMERA_FEEDBACK."""
 
     def record(
         shots: list[_Shot],
@@ -57,8 +58,11 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
         ends_s: float = SPAN_S + 2,
         time_delays_s: Sequence[float] = (0.0,),
         ahead_s: float = 0.0,
+        fired_by: str = "",
+        fed_back: Sequence[tuple[float, int, int]] = (),
     ) -> Path:
-        flight = recording.begin(tmp_path / "flights", RecordedClock(UTC_US * 1000), {"settings": {}})
+        settings = {"camera": {"driver": "folder", "shutter": fired_by}} if fired_by else {}
+        flight = recording.begin(tmp_path / "flights", RecordedClock(UTC_US * 1000), {"settings": settings})
         flight.ledger.set_fact("vehicles", [[0, 1]])
         packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         for step in range(-2, round(2 * ends_s)):
@@ -72,6 +76,9 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
                 1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, number or 0, 0, 0, 0
             )
             flight.telemetry.append(UTC_US + round(t_s * 1e6) + LINK_US, pack(command, packer, version_1=False))
+        for t_s, number, camera in fed_back:
+            report = mavlink.MAVLink_camera_feedback_message(0, 1, camera, number, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
+            flight.telemetry.append(UTC_US + round(t_s * 1e6) + LINK_US, pack(report, packer, version_1=False))
         for index, (t_s, source, kind, number) in enumerate(shots):
             at_ns = (UTC_US + round(t_s * 1e6) + LINK_US) * 1000
             shot = Shot(index, Cause(source, kind, number), at_ns, at_ns)
@@ -236,6 +243,18 @@ def test_with_a_pin_triggers_are_trig_and_contacts_are_counted(
     code, said = report(capsys, fly(requested()), "--log", bin_log)
     assert code == 0
     assert "9 triggers in ArduPilot's 00000012.bin (8 contacts at its feedback pin)" in said[-2]
+
+
+@pytest.mark.parametrize(("camera", "kind"), [(0, "refused"), (1, "lost")])
+def test_a_report_about_another_camera_is_no_request_to_this_one(
+    fly: Callable[..., Path], bin_log: Path, camera: int, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Trigger 3 made no shot, of a camera that is fired outside and told of it; one camera's report of it was heard."""
+    add_triggers(bin_log, TIMES_S)
+    shots = [one for one in requested(kind="CAMERA_FEEDBACK") if one[3] != 3]
+    flight = fly(shots, fired_by="outside", fed_back=[(TIMES_S[3], 3, camera)])
+    _, said = report(capsys, flight, "--log", bin_log, "--json")
+    assert [one["kind"] for one in json.loads("\n".join(said))["log"]["imbalances"]] == [kind]
 
 
 @pytest.mark.parametrize("rewritten", [False, True])

@@ -184,6 +184,13 @@ def test_every_shot_finds_its_mark_and_its_position(tmp_path: Path) -> None:
     assert (tagged.source, first.tag.time_source) == ("mark", TimeSource.LOGGED_MARK)
 
 
+@pytest.mark.parametrize(("off_s", "found"), [(0.06, [0, 1, 2, 3, 4, 5]), (0.1, [0, 1, 3, 4, 5])])
+def test_a_shot_has_its_mark_within_four_of_its_sigmas(tmp_path: Path, off_s: float, found: list[int]) -> None:
+    """Its tag's sigma is 20 ms."""
+    lines = [line(at_s + (off_s if index == 2 else 0.0)) for index, at_s in enumerate(TIMES_S)]
+    assert sorted(find(fly(tmp_path), lines).marks) == found
+
+
 def test_lost_and_extra_marks_are_named_and_lost_frames_keep_their_place(tmp_path: Path) -> None:
     flight = fly(tmp_path)
     times = [-29.9871, *TIMES_S[:3], *TIMES_S[4:]]  # a press on the ground before; that of frame 3 was not heard
