@@ -115,6 +115,7 @@ class Code(StrEnum):
     LINK_CLOCK_AHEAD = "link.clock_ahead"
     LINK_CLOCK_BEHIND = "link.clock_behind"
     LINK_SAME_IDS = "link.same_ids"
+    LINK_VEHICLE = "link.vehicle"
     LOG_BYTES_SKIPPED = "log.bytes_skipped"
     LOG_CORE = "log.core"
     LOG_CUT_SHORT = "log.cut_short"

@@ -395,7 +395,7 @@ class Service:
         ]
         doubts = (
             self.component.doubt(),
-            *(findings.told(one) for one in self.component.findings()),
+            *(findings.told(one) for one in self.component.findings() if one.level > findings.Level.NOTE),
             None if (off := navigation.utc.doubt()) is None else findings.told(off),
             *map(findings.told, navigation.telemetry.doubts(self._clock.utc_ns())),
             *([] if (short := self._control.shortage) is None else [findings.text(short)]),

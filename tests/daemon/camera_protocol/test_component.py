@@ -22,7 +22,7 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger, Spacing
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
-from dappled.findings import Finding
+from dappled.findings import Code, Finding, Level
 from dappled.flight.layout import DiskSpace
 from tests.daemon.camera_protocol.rig import NothingEarlier
 from tests.daemon.fakes import NO_CAMERA, FakeSink, Nowhere
@@ -140,16 +140,23 @@ class Rig:
         for _ in range(self.copies):
             self.component.on_packet(Packet(0, 0, link, message, raw, trusted=self.trusted, exposed=self.exposed))
 
-    def command(self, name: int, *p: float, target: tuple[int, int] = (1, 100), confirmation: int = 0) -> int | None:
+    def command(
+        self,
+        name: int,
+        *p: float,
+        target: tuple[int, int] = (1, 100),
+        confirmation: int = 0,
+        sender: tuple[int, int] = GCS,
+    ) -> int | None:
         """Its MAV_RESULT, None for no acknowledgement."""
         self.sent.clear()
         padded = (*p, *[0.0] * (7 - len(p)))
-        self.hear(mavlink.MAVLink_command_long_message(*target, name, confirmation, *padded))
+        self.hear(mavlink.MAVLink_command_long_message(*target, name, confirmation, *padded), sender)
         acks = [m for m in self.sent if m.get_type() == "COMMAND_ACK"]
         assert len(acks) <= 1
         if acks:
             assert self.sent[0] is acks[0]  # first the answer, then the message
-            assert (acks[0].target_system, acks[0].target_component) == GCS
+            assert (acks[0].target_system, acks[0].target_component) == sender
         return int(acks[0].result) if acks else None
 
     def tick(self, seconds: float = 0.0) -> list[str]:
@@ -325,6 +332,44 @@ def test_several_autopilots_that_come_late_leave_the_configured_system_and_it_is
     assert rig.component.doubt() == ("autopilots 7, 8 are heard, the camera belongs to system 1: set mavlink.system_id")
     autopilot_heartbeat(rig, 1)
     assert rig.component.doubt() is None
+
+
+@pytest.mark.parametrize("kind", ["ANTENNA_TRACKER", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB"])
+@pytest.mark.parametrize("late", [False, True])
+def test_what_is_no_vehicle_is_none_whatever_autopilot_it_names(kind: str, *, late: bool) -> None:
+    """An antenna tracker runs ArduPilot, and many programs say that they are a generic autopilot."""
+    rig = Rig()
+    for system in (7, 1) if late else (1, 7):
+        number = getattr(mavlink, f"MAV_TYPE_{kind}") if system == 1 else mavlink.MAV_TYPE_QUADROTOR
+        rig.hear(mavlink.MAVLink_heartbeat_message(number, 3, 0, 0, 4, 3), (system, 1))
+    rig.tick(3.1)
+    assert (rig.system_id, rig.component.vehicle, rig.component.doubt()) == (7, 7, None)
+    assert rig.component.findings() == []
+
+
+def test_of_several_vehicles_the_one_that_fires_the_camera_counts_and_the_others_are_told() -> None:
+    rig = Rig()
+    for system in (2, 1):
+        autopilot_heartbeat(rig, system)
+    rig.tick(3.1)
+
+    def told() -> tuple[object, ...]:
+        (found,) = rig.component.findings()
+        assert (found.code, found.level) == (Code.LINK_VEHICLE, Level.NOTE)
+        rig.tick(0.1)
+        return rig.system_id, rig.component.vehicle, found.facts["vehicle"], found.facts["by"]
+
+    fire = (mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0.0, 1)
+    assert any("vehicle 1 counts" in m.text for m in rig.of("STATUSTEXT"))
+    assert told() == (1, 1, 1, "id in mavlink.system_id")
+    rig.command(*fire, 1, sender=(2, 1), target=(0, 0))  # meant for all: nothing follows
+    assert told() == (1, 1, 1, "id in mavlink.system_id")
+    rig.clock.advance(5)
+    assert rig.command(*fire, 1, sender=(2, 1)) == mavlink.MAV_RESULT_ACCEPTED
+    assert told() == (2, 2, 2, "requests to this camera")
+    rig.clock.advance(5)
+    assert rig.command(*fire, 1, sender=(1, 1), target=(2, 100)) == mavlink.MAV_RESULT_ACCEPTED  # both: undecided again
+    assert told() == (1, 1, 1, "id in mavlink.system_id")
 
 
 def test_heartbeats_time_requests_and_streams_come_in_time_and_none_while_faulted() -> None:

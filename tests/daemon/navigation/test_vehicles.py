@@ -62,12 +62,27 @@ def test_telemetry_turns_to_the_camera_s_own_vehicle_and_a_replay_turns_with_it(
             live[number + 1] = telemetry.pose_at(stamp_us * 1000 - 10**8, 0)
     assert noted == [(60, OURS)]
     seen = {limit: round(math.degrees(pose.latitude_rad or 0)) for limit, pose in live.items()}
-    assert seen == {41: 10, 61: 0, 62: 47, 81: 47, 151: 47}
+    assert seen == {41: 0, 61: 47, 62: 47, 81: 47, 151: 47}  # of two, none counts until one is the camera's
     again = Telemetry(vehicles=noted)
     for number, stamp_us, message in packets(10):
         again.feed(number, stamp_us, message)
         if number + 1 in live:
             assert digest(again.pose_at(live[number + 1].utc_ns, 0)) == digest(live[number + 1])
+
+
+def test_what_is_heard_alone_counts_until_another_is_heard() -> None:
+    telemetry, seen = Telemetry(), []
+    for number, stamp_us, message in packets(4):
+        if number % 2 or number >= 40:  # ours alone at first
+            telemetry.feed(number, stamp_us, message)
+        if number in (39, 41, 79):
+            seen.append(telemetry.pose_at(stamp_us * 1000 - 10**8, 0).latitude_rad is not None)
+    assert seen == [True, False, False]
+    telemetry.follow(OURS)
+    number, stamp_us, message = list(packets(5))[81]
+    telemetry.feed(number, stamp_us, message)
+    early = telemetry.pose_at(START_US * 1000 + 10**9, 0)  # nothing of it was forgotten
+    assert round(math.degrees(early.latitude_rad or 0)) == PLACES_DEG[OURS]
 
 
 def test_following_the_vehicle_that_is_followed_already_forgets_nothing() -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 
 from dappled.clock import Clock
@@ -32,7 +32,7 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
-from dappled.findings import Code, Finding, Subject, finding, told
+from dappled.findings import Code, Finding, Subject, Value, finding, told
 
 PROOF_NS = 500_000_000
 _STEADY_NS = 300_000_000  # telemetry is requested at 50 Hz
@@ -171,6 +171,7 @@ class Component:
         self._files = FtpServer(self._status)
         self._dedup, self._routes = PacketDedup(), ReportRoutes()
         self._lines, self._stations = PilotMessages(), GroundStations()
+        self._rivals: Mapping[str, Value] = {}  # the other vehicles that were told of
         self._same_ids: dict[int, tuple[str, int]] = {}  # link: who sends with our ids, and when last
         self._results: deque[tuple[Command, int]] = deque(maxlen=64)
         self._heartbeat_due_ns = self._status_due_ns = 0
@@ -192,14 +193,17 @@ class Component:
         return self._identity.doubt()
 
     def findings(self) -> list[Finding]:
-        """Other components on the links that send with our own ids: who hears both can't tell them apart."""
+        """Other vehicles on the links, and other components that send with our own ids: who hears both can't tell them
+        apart."""
+        rivals = self._identity.rivals()
         now_ns = self._clock.monotonic_ns()
         system, component = self._links.system_id, self._links.component_id
-        return [
+        same = [
             finding(Code.LINK_SAME_IDS, Subject("link", link), source=source, system=system, component=component)
             for link, (source, heard_ns) in sorted(self._same_ids.items())
             if now_ns - heard_ns <= _SAME_IDS_NS
         ]
+        return same if rivals is None else [*same, rivals]
 
     # what comes in
 
@@ -248,6 +252,13 @@ class Component:
             return
         echo = self._commands.fires(command) and self._autopilot.is_echo(packet, str(command.name))
         answer = CommandAnswer(ACCEPTED) if echo else self._commands.answer(command)
+        if (
+            command.of_autopilot
+            and not command.broadcast
+            and self._commands.fires(command)
+            and answer.result == ACCEPTED
+        ):
+            self._autopilot.fired_by(command.system)
         self._count_trigger(command, new=answer.new_shot)
         if not command.broadcast or answer.result == ACCEPTED or answer.to_all:  # another one may do what is for all
             self._acknowledge(command, answer.result)
@@ -420,6 +431,10 @@ class Component:
                 )
             )
         self._autopilot.ask()
+        rivals = self._identity.rivals()
+        if rivals is not None and rivals.facts != self._rivals:
+            self._rivals = rivals.facts
+            self.say(told(rivals), mavlink.MAV_SEVERITY_NOTICE)
         self._tell_lost_triggers()
         if (counts := self._shutter.statistics()) != self._reported:
             self._reported = counts

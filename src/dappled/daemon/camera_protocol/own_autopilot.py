@@ -49,26 +49,41 @@ class Links(Protocol):
     def send(self, message: MavlinkMessage, link: int | None = None, *, without: int | None = None) -> bool: ...
 
 
+_NO_VEHICLES = frozenset(
+    getattr(mavlink, f"MAV_TYPE_{name}")
+    for name in ("ANTENNA_TRACKER", "GCS", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION",
+                 "FLARM", "SERVO", "ODID", "BATTERY", "PARACHUTE", "LOG", "OSD", "IMU", "GPS", "WINCH")
+)  # fmt: skip
+
+
 class SystemIdentity:
     """Which system this camera belongs to.
 
-    Decides three seconds after the start at the latest: the system id of the only autopilot heard, or the configured
-    one where there are several or none. Decides sooner when one autopilot was heard alone for 1.2 s. Where none was
-    heard (it boots more slowly than this machine), the first one heard alone for 1.2 s later is taken, for good.
+    Decides three seconds after the start at the latest: the system id of the only autopilot of a vehicle that is heard,
+    or the configured one where there are several or none. Decides sooner when one was heard alone for 1.2 s. Where none
+    was heard (it boots more slowly than this machine), the first one heard alone for 1.2 s later is taken, for good.
+    Of several the only one that fires this camera counts, from then on.
     """
 
     def __init__(self, configured_system_id: int, start_ns: int) -> None:
-        self.system_id = configured_system_id
         self.settled = False
         self.autopilots: dict[int, int] = {}  # system id: link it was last heard on
+        self._configured = self._decided = configured_system_id
+        self._firing: set[int] = set()
         self._ardupilots: set[int] = set()
         self._none_yet = True
         self._start_ns = start_ns
         self._first_heard_ns: int | None = None
 
+    @property
+    def system_id(self) -> int:
+        """The system, as far as it is decided."""
+        return next(iter(self._firing)) if self.settled and len(self._firing) == 1 else self._decided
+
     def heard(self, message: MavlinkMessage, link: int, now_ns: int) -> None:
         """Take a HEARTBEAT. Times are monotonic."""
-        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type == mavlink.MAV_TYPE_GCS:
+        of_vehicle = message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and message.type not in _NO_VEHICLES
+        if not of_vehicle or message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1:
             return
         if len(self.autopilots) < 32 or message.get_srcSystem() in self.autopilots:
             self.autopilots[message.get_srcSystem()] = link
@@ -76,6 +91,11 @@ class SystemIdentity:
                 self._ardupilots.add(message.get_srcSystem())
         if self._first_heard_ns is None:
             self._first_heard_ns = now_ns
+
+    def fired_by(self, system_id: int) -> None:
+        """The autopilot of this system has fired this very camera."""
+        if system_id in self.autopilots:
+            self._firing.add(system_id)
 
     def decide(self, now_ns: int) -> bool:
         """Decide if possible by now. Whether it is decided."""
@@ -87,7 +107,7 @@ class SystemIdentity:
             heard = tuple(self.autopilots)  # as of now: another may be heard meanwhile
             if len(heard) == 1:
                 self.settled = True
-                self.system_id = heard[0]
+                self._decided = heard[0]
         return self.settled
 
     def doubt(self) -> str | None:
@@ -98,6 +118,19 @@ class SystemIdentity:
         ids = ", ".join(map(str, heard))
         who = f"autopilot {ids} is" if len(heard) == 1 else f"autopilots {ids} are"
         return f"{who} heard, the camera belongs to system {self.system_id}: set mavlink.system_id"
+
+    def rivals(self) -> Finding | None:
+        """Why the camera's own vehicle counts, of several that are heard."""
+        others = sorted(self.autopilots.keys() - {self.system_id})
+        if not self.settled or not others or self.system_id not in self.autopilots:
+            return None
+        by = "having been heard alone"
+        if self._firing == {self.system_id}:
+            by = "requests to this camera"
+        elif self.system_id == self._configured:
+            by = "id in mavlink.system_id"
+        named = ", ".join(map(str, others))
+        return finding(Code.LINK_VEHICLE, Subject("link"), vehicle=self.system_id, by=by, others=named)
 
     def vehicle(self) -> int | None:
         """The system whose telemetry counts: our own, once that is decided.
@@ -386,6 +419,14 @@ class OwnAutopilot:
         self._now, self._battery = AutopilotNow(), BatteryReports()
         self.numbers = {"CAMERA_FEEDBACK": TriggerNumbers(), "CAMERA_TRIGGER": TriggerNumbers()}
         self.restarts = 0  # of the autopilot, so far: its numbers begin again
+
+    def fired_by(self, system_id: int) -> None:
+        """The autopilot of this system has fired this very camera: of several, it may be the camera's own."""
+        before = self.identity.system_id
+        self.identity.fired_by(system_id)
+        if self.identity.system_id != before:
+            self._now, self._battery = AutopilotNow(), BatteryReports()
+            self.numbers = {kind: TriggerNumbers() for kind in self.numbers}
 
     def heard(self, message: MavlinkMessage) -> None:
         """Take a message of its system that can be trusted."""

@@ -67,13 +67,15 @@ JUMP_AFTER_NS, JUMP_BEFORE_NS = 30 * 10**9, 10 * 10**9  # so long after and befo
 _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
 _PRUNE_EVERY, _LOOK_S = 256, 0.005
+_NOBODY, _MOST_CANDIDATES = -1, 8
 _MARK_COMES_NS = 1_100_000_000  # a receiver sends its marks with the next solution, at 1 Hz up to 1 s later
 # A single-frequency receiver under open sky, where it reports a dilution only; GPS_FIX_TYPE → metres for each unit.
 METRES_PER_DOP = {2: 2.5, 3: 2.5, 4: 1.0, 5: 0.3, 6: 0.02, 7: 0.02, 8: 0.05}
 
 
 class Telemetry:
-    """Telemetry of one vehicle: the one given to `follow`; until then the first autopilot (component 1) heard.
+    """Telemetry of one vehicle: the one given to `follow`; until then the only one heard (component 1), of several
+    none.
 
     `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
     (see AutopilotTime), `cam_idx` our camera's number in CAMERA_FEEDBACK. `attitude_sigma_rad` is how well the
@@ -93,28 +95,50 @@ class Telemetry:
         self._lock = threading.Lock()
         self._packets = self._prune_at = 0
         self._counts = Counts()
-        self._history = VehicleHistory(None, component_id, self._counts, cam_idx=cam_idx)
+        self._candidates: dict[int, VehicleHistory] | None = {}  # by system id; None: it is known which one counts
+        self._history = self._of(_NOBODY)
 
     def feed(self, number: int, stamp_us: int, message: MavlinkMessage) -> None:
         """Take one packet. Numbers must rise. Messages that are not used only count."""
         with self._lock:
             while self._turns and self._turns[0][0] <= number:
                 _, system_id = self._turns.popleft()
-                if system_id != self._history.system_id:
-                    self._history = VehicleHistory(system_id, self._component_id, self._counts, cam_idx=self._cam_idx)
+                if self._candidates is not None:
+                    self._history = self._candidates.get(system_id) or self._of(system_id)
+                    self._candidates, self._counts = None, self._history.counts
+                elif system_id != self._history.system_id:
+                    self._history = self._of(system_id, self._counts)
             self._packets = number + 1
             kind = message.get_type()
             if kind not in USED_MESSAGES:
                 return
-            self._history.feed(number, stamp_us * 1000, message)
+            histories = [self._history] if self._candidates is None else self._heard(message)
+            for history in histories:
+                history.feed(number, stamp_us * 1000, message)
             if number >= self._prune_at:  # by packets that the flight used as well
                 self._prune_at = number + _PRUNE_EVERY
-                self._history.prune(stamp_us * 1000 - HISTORY_NS)
+                for history in histories:
+                    history.prune(stamp_us * 1000 - HISTORY_NS)
+
+    def _of(self, system_id: int, counts: Counts | None = None) -> VehicleHistory:
+        return VehicleHistory(system_id, self._component_id, counts or Counts(), cam_idx=self._cam_idx)
+
+    def _heard(self, message: MavlinkMessage) -> list[VehicleHistory]:
+        """All vehicles that may be the camera's, while that is not known; the only one counts for now."""
+        assert self._candidates is not None
+        known, system_id = self._candidates, message.get_srcSystem()
+        of_autopilot = message.get_srcComponent() == 1 and message.get_type() != "TIMESYNC"
+        if of_autopilot and system_id not in known and len(known) < _MOST_CANDIDATES:
+            known[system_id] = self._of(system_id)
+            self._history = known[system_id] if len(known) == 1 else self._of(_NOBODY)
+            self._counts = self._history.counts
+        return list(known.values())
 
     def follow(self, system_id: int) -> int:
         """Follow this vehicle from the next packet on, and forget then what was known of another vehicle.
 
-        Returns the number of that packet: a replay changes vehicles at the same packet.
+        Returns the number of that packet: a replay changes vehicles at the same packet. What was heard of it before it
+        was known which one counts is not lost.
         """
         with self._lock:
             self._turns.append((self._packets, system_id))

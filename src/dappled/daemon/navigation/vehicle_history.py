@@ -320,13 +320,13 @@ class Steady(Generic[M]):
 class VehicleHistory:
     """Samples of position, attitude, receiver, gimbal and hot shoe of one vehicle.
 
-    `system_id` is the vehicle's: None for the first autopilot (component 1) that is heard. `component_id` is our own
-    (see AutopilotTime), `cam_idx` our camera's number at the autopilot. Not thread-safe.
+    `system_id` is the vehicle's, and its autopilot is component 1. `component_id` is our own (see
+    AutopilotTime), `cam_idx` our camera's number at the autopilot. Not thread-safe.
     """
 
     def __init__(
         self,
-        system_id: int | None,
+        system_id: int,
         component_id: int,
         counts: Counts,
         *,
@@ -484,16 +484,12 @@ class VehicleHistory:
         """Whether it can't be true. Our own vehicle's are counted."""
         if not telemetry_samples.is_impossible(message):
             return False
-        if message.get_srcComponent() == 1 and message.get_srcSystem() == self.system_id:
+        if self._ours(message):
             self.counts.refuse(stamp_ns)
         return True
 
     def _ours(self, message: MavlinkMessage) -> bool:
-        if message.get_srcComponent() != 1:
-            return False
-        if self.system_id is None and message.get_type() != "TIMESYNC":
-            self.system_id = message.get_srcSystem()
-        return bool(message.get_srcSystem() == self.system_id)
+        return bool(message.get_srcComponent() == 1 and message.get_srcSystem() == self.system_id)
 
     def _believed(
         self,
