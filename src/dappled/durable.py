@@ -6,15 +6,18 @@ In tests that cut the power, every shorter order lost acknowledged files or left
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import mmap
 import os
+import stat
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 _PART = ".part"
 _PIECE_BYTES = 1 << 20
+_BELIEVED_BYTES, _BELIEVED_TIMES = 256 << 20, 200  # of a file's size: always, and times what is stored of it
 _CLOEXEC, _NOFOLLOW = (getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW"))  # Windows has neither
 
 
@@ -98,14 +101,45 @@ def copy_in(source_fd: int, size: int, path: Path) -> str:
         return sha256.result()
 
 
-def without_waiting(path: str, flags: int) -> int:
-    """Open a file, an opener for `open`: a pipe that nobody writes to ends at once. Raises OSError."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+class NoPlainFileError(OSError):
+    """What stands there is not to be read; `strerror` says why, and what to do."""
+
+
+def plain_file(path: str, flags: int) -> int:
+    """Open a file that others may have put there, an opener for `open`: a pipe is not waited for. Raises OSError, also
+    for what `check_plain` refuses."""
+    fd = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    try:
+        check_plain(fd, path)
+    except OSError:
+        os.close(fd)
+        raise
+    return fd
+
+
+def check_plain(fd: int, path: str) -> None:
+    """Raises NoPlainFileError for a device, which may have no end, and for a file of holes, which can claim any size.
+    A folder is the caller's to refuse."""
+    found = os.fstat(fd)
+    if stat.S_ISDIR(found.st_mode):
+        return
+    if not stat.S_ISREG(found.st_mode):
+        raise NoPlainFileError(errno.EINVAL, "it is no plain file: somebody put it there; use another copy", path)
+    stored = found.st_blocks * 512 if hasattr(found, "st_blocks") else found.st_size
+    if found.st_size > max(_BELIEVED_BYTES, _BELIEVED_TIMES * stored):
+        said = f"its content would take {found.st_size} bytes, and {stored} are stored: it has holes; use another copy"
+        raise NoPlainFileError(errno.EINVAL, said, path)
+
+
+def read_plain(path: Path) -> bytes:
+    """Read such a file whole. Raises OSError."""
+    with open(path, "rb", opener=plain_file) as file:
+        return file.read()
 
 
 def hash_file(path: Path) -> str:
     """SHA-256 (hex) of a file's bytes. Raises OSError."""
-    with open(path, "rb", opener=without_waiting) as file:
+    with open(path, "rb", opener=plain_file) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 

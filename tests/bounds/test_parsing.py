@@ -88,6 +88,9 @@ def test_shipped_profiles_pass() -> None:
         assert parsing.parse_toml(text) == tomllib.loads(text)
 
 
-def test_no_more_of_a_file_is_read_than_allowed() -> None:
+def test_no_more_of_a_file_is_read_than_allowed(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(bytes(1001))
     with pytest.raises(ClaimError, match="longer than 1 kB"):
+        parsing.read_bytes(tmp_path / "a", 1000)
+    with pytest.raises(OSError, match="no plain file"):
         parsing.read_bytes(Path("/dev/zero"), 1000)

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
+from dappled import durable
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import check_stored
 
 _HEADER_BYTES = 10_000  # as numpy's own limit, which it looks at too late
 _READERS = {1: npy.read_array_header_1_0, 2: npy.read_array_header_2_0}
@@ -30,7 +32,7 @@ def read_npy(file: IO[bytes], stored: int, what: str) -> NDArray[Any]:
 def read_npz(path: Path, names: Collection[str], *, also: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Read these arrays of an NPZ file, `also` those where they are there. Raises ClaimError, KeyError where one of
     `names` is missing, and what zipfile raises."""
-    with zipfile.ZipFile(path) as archive:
+    with open(path, "rb", opener=durable.plain_file) as raw, zipfile.ZipFile(raw) as archive:
         names = [*names, *(name for name in also if f"{name}.npy" in archive.namelist())]
         if missing := {f"{name}.npy" for name in names}.difference(archive.namelist()):
             raise KeyError(min(missing).removesuffix(".npy"))  # zipfile's own error has a sentence of its own
@@ -41,7 +43,7 @@ def read_npz(path: Path, names: Collection[str], *, also: Collection[str] = ()) 
                 raise ClaimError(f"its {name} is packed by neither deflate nor nothing: write it with numpy")
             with archive.open(member) as file:
                 claimed += _claimed(file, name)
-        claims.check_size(claimed, path.stat().st_size, "arrays")
+        claims.check_size(claimed, check_stored(raw.fileno()), "arrays")
         found = {}
         for name, member in members.items():
             with archive.open(member) as file:

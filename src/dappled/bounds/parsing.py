@@ -9,7 +9,6 @@ import json
 import math
 import os
 import re
-import stat
 import tomllib
 from collections.abc import Iterator, Mapping, Sized
 from pathlib import Path
@@ -40,7 +39,7 @@ _TOML_TOKEN = re.compile(
 
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
     """Read a file of at most `most` bytes. Raises OSError, and ClaimError for a larger one."""
-    with path.open("rb") as file:
+    with open(path, "rb", opener=durable.plain_file) as file:
         data = file.read(most + 1)
     _check_length(data, most)
     return data
@@ -48,23 +47,21 @@ def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
 
 def read_log(path: Path) -> bytes:
     """Read a file that is only appended to, of any length that its disk bears out: one with holes can claim any. Raises
-    OSError, and ClaimError, also for a pipe, which would be waited for."""
-    with open(path, "rb", opener=durable.without_waiting) as file:
+    OSError, and ClaimError."""
+    with open(path, "rb", opener=durable.plain_file) as file:
         check_stored(file.fileno())
         return file.read()
 
 
 def stored_size(path: Path) -> int:
     """Return the bytes of a plain file that its disk bears out. Raises OSError and ClaimError like `read_log`."""
-    with open(path, "rb", opener=durable.without_waiting) as file:
+    with open(path, "rb", opener=durable.plain_file) as file:
         return check_stored(file.fileno())
 
 
 def check_stored(fd: int) -> int:
-    """Return an open file's size, where it is a plain one whose disk bears that out. Raises ClaimError, OSError."""
+    """Return the size of an open plain file, where its disk bears that out. Raises ClaimError, OSError."""
     found = os.fstat(fd)
-    if not stat.S_ISREG(found.st_mode):
-        raise ClaimError("it is no plain file: somebody put it there; use another copy")
     stored = found.st_blocks * 512 if hasattr(found, "st_blocks") else found.st_size
     check_size(found.st_size, stored, "content")
     return found.st_size

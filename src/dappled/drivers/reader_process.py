@@ -7,6 +7,7 @@ The process writes arrays end to end into a temporary file, and an answer in JSO
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import mmap
@@ -65,15 +66,20 @@ def read(
     Raises ClaimError for a file that claims too much, KeyError for what is missing, ValueError for a damaged file,
     MemoryError, and OSError.
     """
-    with tempfile.TemporaryDirectory(prefix="dappled-", ignore_cleanup_errors=True) as folder:
+    with (
+        tempfile.TemporaryDirectory(prefix="dappled-", ignore_cleanup_errors=True) as folder,
+        tempfile.TemporaryFile() as answered,
+    ):
         out, size = Path(folder, "arrays"), stored_size(path)
         memory = budget.memory + budget.ratio * size
+        patience_s = budget.patience_s + size / budget.bytes_a_second
         try:
             done = subprocess.run(
-                python_module(module, str(path), str(out), str(memory), *words),
+                python_module(module, str(path), str(out), str(memory), str(math.ceil(patience_s)), *words),
                 stdin=subprocess.DEVNULL,
-                capture_output=True,
-                timeout=budget.patience_s + size / budget.bytes_a_second,
+                stdout=answered,
+                stderr=subprocess.DEVNULL,  # a library may write there without end
+                timeout=patience_s,
                 check=False,
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )
@@ -81,7 +87,8 @@ def read(
             raise ValueError(f"the {library} library did not come to an end with it") from None
         if done.returncode != 0:
             raise ValueError(f"the {library} library failed on it")
-        answer = parse_json(done.stdout, _ANSWER_BYTES)
+        answered.seek(0)
+        answer = parse_json(answered.read(_ANSWER_BYTES + 1), _ANSWER_BYTES)
         if "kind" in answer:
             raise _RAISED[answer["kind"]](answer["words"])
         return _mapped(out, answer["arrays"]), answer["text"]
@@ -89,8 +96,9 @@ def read(
 
 def serve(answer: Callable[[str, Sequence[str]], ReadArrays]) -> None:
     """In the process: let `answer(path, words)` read the file, and hand over what it returns or raises."""
-    path, out, memory, *words = sys.argv[1:]
+    path, out, memory, seconds, *words = sys.argv[1:]
     _limit(int(memory))
+    _limit_use(int(memory), int(seconds))
     stdout = sys.stdout
     sys.stdout = sys.stderr  # libraries print
     stdout.write(json.dumps(_answered(answer, path, words, out, int(memory))))
@@ -108,10 +116,12 @@ def _answered(
         return {"kind": "claim", "words": str(error)}
     except KeyError as error:
         return {"kind": "key", "words": str(error.args[0])[:200]}
-    except MemoryError:
+    except (MemoryError, OSError) as error:
+        if isinstance(error, OSError) and error.errno not in (errno.EFBIG, errno.ENOMEM):
+            return {"kind": "damage", "words": first_line(error)}
         _limit(None)
         most = claims.in_words(memory)
-        return {"kind": "memory", "words": f"it takes more memory to read than is free, or than {most}"}
+        return {"kind": "memory", "words": f"it takes more memory or disk to read than is free, or than {most}"}
     except Exception as error:  # noqa: BLE001  # these libraries raise anything on damaged bytes
         return {"kind": "damage", "words": first_line(error)}
 
@@ -130,6 +140,16 @@ def _limit(memory: int | None) -> None:
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         taken = int(_STATM.read_text(encoding="ascii").split()[0]) * resource.getpagesize()
         resource.setrlimit(resource.RLIMIT_AS, (most if memory is None else taken + memory, most))
+
+
+def _limit_use(size: int, seconds: int) -> None:
+    """Limit what this process may write to a file, as its memory, and how long it may calculate: nobody may be left to
+    end it."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource  # noqa: PLC0415  # Windows has none
+
+        for kind, most in ((resource.RLIMIT_FSIZE, size), (resource.RLIMIT_CPU, seconds)):
+            resource.setrlimit(kind, (most, resource.getrlimit(kind)[1]))
 
 
 def _mapped(path: Path, described: list[tuple[str, str, list[int]]]) -> dict[str, NDArray[Any]]:

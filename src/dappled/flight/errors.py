@@ -7,6 +7,7 @@ import os
 import sqlite3
 from pathlib import Path
 
+from dappled import durable
 from dappled.errors import DappledError
 
 
@@ -36,6 +37,8 @@ def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
     """The sentence for an operating system error: "cannot <doing> <path>: <why>; <what to do>"."""
     number = error.errno or 0
     why = _REMEDIES.get(number) or f"{os.strerror(number) if number else error}; check the disk"
+    if isinstance(error, durable.NoPlainFileError):
+        why = str(error.strerror)
     return FlightError(f"cannot {doing} {path}: {why}")
 
 

@@ -89,7 +89,7 @@ def read_telemetry(
     file. `report` gets each such gap. Raises FlightError when the file can't be read.
     """
     try:
-        with open(path, "rb", opener=durable.without_waiting) as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             size = check_stored(file.fileno())
             data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
     except OSError as error:
@@ -126,7 +126,7 @@ def summarise(path: Path, report: Callable[[Finding], object] = lambda _: None) 
     """Read a whole log and summarise it. Raises FlightError."""
     packets = sum(1 for _ in read_telemetry(path, report))
     try:
-        with open(path, "rb", opener=durable.without_waiting) as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             return TelemetrySummary(
                 packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
             )

@@ -117,6 +117,7 @@ class Tree:
             try:
                 if not stat.S_ISREG(os.fstat(fd).st_mode):
                     raise FlightError(f"{self.path / name} is no file: nothing was touched")
+                durable.check_plain(fd, name)
                 yield fd
             except EOFError as error:
                 raise FlightError(f"{self.path / name} changed while it was read ({error}); try again") from error

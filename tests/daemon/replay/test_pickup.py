@@ -113,7 +113,7 @@ def test_a_telemetry_that_can_t_be_read_is_a_sentence(
     flight = Landed(tmp_path, [0])
     card = flight.card("card", {"DSCF0001.RAF": 0.5})
     (flight.path / "telemetry.tlog").write_bytes(bytes(100))
-    monkeypatch.setattr(durable, "without_waiting", full)
+    monkeypatch.setattr(durable, "plain_file", full)
     assert flight.pickup(card, "--pair", "0=DSCF0001.RAF") == 1
     assert "telemetry.tlog can't be read: No space left on device" in capfd.readouterr().err
 

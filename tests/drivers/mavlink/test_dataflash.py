@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, log_packets
 from dappled.drivers.mavlink.dataflash import DataFlashError
+from dappled.drivers.reader_process import Budget
 from dappled.findings import Level, text
 from dappled.flight import TimeSource
 from dappled.mocks.autopilot.path import FlightPath
@@ -127,4 +129,29 @@ def test_a_log_of_holes_is_judged_before_it_is_read(tmp_path: Path) -> None:
     with path.open("ab") as file:
         file.truncate(1 << 40)
     with pytest.raises(DataFlashError, match=r"1\.bin.*its content would take"):
+        list(dataflash.packets(path))
+
+
+def of_nothing(count: int) -> bytes:
+    """A log of messages that hold nothing, three bytes each: pymavlink takes some hundred times as much for each."""
+    told = ((0x80, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns"), (0x81, 3, b"GPS", b"", b""))
+    heads = [b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", *one) for one in told]
+    return b"".join(heads) + b"\xa3\x95\x81" * count
+
+
+@pytest.mark.parametrize(
+    ("budget", "says"),
+    [
+        (Budget(1e9, patience_s=1.0), "come to an end"),
+        (Budget(1e9, memory=1 << 24, ratio=0), "more memory"),
+    ],
+    ids=["time", "memory"],
+)
+def test_a_log_that_is_made_to_exhaust_the_machine_is_one_sentence(
+    budget: Budget, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(dataflash, "_BUDGET", budget)
+    path = tmp_path / "1.bin"
+    path.write_bytes(of_nothing(300_000))
+    with pytest.raises(DataFlashError, match=rf"1\.bin is damaged .*({says})"):
         list(dataflash.packets(path))

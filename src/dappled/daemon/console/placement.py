@@ -13,6 +13,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from dappled import durable
 from dappled.bounds.parsing import read_bytes
 from dappled.bounds.pictures import open_picture
 from dappled.decode.geometry import camera_pose
@@ -54,7 +55,7 @@ def load_background(file: Path) -> Background:
     try:
         lines = read_bytes(world, _WORLD_BYTES).decode("ascii").split()
         across, turned, turned_too, down, left, top = (float(line) for line in lines)
-        with file.open("rb") as picture:
+        with open(file, "rb", opener=durable.plain_file) as picture:
             width, height = open_picture(picture).size
     except (OSError, ValueError) as error:
         raise DappledError(f"{file} with {world.name} can't be used as a map: {first_line(error)}") from None

@@ -113,7 +113,7 @@ def _law(settings: Settings) -> str:
 
 def _copy(source: str, folder: Path, name: str) -> str:
     target = folder / f"{name}{Path(source).suffix}"
-    durable.write_file(target, Path(source).read_bytes())
+    durable.write_file(target, durable.read_plain(Path(source)))
     return str(target)
 
 

@@ -214,7 +214,7 @@ def _called_utc_ns(row: ShotRow) -> int:
 def _taken_s(path: Path) -> float | None:
     """When a recorded frame was taken by the body's clock; None where it has no time, or is elsewhere now."""
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             return matching.seconds(read_exif(file).taken)
     except OSError:
         return None

@@ -197,7 +197,7 @@ def _bounds(paths: Sequence[Path], start_utc_ns: int | None, now_ns: int) -> Utc
 
 def _taken_s(path: Path) -> float | None:
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             return seconds(read_exif(file).taken)
     except OSError as error:
         raise ReplayError(f"{path} can't be read: {error.strerror}") from None
@@ -453,7 +453,7 @@ def own_log(path: Path) -> str | None:
     Raises ReplayError where it can't be read.
     """
     try:
-        with open(path, "rb", opener=durable.without_waiting) as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             begins = file.read(7)
     except OSError as error:
         raise ReplayError(f"{path} can't be read: {error.strerror}") from error

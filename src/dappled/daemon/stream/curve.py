@@ -15,7 +15,7 @@ from pathlib import Path
 import zmq
 import zmq.utils.z85
 
-from dappled import key_files
+from dappled import durable, key_files
 from dappled.errors import DappledError
 
 ZAP_ENDPOINT = "inproc://zeromq.zap.01"  # ZeroMQ's RFC 27
@@ -102,7 +102,7 @@ def load_own(path: Path) -> Keys:
 def load_public(path: Path) -> bytes:
     """A public key from NAME.key (or NAME.key_secret). Raises DappledError."""
     try:
-        text = path.read_text(encoding="ascii")
+        text = durable.read_plain(path).decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
         raise DappledError(f"{path} can't be read as a public key: {why}") from None

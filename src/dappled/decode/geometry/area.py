@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dappled.bounds import parsing
 from dappled.decode.array_types import Floats
-from dappled.errors import DappledError, counted, sentence
+from dappled.errors import DappledError, counted, first_line
 
 MOST_CORNERS = 2000
 _BAD = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, ElementTree.ParseError)
@@ -84,7 +84,8 @@ def read(path: Path) -> PlannedArea:
         data = parsing.read_bytes(path)
         polygons = tuple(tuple(_ring(path, ring) for ring in polygon) for polygon in readers[kind](data))
     except (DappledError, OSError) as error:
-        raise AreaError(str(error) if isinstance(error, AreaError) else f"{path}: {sentence(error)}") from None
+        said = error.strerror if isinstance(error, OSError) else error
+        raise AreaError(str(error) if isinstance(error, AreaError) else f"{path} can't be read: {said}") from None
     except (
         ValueError,
         TypeError,
@@ -94,7 +95,7 @@ def read(path: Path) -> PlannedArea:
         RecursionError,
         ElementTree.ParseError,
     ) as error:
-        raise AreaError(f"{path} can't be read as an area: {sentence(error)}") from None
+        raise AreaError(f"{path} can't be read as an area: {first_line(error)}") from None
     if not polygons:
         what = "no survey with a polygon" if kind == ".plan" else "no polygon"
         raise AreaError(f"{path} has {what}: draw the area as one")

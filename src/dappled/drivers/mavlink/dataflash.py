@@ -8,24 +8,25 @@ without a pin, CAM.
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 from collections.abc import Callable, Iterator
 from datetime import timedelta
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pymavlink import DFReader
 
-from dappled.bounds.parsing import stored_size
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import from_euler
+from dappled.drivers import reader_process
 from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
 from dappled.drivers.mavlink import log_evidence, log_packets
+from dappled.drivers.mavlink.dataflash_reader import WHERE
 from dappled.drivers.mavlink.log_evidence import Chosen, LoggedPlaces, Missing, Receiver
 from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
+from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import UtcBounds, rollovers
 from dappled.errors import first_line
 from dappled.findings import Code, Finding, Subject, finding
@@ -37,6 +38,7 @@ _WEEK_US = 7 * 86400 * 10**6
 _MOST_WEEKS = 2**16
 _CORES_AGREE_M_S = 0.5
 _METRES_PER_DEG = 111_195.0
+_BUDGET = Budget(bytes_a_second=2e5, ratio=32)  # pymavlink reads some megabytes a second
 
 
 class DataFlashError(AutopilotLogError):
@@ -90,53 +92,38 @@ def triggers(path: Path, cam_idx: int, bounds: UtcBounds | None = None) -> Trigg
 
 @contextlib.contextmanager
 def _sound(path: Path) -> Iterator[None]:
-    """What damage does to the reader, or to a field of a message, is one sentence; what is printed of it is dropped."""
+    """What damage does to the reader, or to a field of a message, is one sentence."""
     try:
-        with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-            yield
+        yield
     except OSError as error:
         raise DataFlashError(f"{path} can't be read: {error.strerror}") from None
     except DataFlashError:
         raise
-    except Exception as error:  # noqa: BLE001  the reader raises that class itself, beside many others
+    except MemoryError as error:
+        raise DataFlashError(f"{path} is damaged as a log of ArduPilot, or made to exhaust memory: {error}") from None
+    except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
         raise DataFlashError(f"{path} is damaged as a log of ArduPilot ({first_line(error)}): copy it again") from None
-
-
-class _Reader(DFReader.DFReader_binary):  # type: ignore[misc]  # it has no types
-    """The reader, which leaves no file open where it finds nothing to read."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            super().__init__(str(path))
-        except BaseException:
-            if hasattr(self, "filehandle"):
-                self.filehandle.close()
-            raise
-
-    def cut_short(self) -> bool:
-        """Whether the last message ends after the file, or bytes follow it that are none."""
-        ends = (
-            at[-1] + self.formats[number].len
-            for number, at in enumerate(self.offsets)
-            if number in self.formats and len(at)
-        )
-        return max(ends, default=0) != int(self.data_len)
 
 
 def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
     """The messages in use, by name, and whether the log was cut short: then it is read up to there."""
+    arrays, said = reader_process.read(
+        "dappled.drivers.mavlink.dataflash_reader", path, used, library="pymavlink", budget=_BUDGET
+    )
+    forms: dict[tuple[str, str], dict[str, list[Any]]] = {}
+    for key, values in arrays.items():
+        name, form, field = key.split("/", 2)
+        forms.setdefault((name, form), {})[field] = values.tolist()
     rows: dict[str, list[Any]] = {name: [] for name in used}
-    stored_size(path)  # a log with holes would be read for hours
-    log = _Reader(path)
-    try:
-        while (message := log.recv_match(type=used)) is not None:
-            rows[message.get_type()].append(message)
-        begins_us = log_evidence.begins_us([_times(of_type) for of_type in rows.values()])
-        for row in (row for of_type in rows.values() for row in of_type if begins_us):
-            row.TimeUS -= begins_us
-        return rows, log.cut_short()
-    finally:
-        log.filehandle.close()
+    for (name, _), columns in forms.items():
+        each = zip(*columns.values(), strict=True)
+        rows[name] += [SimpleNamespace(**dict(zip(columns, values, strict=True))) for values in each]
+    for name in used:
+        rows[name].sort(key=lambda row: getattr(row, WHERE))
+    begins_us = log_evidence.begins_us([_times(of_type) for of_type in rows.values()])
+    for row in (row for of_type in rows.values() for row in of_type if begins_us):
+        row.TimeUS -= begins_us
+    return rows, said == "cut"
 
 
 def _clock(

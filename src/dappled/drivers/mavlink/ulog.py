@@ -16,6 +16,7 @@ from typing import Any, Self
 
 import numpy as np
 
+from dappled import durable
 from dappled.decode.array_types import Floats
 from dappled.drivers import reader_process
 from dappled.drivers.mavlink import log_evidence, log_packets
@@ -65,7 +66,7 @@ def packets(
         for receiver, which in counting:
             for fix in receiver.fixes(which & receiver.fixed):
                 messages += log_packets.receiver(fix, clock)
-        cut = _cut_short(path.read_bytes())
+        cut = _cut_short(durable.read_plain(path))
     log_packets.tell(path, [*told, *missing.findings(path)], report, cut=cut)
     yield from log_packets.packets(messages, clock)
 

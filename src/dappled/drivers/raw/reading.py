@@ -26,9 +26,11 @@ from PIL import Image, UnidentifiedImageError
 
 from dappled.bounds.arrays import read_npy
 from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import check_stored
 from dappled.bounds.pictures import FREE_PIXELS, check_pixels, check_tiff_page, open_picture
 from dappled.drivers.raw import lytro
 from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, RawSource, positive, read_exif
+from dappled.durable import plain_file
 from dappled.errors import DappledError
 
 __all__ = ["ExposureSettings", "RawFile", "RawFileError", "RawSource", "read", "read_metadata"]
@@ -101,14 +103,16 @@ def _label(source: RawSource, name: str | None) -> str:
 def _open(source: RawSource, label: str) -> Iterator[BinaryIO]:
     try:
         if isinstance(source, Path | str):
-            file: BinaryIO = open(source, "rb")  # noqa: SIM115  closed by the with below
-            size = os.fstat(file.fileno()).st_size
+            file: BinaryIO = open(source, "rb", opener=plain_file)  # noqa: SIM115  closed by the with below
         else:
             file = io.BytesIO(source)
-            size = len(source)
     except OSError as error:
         raise RawFileError(f"cannot open the frame {label}: {error.strerror}; check the path") from error
     with file:
+        try:
+            size = _length(file) if isinstance(file, io.BytesIO) else check_stored(file.fileno())
+        except ClaimError as error:
+            raise RawFileError(_sentence(label, error)) from error
         if size == 0:
             raise RawFileError(f"the frame {label} is empty; fetch it from the camera again")
         yield file

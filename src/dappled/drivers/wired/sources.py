@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from dappled import picture_order
+from dappled import durable, picture_order
 from dappled.drivers.camera import Blob, CameraError
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.wired.matching import seconds
@@ -149,7 +149,7 @@ class FolderSource:
     def taken_s(self, found: FoundFile) -> float | None:
         """See FileSource: from EXIF."""
         try:
-            with (self.folder / found.name).open("rb") as file:
+            with open(self.folder / found.name, "rb", opener=durable.plain_file) as file:
                 return seconds(read_exif(file).taken)
         except OSError as error:
             raise self._lost(found, error) from None
@@ -157,7 +157,7 @@ class FolderSource:
     def open(self, found: FoundFile) -> Blob:
         """See FileSource."""
         try:
-            fd = os.open(self.folder / found.name, os.O_RDONLY | os.O_CLOEXEC)
+            fd = durable.plain_file(str(self.folder / found.name), os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
             raise self._lost(found, error) from None
         try:

@@ -21,7 +21,7 @@ def compare(path: Path, links: Mapping[int, ChainLink]) -> Iterator[str]:
     if not blocks:
         return
     try:
-        with open(path, "rb", opener=durable.without_waiting) as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             size = check_stored(file.fileno())
             for link in blocks:
                 start, end = _range(link.key)

@@ -16,6 +16,7 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
+from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_bytes
 from dappled.bounds.pictures import check_tiff_page, open_picture
@@ -123,7 +124,7 @@ def read(path: Path) -> tuple[NDArray[np.float32], tuple[float, float]]:
     Raises DappledError for a file that is not a grey image, or has no resolution.
     """
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             values, density = _read_png(file) if path.suffix.lower() == ".png" else _read_tiff(file)
     except Exception as error:  # the readers raise anything on damaged bytes
         raise DappledError(f"{path} can't be read as an image: {first_line(error)}") from error

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from dappled import durable
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import MOST_BYTES, parse_json, read_log
@@ -147,9 +148,9 @@ def _check_chunk(path: Path, packing: str, chunk: int, name: str) -> int:
     if size > chunk + chunk // 8 + _SLACK_BYTES:
         raise ClaimError(f"a chunk of its {name} has {claims.in_words(size)}, more than it can have: make it anew")
     if packing == "gzip":
-        claims.check_inflated(path.read_bytes(), chunk, f"chunk of {name}", head=_GZIP)
+        claims.check_inflated(durable.read_plain(path), chunk, f"chunk of {name}", head=_GZIP)
         return size
-    with path.open("rb") as file:
+    with open(path, "rb", opener=durable.plain_file) as file:
         head = file.read(18)
     claimed = {"zstd": _zstd_claim, "blosc": _blosc_claim}.get(packing, lambda _: 0)(head)
     if claimed is None or claimed > chunk:

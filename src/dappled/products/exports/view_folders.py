@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled import picture_order
+from dappled import durable, picture_order
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.pictures import open_picture
@@ -57,7 +57,7 @@ def read(folder: Path) -> LightField:
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             yield open_picture(file)
     except Exception as error:  # Pillow raises anything on damaged bytes
         raise DappledError(f"{path} can't be read as a picture: {first_line(error)}") from error

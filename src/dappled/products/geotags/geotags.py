@@ -153,7 +153,7 @@ def copies(
             continue
         where = exif_gps.place(one.camera, one.utc_ns, one.tag.pose)
         try:
-            made = exif_gps.tagged(original.read_bytes(), where)
+            made = exif_gps.tagged(durable.read_plain(original), where)
         except OSError as error:
             raise disk_error("read", original, error) from error
         except ExifError as error:

@@ -61,7 +61,7 @@ def write(path: Path, content: str, *, force: bool = False) -> None:
 
 def _ours(path: Path) -> bool:
     """Whether dappled wrote a sidecar; the mark stands near its beginning. Raises OSError."""
-    with path.open("rb") as file:
+    with open(path, "rb", opener=durable.plain_file) as file:
         return f'xmp:CreatorTool="{_MARK}"'.encode() in file.read(_HEAD_BYTES)
 
 

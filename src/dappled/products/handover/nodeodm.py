@@ -142,7 +142,7 @@ class NodeOdm:
             for done, path in enumerate(files):
                 progress("upload", done, len(files))
                 try:
-                    data = path.read_bytes()
+                    data = durable.read_plain(path)
                 except OSError as error:
                     raise NodeOdmError(f"{path} can't be read: {error.strerror}; nothing was started") from None
                 self._upload(task, _form({}, path.name, data))

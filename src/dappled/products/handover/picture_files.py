@@ -18,7 +18,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled import __version__
+from dappled import __version__, durable
 from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.picture.picture import interpolated
@@ -220,7 +220,7 @@ def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:
 def place_in(path: Path) -> exif_gps.Place | None:
     """The position that a file's own EXIF has; None where it has none."""
     try:
-        with path.open("rb") as file:
+        with open(path, "rb", opener=durable.plain_file) as file:
             exif = Image.Exif()
             if file.read(4) in (b"II*\0", b"MM\0*"):
                 file.seek(0)

@@ -163,7 +163,7 @@ def _encoded(value: Json) -> bytes:
 
 def _read(path: Path) -> Json:
     try:
-        item: Json = parse_json(path.read_bytes(), _ITEM_BYTES)
+        item: Json = parse_json(durable.read_plain(path), _ITEM_BYTES)
         _ = item["bbox"][3], item["properties"]["datetime"]
     except (OSError, ValueError, TypeError, KeyError, IndexError):
         raise DappledError(f"{path} is no item of this batch: remove it, and run the batch again") from None

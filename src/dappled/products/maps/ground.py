@@ -19,6 +19,7 @@ from dappled.errors import DappledError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Geoid, Projection, touch
 from dappled.products.maps.eye import Eye
+from dappled.products.maps.rasters import open_raster
 
 FLAT_SIGMA_M = 1.5  # from grass to roofs, where nothing better is known
 _STEPS = 400  # at most, along a ray through a raster
@@ -145,9 +146,8 @@ def load(
     Heights are taken as above sea level (DTED's are); with a `geoid` they are taken as ellipsoidal and converted.
     Raises DappledError where the file can't be read, is not georeferenced, or does not overlap.
     """
-    rasterio = need("rasterio")
     try:
-        with rasterio.open(path) as source:
+        with open_raster(path) as source:
             values, west, north, step = _posts(source, path, projection, bounds)
     except DappledError:
         raise

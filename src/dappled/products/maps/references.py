@@ -21,6 +21,7 @@ from dappled.errors import DappledError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, touch
 from dappled.products.maps.map_grid import MapGrid, around
+from dappled.products.maps.rasters import open_raster
 
 _MOST_MASK = 256_000_000  # cells
 
@@ -112,9 +113,8 @@ class BaseMap:
         return source.dataset_mask(window=window, out_shape=shape), transform
 
     def _open(self) -> Any:
-        rasterio = need("rasterio")
         with self._sentences():
-            source = rasterio.open(self.path)
+            source = open_raster(self.path)
             placed = source.crs is not None and not source.transform.is_identity
         if not placed:
             source.close()

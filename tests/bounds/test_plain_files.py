@@ -1,0 +1,66 @@
+"""A pipe, a device without end, and a file of holes in the place of a file: one sentence at once, at every door."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from dappled.bounds import arrays, parsing
+from dappled.config import profiles, settings
+from dappled.daemon.stream import curve
+from dappled.decode.geometry import area
+from dappled.drivers.mavlink import dataflash
+from dappled.drivers.raw import reading
+from dappled.errors import DappledError
+from dappled.products import opened
+from dappled.products.exports import mask_files
+from dappled.products.geotags import pos_file, sidecars
+from dappled.products.maps.rasters import open_raster
+
+DOORS: dict[str, Callable[[Path], object]] = {
+    "a.cr2": reading.read,
+    "a.lfp": reading.read,
+    "a.npy": reading.read,
+    "a.npz": opened.light_field,
+    "b.npz": lambda path: arrays.read_npz(path, ["a"]),
+    "a.h5": opened.light_field,
+    "a.png": mask_files.read,
+    "a.tif": open_raster,
+    "a.kml": area.read,
+    "a.pos": pos_file.read,
+    "a.bin": lambda path: list(dataflash.packets(path)),
+    "a.toml": settings.load,
+    "mask.toml": lambda path: profiles.mask(str(path)),
+    "a.key": curve.load_public,
+    "a.xmp": lambda path: sidecars.write(path, "content"),
+    "a.json": parsing.read_bytes,
+}
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def holes(path: Path) -> None:
+    path.touch()
+    os.truncate(path, 1 << 40)
+
+
+@pytest.mark.parametrize("make", [pipe, device, holes])
+@pytest.mark.parametrize("name", DOORS)
+def test_what_is_no_plain_file_is_neither_waited_for_nor_read(
+    tmp_path: Path, name: str, make: Callable[[Path], None]
+) -> None:
+    path = tmp_path / name
+    make(path)
+    with pytest.raises((OSError, ValueError, DappledError)) as refused:
+        DOORS[name](path)
+    said = str(refused.value)
+    assert "plain file" in said or "its content would take" in said or "longer than" in said, said
