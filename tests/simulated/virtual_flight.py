@@ -28,6 +28,7 @@ from dappled.drivers.wired.sources import FolderSource
 from dappled.flight import layout
 from dappled.flight.layout import DiskSpace
 from dappled.mocks.autopilot.autopilot import RATES_HZ, BootTime, Flyer
+from dappled.mocks.autopilot.on_request import OnRequest
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.dng import Exif
@@ -37,13 +38,14 @@ from tests.simulated.memory_links import MemoryNetwork
 from tests.simulated.virtual_clock import VirtualClock
 
 AUTOPILOT, GROUND = 14550, 14551
+EXPOSURE_NS = 10**6
 _OTHERS_HZ = 10.0  # positions
 _IDENTITY = Identity("dappled", "Virtual Camera", "SIM1", "memory")
 
 
 def picture(number: int, utc_ns: int) -> bytes:
     """A raw file that no other number has."""
-    exif = Exif("dappled", "Virtual Camera", "SIM1", 28.0, 8.0, 1e-3, 200, utc_ns)
+    exif = Exif("dappled", "Virtual Camera", "SIM1", 28.0, 8.0, EXPOSURE_NS / 1e9, 200, utc_ns)
     return dng.encode(np.full((32, 48), 256 + number, np.uint16), black=256, white=4095, exif=exif)
 
 
@@ -56,6 +58,7 @@ class MemoryCamera(PlainCamera):
         self._clock, self._fails = clock, fails
         self._random = random.Random(f"camera {seed}")  # noqa: S311  # a simulation
         self._wanted: list[int] = []
+        self.exposed_ns: dict[int, int] = {}  # the middle of each exposure
         self._stopping = threading.Event()
         self._loop = Loop("camera", self._run, self._stopping, clock)
 
@@ -82,6 +85,7 @@ class MemoryCamera(PlainCamera):
     def _expose(self, shot: int) -> None:
         called_ns = self._clock.monotonic_ns()
         self._clock.sleep(self._random.uniform(0.045, 0.075))
+        self.exposed_ns[shot] = self._clock.monotonic_ns() + EXPOSURE_NS // 2
         self.report(Fired(shot, called_ns, self._clock.monotonic_ns()))
         self._clock.sleep(self._random.uniform(0.3, 0.9))
         if not self._random.randrange(self._fails):
@@ -150,13 +154,15 @@ class MemoryStream:
 class VirtualAutopilot:
     """The simulated autopilot, its thread in the clock. Attitudes at `hz`, all else at most at 10 Hz."""
 
-    def __init__(self, clock: VirtualClock, network: MemoryNetwork, seed: int, hz: float, boot: BootTime) -> None:
+    def __init__(self, clock: VirtualClock, network: MemoryNetwork, plan: Plan) -> None:
         self._clock = clock
         url = f"udpout:127.0.0.1:{AUTOPILOT}"
         self._links = MavlinkLinks([url], system_id=1, component_id=1, clock=clock, transport=network)
-        path, send = FlightPath(seed), self._links.sender.send
-        rates = dict.fromkeys(RATES_HZ, min(hz, _OTHERS_HZ)) | {mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: hz}
-        self._flyer = Flyer(path, clock.monotonic_ns(), boot, send, clock=clock, fastest_hz=rates)
+        path, send = FlightPath(plan.seed), self._links.sender.send
+        rates = dict.fromkeys(RATES_HZ, min(plan.hz, _OTHERS_HZ))
+        rates[mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION] = plan.hz
+        has = OnRequest(ground_m=plan.ground_m)
+        self._flyer = Flyer(path, clock.monotonic_ns(), plan.boot, send, has=has, clock=clock, fastest_hz=rates)
         self._loop = Loop("autopilot", self._run, clock=clock)
 
     def start(self) -> None:
@@ -186,7 +192,8 @@ class VirtualFlight:
 @dataclass(frozen=True)
 class Plan:
     """What is flown: `frames` requests, `interval_s` apart, with telemetry at `hz`. `by_files`: the camera is composed
-    of a shutter line and a folder, in place of one that hands over its files itself."""
+    of a shutter line and a folder, in place of one that hands over its files itself. `ground_m`: it has a rangefinder,
+    over ground so high above the take-off place."""
 
     seed: int
     frames: int
@@ -196,6 +203,7 @@ class Plan:
     cuts: tuple[tuple[float, float], ...] = ()
     boot: BootTime = field(default_factory=BootTime)
     by_files: bool = False
+    ground_m: float | None = None
 
 
 def camera(plan: Plan, clock: VirtualClock, card: Path) -> Camera:
@@ -206,11 +214,14 @@ def camera(plan: Plan, clock: VirtualClock, card: Path) -> Camera:
     return ComposedCamera(_IDENTITY, line, FolderSource(card), ComposedSettings(file_s=10.0, hold_s=0.05), clock)
 
 
-def settings(folder: Path) -> Settings:
-    ours = {
+def settings(folder: Path, tables: Mapping[str, Mapping[str, Any]]) -> Settings:
+    """Of a flight in this folder; the tables given come on top."""
+    ours: dict[str, Mapping[str, Any]] = {
         "record": {"directory": str(folder), "min_free_mb": 0},
         "mavlink": {"url": [f"udpin:127.0.0.1:{port}" for port in (AUTOPILOT, GROUND)]},
         "console": {"bind": ""},
+        "camera": {"latency_ms": 60.0, "latency_sigma_ms": 15.0 / 3**0.5},
+        **tables,
     }
     return configuration.resolve(configuration.parse(ours, TomlSource("test")))
 
@@ -236,16 +247,33 @@ def started(part: Any) -> Iterator[None]:
         part.stop()
 
 
-def fly(plan: Plan, folder: Path, watch: Callable[[bytes], object] | None = None) -> VirtualFlight:
-    """Fly it, from the daemon's start to its end. `watch` is shown each datagram of the daemon before it is on its
-    way."""
+@dataclass
+class Airborne:
+    """A flight that goes on: its daemon at work, its autopilot and its ground station connected."""
+
+    clock: VirtualClock
+    service: Service
+    camera: Camera
+    ground: GroundClient
+    flown: VirtualFlight
+    path: FlightPath
+    began_ns: int
+
+
+@contextmanager
+def airborne(
+    plan: Plan, folder: Path, watch: Callable[[bytes], object] | None = None, **tables: Mapping[str, Any]
+) -> Iterator[Airborne]:
+    """Fly, 5 s after the daemon's start until its end. `watch` is shown each datagram of the daemon before it is on its
+    way; `tables` of the settings come on top."""
     with VirtualClock(plan.seed) as clock, memory_disk(plan.seed):
         network, stream = MemoryNetwork(clock, plan.seed, plan.faults, plan.cuts), MemoryStream()
         if watch is not None:
             network.watch = lambda source, data: watch(data) if source in (AUTOPILOT, GROUND) else None
-        instead = StandIns(camera(plan, clock, folder / "card"), network, stream)
-        service = Service(settings(folder / "flights"), clock=clock, instead=instead)
-        autopilot = VirtualAutopilot(clock, network, plan.seed, plan.hz, plan.boot)
+        body = camera(plan, clock, folder / "card")
+        wanted = settings(folder / "flights", tables)
+        service = Service(wanted, clock=clock, instead=StandIns(body, network, stream))
+        autopilot = VirtualAutopilot(clock, network, plan)
         began_ns = clock.monotonic_ns()
         with started(service):
             flown = VirtualFlight(service.folder, sent=network.sent, stream=stream.messages)
@@ -253,10 +281,15 @@ def fly(plan: Plan, folder: Path, watch: Callable[[bytes], object] | None = None
             loop.start()
             with started(autopilot):
                 clock.sleep(5.0)
-                ground = GroundClient(f"udpout:127.0.0.1:{GROUND}", clock=clock, transport=network)
-                with ground:
-                    ground.capture(plan.frames, plan.interval_s, on_outcome=flown.outcomes.append)
+                with GroundClient(f"udpout:127.0.0.1:{GROUND}", clock=clock, transport=network) as ground:
+                    yield Airborne(clock, service, body, ground, flown, FlightPath(plan.seed), began_ns)
             service.ask_to_stop()
             loop.stop(5.0)
         flown.seconds = (clock.monotonic_ns() - began_ns) / 1e9
-    return flown
+
+
+def fly(plan: Plan, folder: Path, watch: Callable[[bytes], object] | None = None) -> VirtualFlight:
+    """All of the plan's requests, each after the last one ended."""
+    with airborne(plan, folder, watch) as now:
+        now.ground.capture(plan.frames, plan.interval_s, on_outcome=now.flown.outcomes.append)
+    return now.flown

@@ -4,18 +4,31 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import pytest
+
 from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.drivers.mavlink.framing import message_of
 from dappled.flight import LedgerReader
+from dappled.mocks.autopilot.autopilot import BootTime
 from tests.simulated.bad_link import LinkFaults
 from tests.simulated.virtual_flight import Plan, VirtualFlight, fly
 from tests.system.flying import assert_whole
 
 TEN_MINUTES = Plan(seed=1, frames=60, interval_s=9.8, hz=5.0, cuts=((100.0, 112.0), (400.0, 403.0)))
+
+
+HOUR = Plan(
+    seed=1,
+    frames=600,
+    interval_s=5.9,
+    cuts=((600.0, 640.0), (1500.0, 1502.0), (3000.0, 3100.0)),
+    boot=BootTime(jumps=((1800.0, 1.5),)),
+)
 
 
 @dataclass
@@ -98,3 +111,13 @@ def test_files_from_a_folder_over_a_very_bad_link(tmp_path: Path) -> None:
     faults = LinkFaults(loss=0.15, doubles=0.1, late_s=0.8, torn=0.03, garbage=0.03)
     plan = Plan(seed=9, frames=8, interval_s=2.0, hz=2.0, faults=faults, cuts=((20.0, 24.0),), by_files=True)
     by_seed(plan, tmp_path / "one")
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_an_hour_with_600_requests_is_lawful_and_the_same_by_seed(tmp_path: Path) -> None:
+    """With attitudes at 50 Hz, three cuts of the links, and 1.5 s that the autopilot's clock gains at once."""
+    began_s = time.process_time()
+    flown = by_seed(HOUR, tmp_path / "one")
+    assert flown.seconds > 3500
+    assert time.process_time() - began_s < 2 * 150  # of a core that other programs use too: 65 s an hour alone

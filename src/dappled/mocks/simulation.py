@@ -38,8 +38,7 @@ class World:
     """What is simulated. `scale` is the sensor's side as a share of the reference camera's 2776 × 3688 px; `f_number`
     0 opens the lens, None stops it down until carriers show; `truth`, for tests, is a folder for the true values.
     `real`: with a round stop, a film printed 0.3 % too fine, and ground whose detail does not end with a slice's band.
-    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in software in the loop.
-    `ground_m`: the vehicle has a rangefinder, over ground so high above the take-off place."""
+    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in software in the loop."""
 
     seed: int = 1
     scale: float = 0.5
@@ -47,7 +46,6 @@ class World:
     truth: Path | None = None
     autopilot: bool = True
     real: bool = False
-    ground_m: float | None = None
 
 
 _ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
@@ -167,13 +165,11 @@ class Simulation:
         self._autopilot = self._start_autopilot(-(time.monotonic_ns() - self.start_monotonic_ns) / 1e9)
 
     def _start_autopilot(self, booted_s: float = BootTime().offset_s) -> Autopilot:
-        ground = () if self.world.ground_m is None else (f"--ground={self.world.ground_m}",)
         return Autopilot.start(
             self.autopilot_url,
             seed=self.world.seed,
             start_monotonic_ns=self.start_monotonic_ns,
             booted_s=booted_s,
-            more=ground,
         )
 
     def _stop_autopilot(self) -> None:
