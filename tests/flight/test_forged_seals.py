@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
+from dappled.findings import Code
 from dappled.flight import Recording, chain, layout, seal_key, seals
 from dappled.flight.checks.flight_check import check
 from dappled.flight.seal_key import SealKey
@@ -74,7 +75,7 @@ def test_links_after_the_signed_seal_are_not_vouched_for(sealed: Path, key: Seal
         forger.fact("utc_correction", {"correction_ns": 86_400 * 10**9})
     found = check(sealed, key)
     assert found.vouched == "not signed"
-    assert f"signed with key {key.name} up to seal" in found.verdict
+    assert (found.verdict.code, found.verdict.facts["key"]) == (Code.SEAL_SIGNED_UNTIL, key.name)
 
 
 @pytest.mark.parametrize("name", ["flight.toml", "shots.jsonl"])

@@ -17,6 +17,7 @@ import pytest
 
 from dappled import durable
 from dappled.clock import RecordedClock
+from dappled.findings import Code
 from dappled.flight import (
     FlightError,
     FlightFolder,
@@ -71,7 +72,7 @@ def test_a_sealed_flight_is_consistent_and_not_signed(sealed: FlightFolder) -> N
     report = check(sealed.path)
     assert (report.problems, report.notes) == ((), ())
     assert report.vouched == "not signed"
-    assert report.verdict == "consistent; not signed: someone who edits on purpose can make the seals anew"
+    assert report.verdict.code is Code.SEAL_NOT_SIGNED
     assert {path: path.read_bytes() for path in files(sealed)} == bytes_before
 
 
@@ -303,7 +304,7 @@ def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: 
     genuine = folder.seals.read_bytes()
     report = check(folder.path, key)
     assert (report.problems, report.vouched) == ((), "signed")
-    assert report.verdict == f"intact, sealed with key {key.name}"
+    assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED, {"key": key.name})
     assert check(folder.path).vouched == check(folder.path, other).vouched == "not verified"
 
     reseal(folder, why="forged")  # its digests fit; its signature doesn't
@@ -317,7 +318,7 @@ def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: 
         pass
     report = check(folder.path, key)
     assert report.problems == ()
-    assert report.verdict.startswith(f"consistent; signed with key {key.name} up to seal 1, then not signed: ")
+    assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED_UNTIL, {"key": key.name, "seal": 1})
 
 
 def test_a_key_is_derived_for_seals_alone(tmp_path: Path) -> None:
@@ -402,7 +403,7 @@ def test_later_work_is_signed_where_the_key_signed_all_before_it(flights: Path, 
     folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
     with seals.work(folder, LATER, "geotag", "geotags flights in", key):
         (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
-    assert check(folder.path, key).verdict == f"intact, sealed with key {key.name}"
+    assert check(folder.path, key).verdict.code is Code.SEAL_SIGNED
 
 
 def added_row(folder: FlightFolder) -> None:
@@ -440,7 +441,7 @@ def test_later_work_does_not_sign_what_somebody_else_did_before_it(
         pass
     report = check(folder.path, key)
     assert report.vouched == "not signed"
-    assert f"signed with key {key.name} up to seal 2, then not signed" in report.verdict
+    assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED_UNTIL, {"key": key.name, "seal": 2})
 
 
 @pytest.mark.parametrize(
@@ -482,7 +483,7 @@ def test_the_start_of_a_daemon_does_not_sign_what_somebody_added(flights: Path, 
     recording.begin(flights, LATER, seal_key=key).close()
     report = check(folder.path, key)
     assert report.vouched == "not signed"
-    assert f"signed with key {key.name} up to seal 1, then not signed" in report.verdict
+    assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED_UNTIL, {"key": key.name, "seal": 1})
 
 
 @pytest.mark.parametrize("name", ["flight.toml", "shots.jsonl", "seals.jsonl", "telemetry.tlog"])

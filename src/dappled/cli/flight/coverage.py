@@ -9,6 +9,7 @@ from pathlib import Path
 from dappled.cli.arguments import refuse_existing
 from dappled.decode.geometry import area as areas
 from dappled.errors import DappledError, counted
+from dappled.findings import to_rows, told
 from dappled.products.maps import coverage, coverage_files, refly
 from dappled.shown import printable
 
@@ -78,7 +79,7 @@ def _said(
     facts = {
         "flight": seen.flight,
         "frames": len(seen.eyes),
-        "left_out": [{"name": name, "why": why} for name, why in seen.left],
+        "left_out": to_rows(seen.left),
         "ground": seen.ground.name,
         "cell_m": covered.grid.step_x,
         "area_m2": round(planned * covered.cell_m2, 1),
@@ -94,8 +95,8 @@ def _said(
         print(json.dumps(facts, indent=2))
         return 1 if missed else 0
     print(f"{counted(len(seen.eyes), 'frame')} on ground {seen.ground.name}, cells of {covered.grid.step_x:.2g} m")
-    for name, why in seen.left:
-        print(printable(f"not counted: {name}: {why}"))
+    for one in seen.left:
+        print(printable(f"not counted: {told(one)}"))
     if seen.unjudged:
         print(f"frames that were not judged in flight, or judged unknown, and count as seen: {seen.unjudged}")
     if area is not None and area.left:

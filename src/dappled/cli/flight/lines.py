@@ -70,7 +70,10 @@ def of_check(found: CheckReport) -> Iterator[str]:
     """The problems, the notes, and the verdict."""
     yield from (f"wrong: {text}" for text in found.problems)
     yield from (f"note:  {text}" for text in found.notes)
-    word, _, rest = (found.verdict if found.intact else "NOT INTACT").partition("; ")
+    word, rest = "NOT INTACT", ""
+    if found.intact:
+        words, signed = findings.told(found.verdict, found.verdict.subject), found.vouched == "signed"
+        word, rest = (f"intact, {words}", "") if signed else ("consistent", words)
     size = f"{found.size / 1e6:.1f} MB"
     packets = counted(found.telemetry_packets, "telemetry packet")
     if found.offloaded:

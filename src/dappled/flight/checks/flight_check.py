@@ -13,12 +13,12 @@ from pathlib import Path
 from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, told
+from dappled.findings import Code, Finding, finding, told
 from dappled.flight import layout, log_reading, provenance, pruning, seals
 from dappled.flight.checks import chain_check, place_check, seal_check, telemetry_check
 from dappled.flight.checks.chain_check import ChainFindings
 from dappled.flight.checks.place_check import PlaceFindings
-from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
+from dappled.flight.checks.seal_check import SEAL, LedgerBytes, SealFindings, Vouched
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -40,7 +40,7 @@ class CheckReport:
     notes: tuple[str, ...]
     offloaded: int
     vouched: Vouched
-    verdict: str
+    verdict: Finding
 
     @property
     def intact(self) -> bool:
@@ -64,7 +64,7 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
     problems: list[str] = []
     notes: list[str] = []
     counts = _Counts()
-    sealed = SealFindings("not sealed", "", (), ())
+    sealed = SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), (), ())
     with _examining("flight.toml", problems):
         layout.read_facts(folder)
     place = PlaceFindings((), (), (), (), None)

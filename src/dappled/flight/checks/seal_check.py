@@ -9,6 +9,7 @@ from typing import Any, Literal
 from dappled import durable
 from dappled.confined import OutsideError
 from dappled.errors import counted
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, seals
 from dappled.flight.chain import ChainLink
 from dappled.flight.layout import FlightFolder
@@ -17,7 +18,7 @@ from dappled.flight.seal_key import SealKey
 from dappled.flight.seals import Seal
 
 Vouched = Literal["signed", "not verified", "not signed", "not sealed"]
-_NOT_SIGNED = "not signed: someone who edits on purpose can make the seals anew"
+SEAL = Subject("seal")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +45,7 @@ class SealFindings:
     the chain after the newest seal."""
 
     vouched: Vouched
-    verdict: str
+    verdict: Finding
     problems: tuple[str, ...]
     notes: tuple[str, ...]
     unsealed: int = 0
@@ -72,7 +73,7 @@ def compare(
     notes += [event.text for event in ledger.events() if event.kind == seals.CHANGED]
     last = file.last
     if last is None:
-        return SealFindings("not sealed", "consistent; not sealed yet", tuple(problems), tuple(notes))
+        return SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), tuple(problems), tuple(notes))
     unsealed = max(0, len(links) - last.links)
     if unsealed:
         notes.append(
@@ -189,14 +190,15 @@ def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[str]:
         yield f"flight.sqlite was changed since seal {last.seal}: its SHA-256 is not the seal's"
 
 
-def _verdict(found: Mapping[int, Seal], last: Seal, key: SealKey | None, unsealed: int) -> tuple[Vouched, str]:
+def _verdict(found: Mapping[int, Seal], last: Seal, key: SealKey | None, unsealed: int) -> tuple[Vouched, Finding]:
     """What the seals vouch for; of `unsealed` links after the newest one they vouch for nothing."""
     if last.key is None or unsealed:
         signed = [number for number, seal in found.items() if key is not None and seal.key == key.name]
-        upto = f"signed with key {key.name} up to seal {max(signed)}, then " if key is not None and signed else ""
-        return "not signed", f"consistent; {upto}{_NOT_SIGNED}"
+        if key is not None and signed:
+            return "not signed", finding(Code.SEAL_SIGNED_UNTIL, SEAL, key=key.name, seal=max(signed))
+        return "not signed", finding(Code.SEAL_NOT_SIGNED, SEAL)
     if key is None:
-        return "not verified", f"consistent; sealed with key {last.key}: --key FILE verifies it"
+        return "not verified", finding(Code.SEAL_UNVERIFIED, SEAL, key=last.key)
     if key.name != last.key:
-        return "not verified", f"consistent; sealed with key {last.key}, not with the given key {key.name}"
-    return "signed", f"intact, sealed with key {last.key}"
+        return "not verified", finding(Code.SEAL_OTHER_KEY, SEAL, key=last.key, given=key.name)
+    return "signed", finding(Code.SEAL_SIGNED, SEAL, key=last.key)

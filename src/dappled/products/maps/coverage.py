@@ -17,7 +17,7 @@ from dappled.decode.geometry.area import PlannedArea
 from dappled.decode.optics import Sensor
 from dappled.drivers.raw import reading
 from dappled.errors import DappledError
-from dappled.findings import text
+from dappled.findings import Code, Finding, Level, Subject, finding, text
 from dappled.flight import LedgerReader, layout
 from dappled.products.maps import ground as grounds
 from dappled.products.maps.earth import EarthError, Projection, utm
@@ -41,7 +41,7 @@ _WHOLE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # the grid of a sensor's 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FramesSeen:
-    """The frames that count, with their eyes by name, on a map; and (name, sentence) of those that don't. `unjudged` of
+    """The frames that count, with their eyes by name, on a map; and why the others don't. `unjudged` of
     those that count have no verdict, or an unknown one."""
 
     flight: str
@@ -49,7 +49,7 @@ class FramesSeen:
     ground: Ground
     eyes: dict[str, Eye]
     stations: tuple[Station, ...]
-    left: tuple[tuple[str, str], ...]
+    left: tuple[Finding, ...]
     mounting: Mounting = field(default_factory=Mounting)
     unjudged: int = 0
 
@@ -102,19 +102,20 @@ def of_flight(
         results = ledger.results()
     states = {index: one.verdict[0] for index, one in results.items() if one.verdict is not None}
     mounting = Mounting.of(layout.read_facts(folder))
-    placed, left = stations(flight, mounting)
+    placed, unplaced = stations(flight, mounting)
+    left = [finding(Code.FRAME_UNPLACED, Subject("frame", name), why=why) for name, why in unplaced]
 
-    def keep(doubt: Callable[[Station], str | None]) -> None:
+    def keep(doubt: Callable[[Station], Finding | None]) -> None:
         found = [(one, doubt(one)) for one in placed]
-        left.extend((one.frame.name, why) for one, why in found if why is not None)
+        left.extend(why for _, why in found if why is not None)
         placed[:] = [one for one, why in found if why is None]
 
     if not count_bad:
-        keep(lambda one: "it was judged bad in flight" if states.get(one.frame.index) == "bad" else None)
+        keep(lambda one: finding(Code.FRAME_JUDGED_BAD, _of(one)) if states.get(one.frame.index) == "bad" else None)
     if not count_doubtful:
         keep(doubt_of)
     if not placed:
-        why = f": {left[0][1]}" if left else ""
+        why = f": {text(left[0])}" if left else ""
         raise DappledError(f"{folder.name} has no frame that can be placed on the ground{why}")
     middle = [sorted(side)[len(placed) // 2] for side in zip(*(_where(one) for one in placed), strict=True)]
     projection = Projection(utm(middle[0], middle[1]))
@@ -126,14 +127,14 @@ def of_flight(
                 sensors[one.tag.camera] = _sensor(one, folder.path)
             eyes[one.name] = eye_of(one, projection, sensors[one.tag.camera])
         except (PhotographError, EyeError, EarthError) as error:
-            left.append((one.frame.name, str(error)))
+            left.append(finding(Code.FRAME_UNPLACED, _of(one), why=str(error)))
     placed = [one for one in placed if one.name in eyes]
     if placed:
         corners = [] if area is None else area.on_map(projection)
         ground = _ground(placed, [*eyes.values()], projection, terrain=terrain, ground_m=ground_m, corners=corners)
         keep(lambda one: _off(one, eyes[one.name], ground, count_doubtful=count_doubtful))
     if not placed:
-        raise DappledError(f"{folder.name} has no frame that looks at the ground: {left[-1][1]}")
+        raise DappledError(f"{folder.name} has no frame that looks at the ground: {text(left[-1])}")
     return FramesSeen(
         folder.name,
         projection,
@@ -150,30 +151,37 @@ def _where(station: Station) -> tuple[float, float]:
     return station.camera.latitude_deg, station.camera.longitude_deg
 
 
-def doubt_of(station: Station) -> str | None:
+def _of(station: Station) -> Subject:
+    return Subject("frame", station.frame.name)
+
+
+def doubt_of(station: Station) -> Finding | None:
     """Why it is in doubt where a frame was taken; None where it isn't."""
     pose = station.tag.pose
     if pose.source not in ("interpolated", "mark"):
-        return f"its position is in doubt: the telemetry nearest to it is {(pose.age_ms or 0) / 1e3:.1f} s away"
+        return finding(Code.POSITION_FAR_TELEMETRY, _of(station), age_s=(pose.age_ms or 0) / 1e3)
     if station.tag.doubts:
-        return f"its place is in doubt, because its time is: {'; '.join(map(text, station.tag.doubts))}"
+        codes = ", ".join(one.code for one in station.tag.doubts)
+        return finding(Code.POSITION_TIME_DOUBTED, _of(station), codes=codes)
     if pose.source == "mark" or pose.gnss is None or pose.gnss.age_ms > _SILENT_MS:
         return None  # no receiver that says how it is: `unjudged` tells that
-    return "its position is in doubt: the receiver had no 3D fix" if pose.gnss.fix_type < _FIX_3D else None
+    return finding(Code.POSITION_WITHOUT_FIX, _of(station)) if pose.gnss.fix_type < _FIX_3D else None
 
 
-def _off(station: Station, eye: Eye, ground: Ground, *, count_doubtful: bool) -> str | None:
+def _off(station: Station, eye: Eye, ground: Ground, *, count_doubtful: bool) -> Finding | None:
     """Why a frame can't be put on the ground: it is below it, or known less well than its footprint asks."""
     level = float(ground.heights(eye.centre[:1], eye.centre[1:2])[0])
     if not math.isfinite(level):
         return None  # beyond the terrain, which `cover` tells
     if not eye.centre[2] > level:
-        return f"the camera was at {eye.centre[2]:.0f} m, below the ground at {level:.0f} m: see --ground, --terrain"
+        at = {"camera_m": float(eye.centre[2]), "ground_m": level}
+        return Finding(Code.FRAME_UNDERGROUND, _of(station), at, Level.CAUTION)
     sigma_m = station.tag.pose.position_sigma_m
     if count_doubtful or sigma_m is None:
         return None
     side_m = min(eye.shape) * eye.gsd_m(level)
-    return None if sigma_m <= _DOUBTFUL * side_m else f"its position is in doubt: it is known to ±{sigma_m:.0f} m"
+    coarse = finding(Code.POSITION_TOO_COARSE, _of(station), sigma_m=sigma_m)
+    return None if sigma_m <= _DOUBTFUL * side_m else coarse
 
 
 def _ground(

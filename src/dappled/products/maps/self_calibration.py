@@ -13,6 +13,7 @@ import numpy as np
 from dappled.config.profiles import Lens
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, counted
+from dappled.findings import Code, Finding, Subject, finding, to_rows
 from dappled.products.maps import lens_solution, matching
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.lens_solution import NAMES, LensSolution, Sightings
@@ -35,14 +36,15 @@ _FARTHEST = 4.0  # sigmas of the lens as given
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FlightLens:
-    """The lens of a flight; `told` (7,) says which of `lens_solution.NAMES` the flight told, `doubts` are sentences."""
+    """The lens of a flight; `told` (7,) says which of `lens_solution.NAMES` the flight told,
+    `doubts` which it did not."""
 
     before: Lens
     solution: LensSolution
     points: int
     sightings: int
     control: int
-    doubts: tuple[str, ...]
+    doubts: tuple[Finding, ...]
 
     @property
     def lens(self) -> Lens:
@@ -75,7 +77,7 @@ class FlightLens:
             "control_points": self.control,
             "scatter_px": self.solution.sigma_px,
             "scatter_before_px": self.solution.before_px,
-            "doubts": list(self.doubts),
+            "doubts": to_rows(self.doubts),
         }
 
 
@@ -115,7 +117,7 @@ def find(
             f"the flight's frames and the lens disagree by more than a lens can be wrong ({name}): are mount, "
             "--focal-length and the telemetry's σ right?"
         )
-    doubts = [f"the flight doesn't tell {name}: it stays as given" for name, known in zip(NAMES, told, strict=True)
+    doubts = [finding(Code.LENS_UNTOLD, Subject("lens"), name=name) for name, known in zip(NAMES, told, strict=True)
               if not known]  # fmt: skip
     good = solution.inliers
     points = len(np.unique(seen.points[good]))
