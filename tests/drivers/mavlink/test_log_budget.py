@@ -35,6 +35,19 @@ def test_a_flood_of_many_senders_and_messages_keeps_within_the_links_rate() -> N
     assert written(LogBudget(), 20_000, 5, senders=1000, messages=1) <= 7 * (128_000 + 16 * 4_000 + 1_000)
 
 
+def test_where_anybody_may_send_all_but_one_autopilot_have_less_than_a_megabyte_a_minute() -> None:
+    budget = LogBudget(anybody=True)
+    of_autopilot = of_others = 0
+    for at in range(60_000):
+        now_ns = at * S // 1000
+        of_autopilot += budget.takes((1, 1), 30 + at % 30, 90, now_ns, "10.0.0.1:14550")
+        for number in range(3):
+            one = 3 * at + number
+            of_others += budget.takes((one % 16 + 1, 1 + one % 2), one // 16 % 64, 280, now_ns, "10.0.0.66:5")
+    assert of_autopilot == 60_000
+    assert 280 * of_others <= 1_000_000
+
+
 def test_who_sends_little_is_written_while_others_flood() -> None:
     budget = LogBudget()
     assert budget.takes((1, 1), 33, 40, 0)

@@ -155,12 +155,23 @@ def test_a_sound_packet_proves_for_five_seconds_and_a_signed_one_for_a_minute() 
 def test_a_full_table_refuses_newcomers_until_somebody_has_gone() -> None:
     peers = Peers()
     for number in range(MOST):
-        peers.shown(("a", number), 20, "sound", 0)
+        peers.shown((f"a{number}", 1), 20, "sound", 0)
     peers.shown(("late", 1), 20, "signed", 4 * S)
     assert ("late", 1) not in peers.receivers(20, 4 * S)
-    peers.shown(("a", 0), 20, "sound", 4 * S)
+    peers.shown(("a0", 1), 20, "sound", 4 * S)
     peers.shown(("late", 1), 20, "signed", 6 * S)
-    assert peers.receivers(20, 6 * S) == [("a", 0), ("late", 1)]
+    assert peers.receivers(20, 6 * S) == [("a0", 1), ("late", 1)]
+
+
+def test_one_host_without_a_signature_keeps_no_other_host_out() -> None:
+    peers = Peers()
+    for at in range(20):
+        for number in range(2 * MOST):
+            peers.shown(("stranger", number), 20, "sound", at * S)
+    peers.shown(("station", 1), 20, "sound", 19 * S)
+    receivers = peers.receivers(20, 19 * S)
+    assert ("station", 1) in receivers
+    assert len(receivers) == MOST - 3
 
 
 def test_calls_of_a_script_that_signs_have_a_port_each_and_none_waits_a_minute() -> None:

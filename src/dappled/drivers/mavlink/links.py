@@ -118,7 +118,7 @@ class Link:
         self.heard_1 = self.heard_2 = False
         self.packets_in = self.packets_out = self.packets_bad = 0
         self.packets_unsent = self.packets_unlogged = self.packets_unrecorded = self.failures = 0
-        self.budgets = {sent: LogBudget() for sent in (False, True)}
+        self.budgets = {sent: LogBudget(anybody=self.exposed and guard is None) for sent in (False, True)}
         self.last_heard_monotonic_ns: int | None = None
 
     def packed(self, message: MavlinkMessage, system_id: int, component_id: int) -> bytes:
@@ -231,7 +231,8 @@ class PacketSender:
         packet_log, number, message = self._log, None, framed.message
         assert packet_log is not None, "packets come and go after `start`"
         source, size = (message.get_srcSystem(), message.get_srcComponent()), _STAMP_BYTES + len(framed.raw)
-        if not link.budgets[sent].takes(source, message.get_msgId(), size, self._clock.monotonic_ns()):
+        address = link.channel.source() if link.channel and not sent else ""
+        if not link.budgets[sent].takes(source, message.get_msgId(), size, self._clock.monotonic_ns(), address):
             link.packets_unrecorded += 1
             return Packet(None, stamp_us, link.number, message, framed.raw, sent, trusted, exposed)
         try:

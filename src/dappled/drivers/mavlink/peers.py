@@ -5,8 +5,9 @@ A peer is *unproven* until a packet of it says something, and costs nothing: its
 brought first): it is sent at most as many bytes as it sent, so that a station whose clock is behind learns the time.
 It is *proven* by a new packet that is obeyed, and is sent everything: for a minute where the packet was signed, else
 for 5 s. At most 16 peers of a port are proven; one that was heard in the last 5 s is never displaced, and a silent one
-only by who signs: a script's calls have a port each. Over a serial line the one at the other end can't be another one;
-a TCP server with a key serves who has proven itself (`TcpServer`).
+only by who signs: a script's calls have a port each. Without a signature the last four are for hosts that have none.
+Over a serial line the one at the other end can't be another one; a TCP server with a key serves who has proven itself
+(`TcpServer`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ Shown = Literal["signed", "sound", "old"]
 """What a packet has shown of its sender: obeyed with a signature, obeyed without one, or rightly signed and not new."""
 
 MOST = 16
+_FOR_OTHER_HOSTS = 4
 _PROVEN_NS: dict[Shown, int] = {"signed": 60 * 10**9, "sound": 5 * 10**9}
 _HEARD_NS = _LIVING_NS = 5 * 10**9
 CREDIT_BYTES = 280  # one packet
@@ -61,6 +63,9 @@ class Peers:
             longest = min(self._proven, key=lambda one: self._proven[one].heard_ns)
             if now_ns - self._proven[longest].heard_ns > _LIVING_NS:
                 del self._proven[longest]
+        crowded = len(self._proven) >= MOST - _FOR_OTHER_HOSTS and evidence == "sound"
+        if crowded and any(host == source[0] for host, _ in self._proven):
+            return
         if len(self._proven) < MOST:
             self._proven[source] = Peer(until_ns, heard_ns=now_ns)
             self._heard.pop(source, None)
