@@ -168,6 +168,13 @@ MUTATIONS = (
         ("daemon/navigation/test_clock_steps.py", "daemon/navigation/test_jumps.py"),
     ),
     Mutation(
+        "a report of the hot shoe from another epoch is used",
+        "daemon/navigation/vehicle_history.py",
+        "between(self._feedbacks, *self.time.span(limit, utc_ns))",
+        "between(self._feedbacks, 0, limit)",
+        ("daemon/navigation/test_owned_triggers.py",),
+    ),
+    Mutation(
         "a path is not confined",
         "confined.py",
         'or not {".", ".."}.isdisjoint(found)',
@@ -194,6 +201,13 @@ MUTATIONS = (
         " and message.cam_idx == mine.cam_idx",
         "",
         ("daemon/replay/test_three_books.py",),
+    ),
+    Mutation(
+        "slices are published before their row is written",
+        "daemon/pipeline/pipeline.py",
+        "        writer.decoded(decoded.result(frame.index",
+        "        self._publish(tag, decoded, judged)\n        writer.decoded(decoded.result(frame.index",
+        ("daemon/pipeline/test_pipeline.py",),
     ),
     Mutation(
         "a frame is announced before it is safe",

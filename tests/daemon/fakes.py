@@ -21,6 +21,7 @@ from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.daemon.pipeline.verdicts import Judge, PictureFacts
+from dappled.daemon.stream.publisher import Stream
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.camera import (
     Arrival,
@@ -290,6 +291,7 @@ def rig(
     queue_: int = 4,
     stop_s: float = 5.0,
     camera: FakeCamera | None = None,
+    publisher: Stream | None = None,
 ) -> Iterator[Rig]:
     """A pipeline at work on a new flight in `flights`; stopped and closed at the end."""
     clock = SystemClock()
@@ -310,7 +312,7 @@ def rig(
         writer,
         NoPoses(),
         decoder=decoder,
-        publisher=None,
+        publisher=publisher,
         latency=BodyLatency(60.0, 15.0),
         names=Names("test", "mask", "geometric"),
         observer=CallingObserver(

@@ -144,6 +144,18 @@ def test_a_shot_without_a_contact_has_no_other_shots_time() -> None:
     assert [one.code for one in exposure.doubts] == [Code.TIME_TRIGGER_UNUSABLE]
 
 
+def test_a_report_from_before_a_reboot_is_no_time_of_a_shot_after_it() -> None:
+    """The autopilot's clock starts again: both were exposed 13.06 s after a start."""
+    vehicle = Vehicle(BootTime(5.0, drift=0.0), (WIRED,), "ardupilot")
+    vehicle.fly(0, 8)
+    vehicle.expose(8.0)
+    vehicle.fly(8.1, 10)
+    vehicle.boot = BootTime(-9.0, drift=0.0)
+    vehicle.fly(10, 24)
+    exposure, _ = vehicle.telemetry.locate(clocks.mid_exposure(START_NS + 22_000 * MS, BodyLatency(60.0, 15.0), 0.002))
+    assert exposure.source != TimeSource.HOT_SHOE
+
+
 def test_what_a_trigger_creates_and_the_settings_that_say_so() -> None:
     inside = BodyLatency.of(CameraSettings())
     outside = BodyLatency.of(CameraSettings(driver="folder"))

@@ -54,6 +54,26 @@ def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
     assert flight_check.check(one.flight.folder.path).intact
 
 
+class Watching:
+    """A stream of which `row` is asked at each message that is published."""
+
+    def __init__(self) -> None:
+        self.row: Callable[[], object] = lambda: None
+        self.seen: dict[str, object] = {}
+
+    def publish(self, topic: str, *_: object) -> None:
+        self.seen.setdefault(topic, self.row())
+
+
+def test_slices_are_published_when_their_row_stands_in_the_ledger(tmp_path: Path) -> None:
+    stream = Watching()
+    with rig(tmp_path, publisher=stream) as one:  # type: ignore[arg-type]  # all that the pipeline asks of one
+        stream.row = lambda: one.flight.ledger.result(0)
+        one.request(1)
+        one.ended(0)
+    assert stream.seen["slices"] is not None
+
+
 def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) -> None:
     def script(shot: int) -> list[CameraEvent | Exception]:
         return [CameraError("no film")] if shot == 0 else good(shot)

@@ -456,7 +456,6 @@ def test_a_flight_that_doesnt_know_its_height_asks_for_the_ground(short_flight: 
         photographs.station(frames[0], None, Mounting())
 
 
-@pytest.mark.slow
 def test_maps_in_a_named_folder_are_not_replaced_unasked(
     short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
