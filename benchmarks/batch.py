@@ -30,6 +30,7 @@ from limits import show
 from dappled.config import profiles
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.geometry import Pose
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
@@ -57,10 +58,12 @@ def flight(folder: Path, count: int, scale: float) -> list[Job]:
     profile = profiles.camera(CAMERA)
     found = calibrate(
         [CalibrationFrame(plane, 50.0, float(raw.f_number or F_NUMBER))],
-        sensor=profile.sensor((plane.shape[0], plane.shape[1])),
-        mask=profiles.mask(MASK).mask,
-        law=profile.law,
-        mask_distance_mm=profile.mask_distance_mm,
+        MaskedOptics(
+            profile.sensor((plane.shape[0], plane.shape[1])),
+            profiles.mask(MASK).mask,
+            profile.law,
+            profile.mask_distance_mm,
+        ),
     )
     calibration = folder / "calibration.toml"
     calibration.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")

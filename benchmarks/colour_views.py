@@ -35,6 +35,7 @@ from views import Frame as GreyFrame
 
 from dappled.decode.colour_views import dc_views, in_colour
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import lineariser
 from dappled.mocks.scene.ray_camera import REAL_COLOURS, RayCamera
@@ -103,7 +104,7 @@ def decoded(family: str, seed: int, shape: tuple[int, int]) -> tuple[Views, dict
     stopped = replace(one.calibration(CALIBRATED_AT), colour_filters=None, level=LEVEL, full_well_e=SNR_100)
     weights = frame.truth.view_weights
     known = calibrated(GreyFrame(frame.plane, stopped.expose().plane, frame.truth.views[..., 1], weights))
-    decoder = MaskDecoder(known.sensor, MASK, "geometric", DISTANCE_MM, known, colours=True)
+    decoder = MaskDecoder(MaskedOptics(known.sensor, MASK, "geometric", DISTANCE_MM), known, colours=True)
     rows = lineariser(frame.plane.shape, black=0.0, white=1.0, cfa=CFA, reference=[1]).apply(frame.plane)
     field = decoder.decode(rows, focal_length_mm=FOCAL_MM, f_number=F_NUMBER)
     true = [at_samples(in_band(frame.truth.views[..., colour]), field) for colour in COLOURS]

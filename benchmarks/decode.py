@@ -34,6 +34,7 @@ from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield.aperture import Aperture, transfer
 from dappled.decode.lightfield.views import from_slices
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum import Lineariser, Plane, Slices
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import lineariser
@@ -127,7 +128,7 @@ def masked(workers: int) -> MaskDecoder:
     """The S5200 with the full second mask under the law `fd`."""
     camera = profiles.camera("fujifilm-s5200")
     mask = profiles.mask("mask-2-full").mask
-    return MaskDecoder(camera.sensor(SHAPE), mask, "fd", camera.mask_distance_mm, workers=workers)
+    return MaskDecoder(MaskedOptics(camera.sensor(SHAPE), mask, "fd", camera.mask_distance_mm), workers=workers)
 
 
 def slices(buffers: SpectrumBuffers, linear: Lineariser, decoder: MaskDecoder, mosaic: Mosaic, length: float) -> Slices:
@@ -172,7 +173,7 @@ def textbook(mosaic: Mosaic, decoder: MaskDecoder, length: float) -> list[NDArra
     lattice = decoder.lattice_at(length)
     height, width = int(lattice.ky[0] * SHAPE[0]), int(lattice.kx[1] * SHAPE[1])
     made = []
-    half = decoder.mask.half_orders()
+    half = decoder.optics.mask.half_orders()
     for carrier in lattice.carriers([*half, *((-ky, -kx) for ky, kx in half if (ky, kx) != (0, 0))]):
         row = SHAPE[0] // 2 + round(carrier.fy * SHAPE[0]) - height // 2
         column = SHAPE[1] // 2 + round(carrier.fx * SHAPE[1]) - width // 2

@@ -21,7 +21,7 @@ from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.optics import Mask, Sensor
+from dappled.decode.optics import Mask, MaskedOptics, Sensor
 from dappled.mocks.scene import chip_faults
 from dappled.mocks.scene.ray_camera import RayCamera
 
@@ -48,7 +48,7 @@ class MaskedFrame:
             well = snr**2 / LEVEL
             plane = chip_faults.with_noise(plane, well, 0.0, np.random.default_rng([seed, 41]))
         known = calibrated(len(plane))
-        decoder = MaskDecoder(known.sensor, MASK, "geometric", DISTANCE_MM, known)
+        decoder = MaskDecoder(MaskedOptics(known.sensor, MASK, "geometric", DISTANCE_MM), known)
         field = decoder.decode(plane, focal_length_mm=FOCAL_MM, f_number=F_NUMBER)
         return field, self._truth_on(field)
 
@@ -75,7 +75,7 @@ def calibrated(side_px: int) -> Calibration:
     white = replace(camera(side_px).calibration(WHITE_AT), level=0.2, full_well_e=28_600.0).expose().plane
     sensor = Sensor((side_px, side_px), (0.01, 0.0), (0.0, 0.01))
     shot = CalibrationFrame(white, FOCAL_MM, WHITE_AT)
-    return calibrate([shot], sensor=sensor, mask=MASK, law="geometric", mask_distance_mm=DISTANCE_MM)
+    return calibrate([shot], MaskedOptics(sensor, MASK, "geometric", DISTANCE_MM))
 
 
 def expose(scene: Scene, side: int, points: int = POINTS) -> MaskedFrame:

@@ -29,7 +29,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.optics import Mask, Sensor
+from dappled.decode.optics import Mask, MaskedOptics, Sensor
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE
 from dappled.mocks.scene.ray_camera import RayCamera
 from dappled.mocks.scene.sharp_boards import SharpBoard
@@ -205,7 +205,7 @@ def calibrated(frame: Frame) -> Calibration:
     """The calibration of a frame's camera, by its white frame."""
     sensor = Sensor((frame.plane.shape[0], frame.plane.shape[1]), (PITCH_MM, 0.0), (0.0, PITCH_MM))
     shot = CalibrationFrame(frame.white, FOCAL_MM, CALIBRATED_AT)
-    return calibrate([shot], sensor=sensor, mask=MASK, law="geometric", mask_distance_mm=DISTANCE_MM)
+    return calibrate([shot], MaskedOptics(sensor, MASK, "geometric", DISTANCE_MM))
 
 
 def at_samples(views: NDArray[np.float32], field: LightField) -> NDArray[np.float32]:
@@ -239,7 +239,9 @@ def reached(frame: Frame, f_number: float, disparity: NDArray[np.float32] | None
     """Decode a frame both ways, and told its true `disparity` (H, W), dx/dθ, if that is given."""
     calibration = calibrated(frame)
     clipped = (frame.plane >= WHITE_SHARE).astype(np.float32)
-    decoder = MaskDecoder(calibration.sensor, MASK, "geometric", DISTANCE_MM, calibration, clipped=clipped)
+    decoder = MaskDecoder(
+        MaskedOptics(calibration.sensor, MASK, "geometric", DISTANCE_MM), calibration, clipped=clipped
+    )
     began = time.process_time()
     joint = decoder.decode(frame.plane, focal_length_mm=FOCAL_MM, f_number=f_number)
     took = time.process_time() - began

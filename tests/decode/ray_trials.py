@@ -12,6 +12,7 @@ from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.errors import DecodeError
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Mask, Sensor
 from tests.decode import rays
 from tests.decode.ray_frames import CANON, FUJI, MASKS, Body, Film, Order, Shot, Stop
@@ -37,10 +38,7 @@ def calibrated(shot: Shot, law: str = "fd", film: Film | None = None) -> Calibra
     frame = CalibrationFrame(shot.frame(), shot.focal_length_mm, shot.f_number)
     return calibrate(
         [frame],
-        sensor=sensor_of(shot.body),
-        mask=mask_of(film or shot.film),
-        law=law,
-        mask_distance_mm=STATED_MM,
+        MaskedOptics(sensor_of(shot.body), mask_of(film or shot.film), law, STATED_MM),
         choose_law=True,
     )
 
@@ -105,7 +103,7 @@ def noisy(scene: NDArray[np.float64], rng: np.random.Generator) -> CalibrationFr
 def shows_no_carriers(frame: CalibrationFrame, film: Film, body: Body = SMALL, law: str = "geometric") -> bool:
     """Whether a frame without a film is refused as such; False where a lattice was found in it."""
     try:
-        calibrate([frame], sensor=sensor_of(body), mask=mask_of(film), law=law, mask_distance_mm=STATED_MM)
+        calibrate([frame], MaskedOptics(sensor_of(body), mask_of(film), law, STATED_MM))
     except DecodeError as refused:
         return "no carriers" in str(refused)
     return False
@@ -126,12 +124,9 @@ def print_costs_db(scale: float, seed: int, beams: int, snr: float = 100.0) -> t
     for mask in (rays.MASK, camera.mask):
         known = calibrate(
             [CalibrationFrame(white, rays.FOCAL_MM, rays.STOPPED_F)],
-            sensor=rays.SENSOR,
-            mask=mask,
-            law="geometric",
-            mask_distance_mm=rays.STATED_DISTANCE_MM,
+            MaskedOptics(rays.SENSOR, mask, "geometric", rays.STATED_DISTANCE_MM),
         )
-        decoder = MaskDecoder(rays.SENSOR, mask, "geometric", rays.STATED_DISTANCE_MM, known)
+        decoder = MaskDecoder(MaskedOptics(rays.SENSOR, mask, "geometric", rays.STATED_DISTANCE_MM), known)
         field = decoder.decode(plane, focal_length_mm=rays.FOCAL_MM, f_number=rays.FULL_F)
         truth = camera.truth(scene, field.grid, (field.views.shape[2], field.views.shape[3]))
         found.append(rays.psnr(field.views, truth))

@@ -10,6 +10,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import DecodeReport, MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Mask
 from dappled.findings import Code
 from tests.decode.ray_trials import print_costs_db
@@ -35,15 +36,12 @@ def _calibration(camera: Camera, noise: float = 0.0, design: Mask | None = None)
     plane = (plane + rng.normal(0, noise, plane.shape)).astype(np.float32)
     return calibrate(
         [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
-        sensor=SENSOR,
-        mask=design or camera.mask,
-        law="geometric",
-        mask_distance_mm=STATED_DISTANCE_MM,
+        MaskedOptics(SENSOR, design or camera.mask, "geometric", STATED_DISTANCE_MM),
     )
 
 
 def _decoder(calibration: Calibration | None = None, mask: Mask = MASK, workers: int = 1) -> MaskDecoder:
-    return MaskDecoder(SENSOR, mask, "geometric", STATED_DISTANCE_MM, calibration, workers=workers)
+    return MaskDecoder(MaskedOptics(SENSOR, mask, "geometric", STATED_DISTANCE_MM), calibration, workers=workers)
 
 
 def _scene(seed: int) -> list[tuple[Texture, float]]:
@@ -248,6 +246,6 @@ def test_bad_calls_are_refused_in_words(stopped: tuple[Camera, Plane]) -> None:
     with pytest.raises(DecodeError, match="fall off the sensor"):
         _decoder(mask=Mask(80.0, 1)).decode(stopped[1], focal_length_mm=50.0)
     with pytest.raises(DecodeError, match="unknown law"):
-        MaskDecoder(SENSOR, MASK, "none", 1.0)
+        MaskDecoder(MaskedOptics(SENSOR, MASK, "none", 1.0))
     with pytest.raises(DecodeError, match="another mask"):
         _decoder(_calibration(stopped[0]), mask=Mask(14.0, 2))

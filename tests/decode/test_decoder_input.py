@@ -12,6 +12,7 @@ import pytest
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.errors import DecodeError
 from dappled.decode.lenslets import LensletDecoder
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum.lineariser import LinearRows, lineariser
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM
 
@@ -20,7 +21,9 @@ SHAPE = (600, 800)
 
 
 def _decoder(shape: tuple[int, int], workers: int = 1) -> MaskDecoder:
-    return MaskDecoder(replace(SENSOR, shape=shape), MASK, "geometric", STATED_DISTANCE_MM, workers=workers)
+    return MaskDecoder(
+        MaskedOptics(replace(SENSOR, shape=shape), MASK, "geometric", STATED_DISTANCE_MM), workers=workers
+    )
 
 
 def _rows(shape: tuple[int, int], seed: int = 0) -> LinearRows:
@@ -30,7 +33,7 @@ def _rows(shape: tuple[int, int], seed: int = 0) -> LinearRows:
 
 
 def _slices(decoder: MaskDecoder, seed: int) -> bytes:
-    field, _ = decoder.decode_reported(_rows(decoder.sensor.shape, seed), focal_length_mm=FOCAL_MM, views=False)
+    field, _ = decoder.decode_reported(_rows(decoder.optics.sensor.shape, seed), focal_length_mm=FOCAL_MM, views=False)
     return field.slices.tobytes()
 
 

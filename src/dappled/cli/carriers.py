@@ -158,11 +158,11 @@ def _predicted(arguments: argparse.Namespace) -> Table:
     camera = profiles.camera(arguments.camera)
     darkroom = Darkroom(decode_arguments.recipe(arguments))
     decoder = darkroom.mask_decoder((arguments.shape[0], arguments.shape[1]), next(iter(camera.models), ""))
-    mask = decoder.mask
+    mask = decoder.optics.mask
     lattice = decoder.lattice_at(arguments.focal_length)
     orders = sorted([*mask.orders(), *(crossed_orders(mask) if arguments.crossed else [])])
     rows = [(carrier, None) for carrier in lattice.carriers(orders)]
-    return Table(decoder.sensor.shape, decoder.law, arguments.focal_length, lattice, rows, _main(mask))
+    return Table(decoder.optics.sensor.shape, decoder.optics.law, arguments.focal_length, lattice, rows, _main(mask))
 
 
 def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
@@ -206,7 +206,7 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
         known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
         lattice = decoder.lattice_at(length)
-        mask = decoder.mask
+        mask = decoder.optics.mask
         halves = lattice.carriers(mask.half_orders())
         if arguments.crossed:
             between = [order for order in crossed_orders(mask) if order > (0, 0)]
@@ -214,10 +214,10 @@ def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
             near = measure(spectrum, used.carriers(between), 2.0)
             known |= dict(zip(between, near, strict=True))
         rows = _both_halves([(c, known.get((c.ky, c.kx))) for c in halves])
-        turned = lattice_rotation(used, decoder.sensor)
+        turned = lattice_rotation(used, decoder.optics.sensor)
         return plane, Table(
             shape,
-            decoder.law,
+            decoder.optics.law,
             length,
             lattice,
             rows,

@@ -32,7 +32,8 @@ from dappled.decode.lightfield.aperture import (
 )
 from dappled.decode.lightfield.light_field import LightField, no_views
 from dappled.decode.lightfield.views import Views
-from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Sensor
+from dappled.decode.optics import MaskedOptics
+from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.optics.visibility import designs
 from dappled.decode.spectrum.lineariser import LinearRows
 from dappled.decode.spectrum.peaks import (
@@ -152,8 +153,8 @@ class Decoder(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MaskDecoder:
-    """Decodes frames from behind a printed mask. The carriers are predicted by the calibration, or else by the law from
-    `mask_distance_mm`. Where enough of them are seen near the prediction, the frame's own lattice is used.
+    """Decodes frames from behind a printed mask. The carriers are predicted by the calibration, or else by the law.
+    Where enough of them are seen near the prediction, the frame's own lattice is used.
     `focal_sigma_mm` is the error of the focal length (half of the EXIF rounding), which widens the search. `size` of
     the slices in bins of the padded transform; None: as large as the spacing allows. Views need a calibration, or a
     frame that shows its carriers; else only the slices are there, and `views` has the shape (0, 0, h, w). `colours`
@@ -164,10 +165,7 @@ class MaskDecoder:
     pixels are clipped, else 0; None: nowhere. `buffers` are reused from frame to frame.
     """
 
-    sensor: Sensor
-    mask: Mask
-    law: str
-    mask_distance_mm: float
+    optics: MaskedOptics
     calibration: Calibration | None = None
     size: tuple[int, int] | None = None
     aperture: Aperture | None = None
@@ -182,22 +180,22 @@ class MaskDecoder:
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     def __post_init__(self) -> None:
-        """Raises DecodeError for an unknown law, or another camera's calibration."""
-        if self.law not in LAWS:
-            raise DecodeError(f"unknown law {self.law!r}; known are {', '.join(LAWS)}")
+        """Raises DecodeError for another camera's calibration."""
         known = self.calibration
-        if known is not None and (known.mask != self.mask or known.law != self.law):
+        if known is not None and (known.mask != self.optics.mask or known.law != self.optics.law):
             raise DecodeError(
                 "the calibration was made with another mask or law: calibrate again, or choose that mask and law"
             )
-        if known is not None and known.shape != self.sensor.shape:
-            raise DecodeError(f"the calibration is for frames of {known.shape}, this camera's are {self.sensor.shape}")
+        if known is not None and known.shape != self.optics.sensor.shape:
+            raise DecodeError(
+                f"the calibration is for frames of {known.shape}, this camera's are {self.optics.sensor.shape}"
+            )
 
     def lattice_at(self, focal_length_mm: float) -> Lattice:
         """The predicted lattice."""
         if self.calibration is not None:
             return self.calibration.lattice_at(focal_length_mm)
-        lattice = LAWS[self.law](self.mask, self.sensor, self.mask_distance_mm, focal_length_mm)
+        lattice = self.optics.lattice(focal_length_mm)
         if self.ratio is None:
             return lattice
         (ay, ax), (by, bx) = np.reshape(self.ratio, (2, 2)) @ lattice.matrix()
@@ -205,7 +203,7 @@ class MaskDecoder:
 
     def predict(self, focal_length_mm: float) -> list[Carrier]:
         """The half plane's carriers that lie on the sensor, (0, 0) first."""
-        return [c for c in self.lattice_at(focal_length_mm).carriers(self.mask.half_orders()) if c.on_sensor]
+        return [c for c in self.lattice_at(focal_length_mm).carriers(self.optics.mask.half_orders()) if c.on_sensor]
 
     def decode(
         self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
@@ -221,9 +219,9 @@ class MaskDecoder:
             raise DecodeError("the frame's focal length is unknown: give it with --focal-length")
         if not (focal_length_mm > 0 and (f_number is None or f_number > 0)):
             raise DecodeError(f"focal length {focal_length_mm} mm and f-number {f_number} must be above 0")
-        if plane.shape != self.sensor.shape:
+        if plane.shape != self.optics.sensor.shape:
             raise DecodeError(
-                f"the frame is {plane.shape} px, this camera's are {self.sensor.shape}: choose its profile"
+                f"the frame is {plane.shape} px, this camera's are {self.optics.sensor.shape}: choose its profile"
             )
         predicted = self.predict(focal_length_mm)
         if len(predicted) < 2:
@@ -231,7 +229,7 @@ class MaskDecoder:
                 f"all carriers but the mean fall off the sensor at {focal_length_mm} mm: "
                 "check mask, law and focal length"
             )
-        with self.buffers.lend(self.sensor.shape) as tiles:
+        with self.buffers.lend(self.optics.sensor.shape) as tiles:
             reach = self.largest_fx(focal_length_mm)
             spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=reach)
             lattice, measured, carriers_from = self.locate(spectrum, focal_length_mm, predicted)
@@ -265,7 +263,7 @@ class MaskDecoder:
             (*(made.moved or self._moved(slices, lattice, focal_length_mm)), *made.findings),
         )
         facts: dict[str, Any] = {
-            "law": self.law,
+            "law": self.optics.law,
             "focal_length_mm": focal_length_mm,
             "f_number": f_number,
             "mask_distance_mm": self._distance(focal_length_mm),
@@ -291,7 +289,7 @@ class MaskDecoder:
     def largest_fx(self, focal_length_mm: float) -> float:
         """The largest frequency along columns that slices and searches need, in cycles/pixel."""
         predicted = self.predict(focal_length_mm)
-        wide = padded_shape(self.sensor.shape)[1]
+        wide = padded_shape(self.optics.sensor.shape)[1]
         turned = 0.0 if self._placed else _ROTATION
         longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers([(c.ky, c.kx) for c in predicted])
         reach = max(abs(c.fx) * (1 + turned) + abs(c.fx - far.fx) for c, far in zip(predicted, longer, strict=True))
@@ -300,7 +298,7 @@ class MaskDecoder:
 
     def slice_size(self, lattice: Lattice) -> tuple[int, int]:
         """(height, width) of the bands in bins of the padded transform."""
-        return self.size or lattice.slice_size(padded_shape(self.sensor.shape))
+        return self.size or lattice.slice_size(padded_shape(self.optics.sensor.shape))
 
     def locate(
         self, spectrum: Spectrum, focal_length_mm: float, predicted: Sequence[Carrier]
@@ -330,7 +328,7 @@ class MaskDecoder:
 
     def radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
         """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""
-        high, wide = padded_shape(self.sensor.shape)
+        high, wide = padded_shape(self.optics.sensor.shape)
         orders = [(c.ky, c.kx) for c in carriers]
         longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers(orders)
         spacing = min(math.hypot(v[0] * high, v[1] * wide) for v in self.lattice_at(focal_length_mm).matrix())
@@ -353,7 +351,7 @@ class MaskDecoder:
     def _distance(self, focal_length_mm: float) -> float:
         if self.calibration is not None:
             return self.calibration.nearest(focal_length_mm).mask_distance_mm
-        return self.mask_distance_mm
+        return self.optics.distance_mm
 
     def _moved(self, slices: Slices, lattice: Lattice, focal_length_mm: float) -> tuple[Finding, ...]:
         """How far the frame's slices show the mask from where the calibration has it."""
@@ -366,7 +364,7 @@ class MaskDecoder:
             focal_length_mm=focal_length_mm,
             lattice=lattice,
             samples_px=(float(slices.grid[0, 0]), float(slices.grid[1, 1])),
-        ).findings(self.mask.frequency_per_mm)
+        ).findings(self.optics.mask.frequency_per_mm)
 
     def views(
         self,
@@ -384,18 +382,18 @@ class MaskDecoder:
         none = MadeViews(*no_views(slices.values.shape[1:]))
         if f_number is None:
             return none
-        printed = self.mask.frequency_per_mm
+        printed = self.optics.mask.frequency_per_mm
         if self.calibration is not None:
             printed *= self.calibration.nearest(focal_length_mm).print_scale
         cycles = kappa(printed, self._distance(focal_length_mm), focal_length_mm, f_number)
-        across, down = math.hypot(*self.sensor.column_mm), math.hypot(*self.sensor.row_mm)
+        across, down = math.hypot(*self.optics.sensor.column_mm), math.hypot(*self.optics.sensor.row_mm)
         taken = TakenSlices(
             slices.values,
             slices.carriers,
             np.ones(len(slices.carriers), dtype=np.complex128),
             kappa_cycles=cycles,
             rotation_rad=0.0,
-            aperture=self.aperture or Aperture(self.mask.views_per_axis),
+            aperture=self.aperture or Aperture(self.optics.mask.views_per_axis),
             samples_px=(float(np.hypot(*slices.grid[:, 0])), float(np.hypot(*slices.grid[:, 1]))),
             row_over_column=down / across,
             noise_variance=noise_rms**2 * slices.band,
@@ -417,9 +415,7 @@ class MaskDecoder:
             views_from: ViewsFrom = "calibration"
         elif carriers_from == "measured":
             rotation = turn_between(lattice, self.lattice_at(focal_length_mm))
-            drawn = designs(
-                self.mask, self.sensor, lattice, self.mask_distance_mm, f_number=f_number, orders=taken.orders
-            )
+            drawn = designs(self.optics, lattice, f_number, taken.orders)
             width = shown_aperture(
                 slices.values,
                 drawn,
@@ -461,14 +457,14 @@ class MaskDecoder:
             views_from,
             facts,
             made.findings if strange is None else (strange, *made.findings),
-            () if place is None else moved(place.periods, place.turn_rad, self.mask.frequency_per_mm),
+            () if place is None else moved(place.periods, place.turn_rad, self.optics.mask.frequency_per_mm),
         )
 
     def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:
         """The slices of a plane whose clipped pixels are as bright as what is around them tells."""
         assert self.clipped is not None
         whole = plane.plane(self.workers) if isinstance(plane, LinearRows) else plane
-        with self.buffers.lend(self.sensor.shape) as tiles:
+        with self.buffers.lend(self.optics.sensor.shape) as tiles:
             spectrum = transform(unclipped(whole, self.clipped, taken), tiles=tiles, workers=self.workers)
             size = self.slice_size(lattice)
             return extract(spectrum, taken.carriers, size, taper=self.taper, workers=self.workers).values
@@ -478,15 +474,15 @@ class MaskDecoder:
     ) -> tuple[TakenSlices, UsedAperture, MaskPlace | None]:
         """The slices with a calibration's transfers, and the aperture that they show; with the joint model, where
         they place the mask, and as a mask in its place would make them."""
-        magnitudes = dict(zip(self.mask.half_orders(), known.transfer, strict=True))
-        corner = at_corner(known.origin, lattice, self.sensor.shape)
+        magnitudes = dict(zip(self.optics.mask.half_orders(), known.transfer, strict=True))
+        corner = at_corner(known.origin, lattice, self.optics.sensor.shape)
         transfers = transfer(taken.orders, [magnitudes[order] for order in taken.orders], corner)
         taken = replace(taken, transfers=transfers, rotation_rad=known.rotation_rad)
         width = taken.width(distance_known=known.distance_fitted)
         found = taken.through(width)
         if not self.joint_views:
             return found, width, None
-        turned = cycles_per_radian(lattice, self.sensor)
+        turned = cycles_per_radian(lattice, self.optics.sensor)
         place = place_of(found.used(), turned, taken.samples_px, workers=self.workers)
         if place is None or not place.moved:
             return found, width, place

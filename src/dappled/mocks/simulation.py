@@ -22,6 +22,7 @@ import tomli_w
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.errors import DappledError
@@ -232,10 +233,12 @@ def write_calibration(camera: MaskedCamera, folder: Path, profile_name: str = CA
     assert raw.f_number is not None
     found = calibrate(
         [CalibrationFrame(plane, raw.focal_length_mm, raw.f_number)],
-        sensor=profile.sensor((plane.shape[0], plane.shape[1])),
-        mask=profiles.mask(mask_name).mask,
-        law=profile.law,
-        mask_distance_mm=profile.mask_distance_mm,
+        MaskedOptics(
+            profile.sensor((plane.shape[0], plane.shape[1])),
+            profiles.mask(mask_name).mask,
+            profile.law,
+            profile.mask_distance_mm,
+        ),
         choose_law=profile_name == EOS_450D,  # its profile's law is not that of rays
     )
     path = folder / "calibration.toml"

@@ -10,6 +10,7 @@ import pytest
 from dappled.decode.calibration.calibration import Calibration, _shift
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.optics import MaskedOptics
 from dappled.findings import Code, Finding
 from tests.decode.rays import FOCAL_MM, FULL_F, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Texture
 
@@ -22,10 +23,7 @@ def calibrated() -> tuple[Camera, Calibration]:
     plane = camera.expose([(Texture.random(np.random.default_rng(1)), 0.0)], STOPPED_F)
     found = calibrate(
         [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
-        sensor=SENSOR,
-        mask=MASK,
-        law="geometric",
-        mask_distance_mm=STATED_DISTANCE_MM,
+        MaskedOptics(SENSOR, MASK, "geometric", STATED_DISTANCE_MM),
     )
     return camera, found
 
@@ -35,7 +33,9 @@ def _doubt(camera: Camera, known: Calibration, seed: int = 7, f_number: float = 
     layers = [(Texture.random(rng, waves=60), 1.4), (Texture.random(rng, waves=60), -0.6)]
     plane = camera.expose(layers, f_number)
     plane = (plane + rng.normal(0, 0.008, plane.shape)).astype(np.float32)
-    decoder = MaskDecoder(SENSOR, MASK, "geometric", STATED_DISTANCE_MM, calibration=known, joint_views=False)
+    decoder = MaskDecoder(
+        MaskedOptics(SENSOR, MASK, "geometric", STATED_DISTANCE_MM), calibration=known, joint_views=False
+    )
     _, report = decoder.decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=f_number)
     return [one for one in report.doubts if one.code in (Code.MASK_SHIFTED, Code.MASK_TURNED)]
 

@@ -11,6 +11,7 @@ from dappled.decode.calibration.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import at_centre, at_corner, origin_of, transfer
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Lattice, Mask, Pattern
 from dappled.findings import Code
 from tests.decode.rays import FOCAL_MM, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Texture
@@ -22,10 +23,7 @@ def _calibrate(camera: Camera, seed: int = 0, noise: float = 0.0) -> Calibration
     plane = (plane + rng.normal(0, noise, plane.shape)).astype(np.float32)
     return calibrate(
         [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
-        sensor=SENSOR,
-        mask=MASK,
-        law="geometric",
-        mask_distance_mm=STATED_DISTANCE_MM,
+        MaskedOptics(SENSOR, MASK, "geometric", STATED_DISTANCE_MM),
     )
 
 
@@ -62,7 +60,7 @@ def test_several_focal_lengths_are_interpolated() -> None:
         CalibrationFrame(camera.expose([(Texture.random(np.random.default_rng(k)), 0.5)], STOPPED_F), f, STOPPED_F)
         for k, f in enumerate((50.0, 50.0, 60.0))
     ]
-    found = calibrate(frames, sensor=SENSOR, mask=MASK, law="geometric", mask_distance_mm=STATED_DISTANCE_MM)
+    found = calibrate(frames, MaskedOptics(SENSOR, MASK, "geometric", STATED_DISTANCE_MM))
     assert [f.focal_length_mm for f in found.fits] == [50.0, 60.0]
     assert found.fits[0].mask_distance_mm == pytest.approx(base.mask_distance_mm, rel=0.02)
     sizes = [found.lattice_at(f).kx[1] for f in (50.0, 55.0, 60.0)]
@@ -88,7 +86,7 @@ def test_the_centre_and_the_corner_tell_the_same_phase() -> None:
 def test_bad_frames_and_files_are_refused_in_words() -> None:
 
     def attempt(*frames: CalibrationFrame, law: str = "geometric") -> None:
-        calibrate(frames, sensor=SENSOR, mask=MASK, law=law, mask_distance_mm=STATED_DISTANCE_MM)
+        calibrate(frames, MaskedOptics(SENSOR, MASK, law, STATED_DISTANCE_MM))
 
     noise = np.random.default_rng(0).normal(0.5, 0.1, SENSOR.shape).astype(np.float32)
     with pytest.raises(DecodeError, match=r"should stand out at f/59\.\d+ and no lattice of this mask does"):
@@ -124,10 +122,7 @@ def _of_another_print(pattern: Pattern) -> tuple[Camera, Callable[[], Calibratio
     plane = camera.expose([(Texture.random(np.random.default_rng(3)), 1.0)], STOPPED_F)
     return camera, lambda: calibrate(
         [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
-        sensor=SENSOR,
-        mask=Mask(15.5, 2, pattern),
-        law="geometric",
-        mask_distance_mm=STATED_DISTANCE_MM,
+        MaskedOptics(SENSOR, Mask(15.5, 2, pattern), "geometric", STATED_DISTANCE_MM),
     )
 
 
@@ -149,10 +144,7 @@ def test_the_other_law_s_frames_are_found_too() -> None:
     for choose, law in ((False, "fd"), (True, "geometric")):
         found = calibrate(
             [CalibrationFrame(plane, FOCAL_MM, STOPPED_F)],
-            sensor=SENSOR,
-            mask=MASK,
-            law="fd",
-            mask_distance_mm=STATED_DISTANCE_MM,
+            MaskedOptics(SENSOR, MASK, "fd", STATED_DISTANCE_MM),
             choose_law=choose,
         )
         assert found.law == law

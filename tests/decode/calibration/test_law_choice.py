@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dappled.decode.calibration.law_choice import LawVerdict, judge, steps_bins
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Sensor
 from dappled.findings import Code
 from tests.decode.thesis_tables import MASK_2, S5200
@@ -24,7 +25,7 @@ def _seen(law: str, distance_mm: float, *, pupil_mm: float = 0.0, stretch: float
 
 
 def _judged(seen: Seen, asked: str = "fd") -> LawVerdict:
-    return judge(seen, sensor=CHIP, mask=MASK, stated_mm=0.48, asked=asked)
+    return judge(seen, MaskedOptics(CHIP, MASK, asked, 0.48))
 
 
 @pytest.mark.parametrize("law", ["fd", "geometric"])
@@ -62,7 +63,7 @@ def test_carriers_of_neither_law_are_called_so() -> None:
 def test_the_thesis_s_own_readings_fit_neither_law_together() -> None:
     """Tables 12 (12 mm) and 13 (33 mm), as measured: the steps of mask 2."""
     seen = [(12.0, (653.0, 613.0)), (33.0, (183.5, 184.0))]
-    verdict = judge(seen, sensor=S5200, mask=MASK_2, stated_mm=1.01, asked="fd")
+    verdict = judge(seen, MaskedOptics(S5200, MASK_2, "fd", 1.01))
     assert verdict.law is None
     fd, _ = verdict.fits
     assert fd.rms_bins > 20
@@ -91,7 +92,7 @@ def test_the_distance_scatters_as_told_where_exif_rounds_focal_lengths() -> None
             lattice = LAWS["geometric"](MASK, CHIP, 1.0, length + chance.uniform(-0.5, 0.5))
             rows, columns = np.array(steps_bins(lattice, CHIP)) + chance.normal(0, 0.02, 2)
             seen.append((length, (float(rows), float(columns))))
-        verdict = judge(seen, sensor=CHIP, mask=MASK, stated_mm=1.0, asked="geometric", focal_sigma_mm=0.5 / 3**0.5)
+        verdict = judge(seen, MaskedOptics(CHIP, MASK, "geometric", 1.0), focal_sigma_mm=0.5 / 3**0.5)
         (_, fit) = verdict.fits
         assert fit.distance_sigma_mm is not None
         distances.append(fit.mask_distance_mm)

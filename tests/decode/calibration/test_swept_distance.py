@@ -13,6 +13,7 @@ from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, latt
 from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.decode.calibration.law_choice import LawFit
 from dappled.decode.calibration.swept_distance import swept_distance
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Mask, Sensor
 from tests.decode.ray_frames import CANON, MASKS, Body, Shot, Stop
 
@@ -27,7 +28,7 @@ STOPS = (11.0, 22.0, 32.0)
 def _seen(shot: Shot, length_mm: float, f_number: float, sigma_mm: float = 0.0) -> FrameLattice:
     """What a frame shows whose EXIF says that length and f-number."""
     frame = CalibrationFrame(shot.frame(), length_mm, f_number, sigma_mm)
-    return lattice_of(frame, SENSOR, MASK, "geometric", STATED_MM)
+    return lattice_of(frame, MaskedOptics(SENSOR, MASK, "geometric", STATED_MM))
 
 
 def _geometric(found: Calibration) -> LawFit:
@@ -35,7 +36,7 @@ def _geometric(found: Calibration) -> LawFit:
 
 
 def _calibrated(seen: Sequence[FrameLattice]) -> Calibration:
-    found = from_lattices(seen, sensor=SENSOR, mask=MASK, law="fd", mask_distance_mm=STATED_MM, choose_law=True)
+    found = from_lattices(seen, MaskedOptics(SENSOR, MASK, "fd", STATED_MM), choose_law=True)
     assert Calibration.from_dict(found.to_dict()) == found
     return found
 
@@ -67,7 +68,7 @@ def test_one_focal_length_at_several_stops_tells_scale_and_distance_apart(one_le
 
 def test_one_stop_tells_no_distance(one_length: list[FrameLattice]) -> None:
     alone = one_length[1:2]
-    assert swept_distance(alone, sensor=SENSOR, mask=MASK, stated_mm=STATED_MM) is None
+    assert swept_distance(alone, MaskedOptics(SENSOR, MASK, "geometric", STATED_MM)) is None
     found = _calibrated(alone)
     assert _geometric(found).distance_sigma_mm is None
     assert found.verdict is not None
@@ -77,7 +78,7 @@ def test_one_stop_tells_no_distance(one_length: list[FrameLattice]) -> None:
 
 def test_stops_told_in_the_wrong_order_tell_no_distance(one_length: list[FrameLattice]) -> None:
     told = [replace(one, f_number=n) for one, n in zip(one_length, reversed(STOPS), strict=True)]
-    assert swept_distance(told, sensor=SENSOR, mask=MASK, stated_mm=STATED_MM) is None
+    assert swept_distance(told, MaskedOptics(SENSOR, MASK, "geometric", STATED_MM)) is None
 
 
 def test_focal_lengths_that_contradict_the_stops_leave_large_errors(one_length: list[FrameLattice]) -> None:

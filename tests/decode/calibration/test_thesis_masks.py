@@ -9,6 +9,7 @@ import pytest
 
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.errors import DecodeError
+from dappled.decode.optics import MaskedOptics
 from tests.decode.ray_frames import CANON, FUJI, MASKS, Body, Shot, Stop, orders_above_noise
 from tests.decode.ray_trials import (
     ENOUGH,
@@ -98,9 +99,7 @@ def test_a_stop_that_averages_an_order_out_says_nothing_about_its_transfer() -> 
     def of(*f_numbers: float) -> list[float]:
         frames = [Shot(film, SMALL, 50.0, stop, turn_deg=0.7, scene="white", seed=2) for stop in f_numbers]
         shown = [CalibrationFrame(one.frame(), one.focal_length_mm, one.f_number) for one in frames]
-        known = calibrate(
-            shown, sensor=sensor_of(SMALL), mask=mask_of(film), law="geometric", mask_distance_mm=STATED_MM
-        )
+        known = calibrate(shown, MaskedOptics(sensor_of(SMALL), mask_of(film), "geometric", STATED_MM))
         return [known.fits[0].transfer[place] for place in map(known.mask.half_orders().index, [(2, -2), (2, 2)])]
 
     assert of(22.0) == [0.0, 0.0]

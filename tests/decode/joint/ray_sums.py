@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Lattice, Mask, Sensor
 
 Floats = NDArray[np.float64]
@@ -129,7 +130,7 @@ class RaySum:
         )
         sensor = Sensor(self.shape, (PITCH_MM, 0.0), (0.0, PITCH_MM))
         known = Calibration(self.shape, "geometric", MASK, sensor, (fit,))
-        return MaskDecoder(sensor, MASK, "geometric", DISTANCE_MM, known, joint_views=joint_views)
+        return MaskDecoder(MaskedOptics(sensor, MASK, "geometric", DISTANCE_MM), known, joint_views=joint_views)
 
 
 def on_slices(views: NDArray[np.float32], grid: Floats, shape: tuple[int, int]) -> Floats:

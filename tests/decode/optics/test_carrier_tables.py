@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics import carrier_tables
+from dappled.decode.optics import MaskedOptics, carrier_tables
 from dappled.decode.optics.carriers import Mask, Sensor
 from tests.decode import thesis_tables as thesis
 
@@ -20,7 +20,7 @@ SQUARE = Sensor((2776, 3688), (0.01, 0.0), (0.0, 0.01))
 
 @pytest.mark.parametrize(("length", "row"), thesis.TABLE_11.items())
 def test_table_11(length: float, row: tuple[float, ...]) -> None:
-    (found,) = carrier_tables.table(thesis.MASK_2, thesis.S5200, 1.01, [length])
+    (found,) = carrier_tables.table(MaskedOptics(thesis.S5200, thesis.MASK_2, "fd", 1.01), [length])
     one, two = found.harmonics
     assert (one.horizontal_mm, two.horizontal_mm) == pytest.approx(row[:2], abs=0.0101)
     assert (one.vertical_mm, two.vertical_mm) == pytest.approx(row[:2], abs=0.0101)
@@ -31,7 +31,7 @@ def test_table_11(length: float, row: tuple[float, ...]) -> None:
 
 
 def test_table_14() -> None:
-    rows = carrier_tables.table(thesis.MASK_4, thesis.S5200, 1.01, thesis.TABLE_14_LENGTHS)
+    rows = carrier_tables.table(MaskedOptics(thesis.S5200, thesis.MASK_4, "fd", 1.01), thesis.TABLE_14_LENGTHS)
     for column, row in enumerate(rows):
         for from_top in range(6):
             place = row.harmonics[5 - from_top]
@@ -50,7 +50,7 @@ def test_table_14() -> None:
     ],
 )
 def test_expected_columns(mask: Mask, length: float, expected: list[Any]) -> None:
-    lattice = carrier_tables.lattice_of("fd", mask, thesis.S5200, 1.01, length)
+    lattice = carrier_tables.lattice_of(MaskedOptics(thesis.S5200, mask, "fd", 1.01), length)
     for order, place in expected:
         (carrier,) = lattice.carriers([order])
         assert carrier.index((2776, 3688)) == pytest.approx(place, abs=1)
@@ -66,7 +66,9 @@ def test_crossed_orders_fill_a_diagonal_mask_up_to_the_full_product() -> None:
 
 
 def test_rotation_moves_a_far_carrier_as_measured() -> None:
-    lattice = carrier_tables.lattice_of("fd", thesis.MASK_2, thesis.S5200, 1.01, 13, rotation_rad=math.radians(1))
+    lattice = carrier_tables.lattice_of(
+        MaskedOptics(thesis.S5200, thesis.MASK_2, "fd", 1.01), 13, rotation_rad=math.radians(1)
+    )
     (carrier,) = lattice.carriers([(0, 2)])
     assert abs(carrier.fy) * 2776 == pytest.approx(20, abs=0.5)  # bin 1132 by 20 a degree
     assert carrier.fx * 3688 == pytest.approx(1132, abs=1)
@@ -75,8 +77,8 @@ def test_rotation_moves_a_far_carrier_as_measured() -> None:
 @given(angle=st.floats(-3, 3), law=st.sampled_from(["fd", "geometric"]))
 def test_rotation_on_square_pixels_is_the_lattice_s_own(angle: float, law: str) -> None:
     sensor = Sensor((2000, 2000), (0.005, 0.0), (0.0, 0.005))
-    turned = carrier_tables.lattice_of(law, Mask(10.0, 2), sensor, 1.0, 20.0, rotation_rad=angle)
-    upright = carrier_tables.lattice_of(law, Mask(10.0, 2), sensor, 1.0, 20.0)
+    turned = carrier_tables.lattice_of(MaskedOptics(sensor, Mask(10.0, 2), law, 1.0), 20.0, rotation_rad=angle)
+    upright = carrier_tables.lattice_of(MaskedOptics(sensor, Mask(10.0, 2), law, 1.0), 20.0)
     np.testing.assert_allclose(turned.matrix(), upright.rotated(angle).matrix(), atol=1e-12)
 
 
@@ -89,18 +91,18 @@ def test_contrast_that_diffraction_leaves() -> None:
 
 
 def test_the_thesis_finds_13_mm_for_mask_2() -> None:
-    best = carrier_tables.best_focal_length(thesis.MASK_2, thesis.S5200, 1.01)
+    best = carrier_tables.best_focal_length(MaskedOptics(thesis.S5200, thesis.MASK_2, "fd", 1.01))
     assert best.slices_mm is not None
     assert best.carriers_mm is not None
     assert round(best.slices_mm) == 13
-    (row,) = carrier_tables.table(thesis.MASK_2, thesis.S5200, 1.01, [best.carriers_mm])
+    (row,) = carrier_tables.table(MaskedOptics(thesis.S5200, thesis.MASK_2, "fd", 1.01), [best.carriers_mm])
     assert row.harmonics[1].vertical_px == pytest.approx(1388, abs=0.01)
 
 
 def test_under_the_geometric_law_a_coarse_mask_fits_at_every_focal_length() -> None:
-    found = carrier_tables.best_focal_length(Mask(15.5, 2), SQUARE, 0.48, law="geometric")
+    found = carrier_tables.best_focal_length(MaskedOptics(SQUARE, Mask(15.5, 2), "geometric", 0.48))
     assert found == carrier_tables.BestFocalLength(None, None)
-    fine = carrier_tables.best_focal_length(Mask(26.0, 2), SQUARE, 5.0, law="geometric")
+    fine = carrier_tables.best_focal_length(MaskedOptics(SQUARE, Mask(26.0, 2), "geometric", 5.0))
     assert fine.carriers_mm == pytest.approx(5 / (1 - 50 / 52), rel=1e-6)
 
 
@@ -108,7 +110,7 @@ def test_under_the_geometric_law_a_coarse_mask_fits_at_every_focal_length() -> N
 @pytest.mark.parametrize("law", ["fd", "geometric"])
 def test_any_frame_shape_has_a_table(shape: tuple[int, int], law: str) -> None:
     sensor = Sensor(shape, (0.005, 0.0), (0.0, 0.005))
-    (row,) = carrier_tables.table(Mask(11.38, 2), sensor, 1.01, [30.0], law=law)
+    (row,) = carrier_tables.table(MaskedOptics(sensor, Mask(11.38, 2), law, 1.01), [30.0])
     assert len(row.harmonics) == 2
     assert row.slice_px is None or (row.slice_px[0] <= shape[0] and row.slice_px[1] <= shape[1])
 
@@ -119,8 +121,8 @@ def test_any_frame_shape_has_a_table(shape: tuple[int, int], law: str) -> None:
         ({"focal_length_mm": 0.013}, "focal length = 0.013 mm must lie between 0.5"),
         ({"focal_length_mm": math.nan}, "focal length = nan mm"),
         ({"focal_length_mm": -13.0}, "-13 mm"),
-        ({"mask_distance_mm": 14.0}, "mask distance = 14 mm must lie between"),
-        ({"mask_distance_mm": 0.0}, "mask distance = 0 mm"),
+        ({"distance_mm": 14.0}, "mask distance = 14 mm must lie between"),
+        ({"distance_mm": 0.0}, "mask distance = 0 mm"),
         ({"rotation_rad": 45.0}, "is it in radians"),
         ({"law": "snell"}, "known are fd, geometric"),
         ({"mask": Mask(-1.0, 2)}, "mask frequency = -1"),
@@ -131,8 +133,10 @@ def test_nonsense_is_answered_with_value_and_limit(changed: dict[str, Any], said
         "law": "fd",
         "mask": thesis.MASK_2,
         "sensor": thesis.S5200,
-        "mask_distance_mm": 1.01,
-        "focal_length_mm": 13.0,
+        "distance_mm": 1.01,
     }
+    setting: dict[str, Any] = {"focal_length_mm": 13.0}
+    for name, value in changed.items():
+        (values if name in values else setting)[name] = value
     with pytest.raises(DecodeError, match=said):
-        carrier_tables.lattice_of(**{**values, **changed})
+        carrier_tables.lattice_of(MaskedOptics(**values), **setting)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics import lenses
+from dappled.decode.optics import MaskedOptics, lenses
 from dappled.decode.optics.carrier_tables import beyond_mask, fresnel_number, lattice_of
 from dappled.decode.optics.carriers import Mask, Sensor
 from dappled.decode.optics.film import FILMS, film_of
@@ -64,7 +64,7 @@ def test_what_works_keeps_every_rule(focal: float, stop: float, altitude: float,
     assert made.mask_distance_mm <= 5.0
     assert top <= wanted.film.nyquist_per_mm * (1 + 1e-6)
     assert fresnel_number(made.mask_distance_mm, top) <= FRESNEL_LIMIT * (1 + 1e-6)
-    lattice = lattice_of(law, made.mask, S5200, made.mask_distance_mm, wanted.image_mm)
+    lattice = lattice_of(MaskedOptics(S5200, made.mask, law, made.mask_distance_mm), wanted.image_mm)
     assert (made.mask.p + 0.5) * max(lattice.ky[0], lattice.kx[1]) <= 0.5 * (1 + 1e-6)
     assert 0 < made.spectrum_used <= 1 + 1e-9
     if law == "geometric":  # the ideal: f_m = v / (d·A)
@@ -73,7 +73,7 @@ def test_what_works_keeps_every_rule(focal: float, stop: float, altitude: float,
 
 def test_fd_fills_the_shorter_side_of_the_spectrum() -> None:
     made = DESIGNS["fd"](_requirements())
-    lattice = lattice_of("fd", made.mask, S5200, made.mask_distance_mm, 13.0)
+    lattice = lattice_of(MaskedOptics(S5200, made.mask, "fd", made.mask_distance_mm), 13.0)
     assert 2.5 * lattice.ky[0] == pytest.approx(0.5)
 
 
@@ -120,13 +120,13 @@ def test_what_hardware_refuses_is_answered_with_what_can_be_built() -> None:
 def test_a_law_that_asks_the_mask_for_more_than_it_has_is_warned_of() -> None:
     """Eq 30 at 13 mm: 2·11.38·1.01/13 mm on a DFT of 4.29 mm and 2776 px is 266.7 cycles/mm; the mask has 22.76."""
     mask = Mask(11.38, 2, film_px_per_mm=113.8)
-    told = beyond_mask(mask, S5200, lattice_of("fd", mask, S5200, 1.01, 13.0))
+    told = beyond_mask(mask, S5200, lattice_of(MaskedOptics(S5200, mask, "fd", 1.01), 13.0))
     assert told is not None
     assert (
         "×2 at 266.7 cycles/mm on the sensor, but on the mask it has 22.8, and its film draws nothing above 56.9"
         in told
     )
-    assert beyond_mask(mask, S5200, lattice_of("geometric", mask, S5200, 1.01, 13.0)) is None
+    assert beyond_mask(mask, S5200, lattice_of(MaskedOptics(S5200, mask, "geometric", 1.01), 13.0)) is None
     assert any("no shadow" in warning for warning in DESIGNS["fd"](_requirements()).warnings)
 
 

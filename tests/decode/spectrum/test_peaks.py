@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dappled.decode.decoder import MaskDecoder
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Carrier, Mask
 from dappled.decode.spectrum.peaks import farther_lattice, is_suspect, measure, stretch
 from dappled.decode.spectrum.transform import Spectrum, transform
@@ -92,7 +93,7 @@ def _told(off: float, mask: Mask = MASK) -> MaskDecoder:
     pitch = 0.01 / (1 + off)
     sensor = replace(SENSOR, row_mm=(pitch, 0), column_mm=(0, pitch))
     return MaskDecoder(
-        sensor, mask, "geometric", STATED_DISTANCE_MM, joint_views=False
+        MaskedOptics(sensor, mask, "geometric", STATED_DISTANCE_MM), joint_views=False
     )  # nothing is told of views here
 
 

@@ -11,9 +11,11 @@ from pathlib import Path
 from tqdm import tqdm
 
 from dappled.config import profiles
+from dappled.config.profiles import CameraProfile
 from dappled.decode.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
 from dappled.decode.calibration.lattice_fit import FrameLattice
+from dappled.decode.optics import MaskedOptics
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
 from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
 from dappled.errors import DappledError
@@ -52,10 +54,7 @@ def view_of(
         shape = plane.shape[0], plane.shape[1]
         shown = lattice_of(
             CalibrationFrame(plane, length, stop, _focal_sigma_mm(raw, focal_length_mm), stops and stops[1]),
-            camera.sensor(shape),
-            profiles.mask(darkroom.recipe.mask).mask,
-            darkroom.recipe.law or camera.law,
-            camera.mask_distance_mm,
+            _optics(darkroom, camera, shape),
             workers=2,
         )
     return CalibrationView(shown, shape, raw.camera_model or "", tuple(bent))
@@ -93,10 +92,12 @@ def fit_views(darkroom: Darkroom, seen: Sequence[CalibrationView], *, choose_law
     camera = darkroom.camera(seen[0].model)
     found = from_lattices(
         [one.shown for one in seen],
-        sensor=camera.sensor(seen[0].shape),
-        mask=profiles.mask(darkroom.recipe.mask).mask,
-        law=darkroom.recipe.law or camera.law,
-        mask_distance_mm=camera.mask_distance_mm,
+        _optics(darkroom, camera, seen[0].shape),
         choose_law=choose_law,
     )
     return replace(found, overridden=(*found.overridden, *(bent for one in seen for bent in one.overridden)))
+
+
+def _optics(darkroom: Darkroom, camera: CameraProfile, shape: tuple[int, int]) -> MaskedOptics:
+    mask, law = profiles.mask(darkroom.recipe.mask).mask, darkroom.recipe.law or camera.law
+    return MaskedOptics(camera.sensor(shape), mask, law, camera.mask_distance_mm)

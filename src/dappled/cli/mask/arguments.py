@@ -8,18 +8,7 @@ from dappled.cli.verb import option
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.config.schema import ConfigError
-from dappled.decode.optics import LAWS, Mask, Sensor, lenses
-
-
-@dataclass(frozen=True, slots=True)
-class Installed:
-    """A mask before a sensor."""
-
-    camera: CameraProfile
-    mask: Mask
-    sensor: Sensor
-    law: str
-    distance_mm: float
+from dappled.decode.optics import LAWS, MaskedOptics, Sensor, lenses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,11 +35,11 @@ class InstallationArguments(SensorArguments):
         "--mask-distance", help="distance from mask to sensor", default=None, metavar="MM", otherwise="the camera's"
     )
 
-    def installed(self, mask: str) -> Installed:
-        """What these arguments name with a mask. Raises ConfigError."""
+    def installed(self, mask: str) -> tuple[CameraProfile, MaskedOptics]:
+        """The camera, and what these arguments name with a mask. Raises ConfigError."""
         camera = profiles.camera(self.camera)
         distance = camera.mask_distance_mm if self.mask_distance is None else self.mask_distance
-        return Installed(camera, profiles.mask(mask).mask, self.sensor(), self.law or camera.law, distance)
+        return camera, MaskedOptics(self.sensor(), profiles.mask(mask).mask, self.law or camera.law, distance)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ from PIL import Image
 from dappled.cli.mask.arguments import AltitudeArguments, InstallationArguments, out_of_reach
 from dappled.cli.verb import Output, Overwriting, Report, Verb, option
 from dappled.config import profiles
-from dappled.decode.optics import carrier_tables
+from dappled.decode.optics import MaskedOptics, carrier_tables
 from dappled.decode.optics.film import FILMS
 from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
 from dappled.decode.spectrum import pictures
@@ -76,8 +76,8 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         return Report(values, _lines(made, instead), failed=not made.works)
 
     def _best(self, mask: str) -> Report:
-        one = self.installed(mask)
-        best = carrier_tables.best_focal_length(one.mask, one.sensor, one.distance_mm, law=one.law)
+        camera, one = self.installed(mask)
+        best = carrier_tables.best_focal_length(one)
         lines = [f"law {one.law}: no focal length brings the outer slices of {mask} to the edge of the spectrum"]
         if best.slices_mm is not None and best.carriers_mm is not None:
             alone = f"(carriers alone at {best.carriers_mm:.1f} mm)"
@@ -85,7 +85,7 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
             lines = [f"law {one.law}: {at} {alone}"]
         ideal = one.mask.frequency_per_mm * one.distance_mm
         lines.append(f"by geometry its views are separated at f/{ideal:.3g}, whatever the lens")
-        warning = out_of_reach(one.camera, ideal)
+        warning = out_of_reach(camera, ideal)
         lines += [] if warning is None else [f"warning: {warning}"]
         return Report({"law": one.law, "mask_distance_mm": one.distance_mm, **asdict(best)}, lines)
 
@@ -96,9 +96,8 @@ CLASSES = {"mask design": DesignMask}
 def _picture(made: Design) -> Any:
     height, width = made.wanted.sensor.shape
     shrink = max(1, max(height, width) // 1200)
-    lattice = carrier_tables.lattice_of(
-        made.law, made.mask, made.wanted.sensor, made.mask_distance_mm, made.wanted.focal_length_mm
-    )
+    optics = MaskedOptics(made.wanted.sensor, made.mask, made.law, made.mask_distance_mm)
+    lattice = carrier_tables.lattice_of(optics, made.wanted.focal_length_mm)
     carriers = [c for c in lattice.carriers(made.mask.half_orders()) if c.on_sensor]
     size = abs(lattice.ky[0]), abs(lattice.kx[1])
     return pictures.spectrum_boxes(np.zeros((height // shrink, width // shrink), np.float32), carriers, size)

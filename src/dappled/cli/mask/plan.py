@@ -9,7 +9,7 @@ from dappled.cli.mask.arguments import AltitudeArguments, out_of_reach
 from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
-from dappled.decode.optics import Lattice, Mask, Sensor, carrier_tables, lenses
+from dappled.decode.optics import MaskedOptics, carrier_tables, lenses
 from dappled.decode.optics.mask_design import SMALL_VIEW_PX
 
 
@@ -42,11 +42,10 @@ class PlanFlight(AltitudeArguments, Verb):
         camera, sensor, length = self.camera_set()
         columns, warnings = None, list[str]()
         if self.mask:
-            mask = profiles.mask(self.mask).mask
-            lattice = carrier_tables.lattice_of(camera.law, mask, sensor, camera.mask_distance_mm, length)
-            size = carrier_tables.slice_size(lattice, sensor.shape)
+            optics = MaskedOptics(sensor, profiles.mask(self.mask).mask, camera.law, camera.mask_distance_mm)
+            size = carrier_tables.slice_size(carrier_tables.lattice_of(optics, length), sensor.shape)
             columns = size[1] if size else None
-            warnings = list(_warnings(camera, mask, sensor, lattice, length))
+            warnings = list(_warnings(camera, optics, length))
         made = lenses.plan_survey(
             sensor,
             focal_length_mm=length,
@@ -76,10 +75,9 @@ class PlanFlight(AltitudeArguments, Verb):
 CLASSES = {"plan": PlanFlight, "mask plan": PlanFlight}
 
 
-def _warnings(
-    camera: CameraProfile, mask: Mask, sensor: Sensor, lattice: Lattice, focal_length_mm: float
-) -> Iterator[str]:
+def _warnings(camera: CameraProfile, optics: MaskedOptics, focal_length_mm: float) -> Iterator[str]:
     """What the camera's own limits make of this mask."""
+    mask, sensor, lattice = optics.mask, optics.sensor, carrier_tables.lattice_of(optics, focal_length_mm)
     size = carrier_tables.slice_size(lattice, sensor.shape)
     if size is None:
         yield "the carriers lie too close together for views"
@@ -87,10 +85,10 @@ def _warnings(
         yield f"views of {size[1]} × {size[0]} px show little more than large shapes"
     beyond = carrier_tables.beyond_mask(mask, sensor, lattice)
     if beyond is not None:
-        by_rays = carrier_tables.lattice_of("geometric", mask, sensor, camera.mask_distance_mm, focal_length_mm)
+        by_rays = carrier_tables.lattice_of(optics.by("geometric"), focal_length_mm)
         smaller = carrier_tables.slice_size(by_rays, sensor.shape)
         views = "no views" if smaller is None else f"views of {smaller[1]} × {smaller[0]} px"
         yield f"{beyond}; the law geometric gives {views}"
-    unreachable = out_of_reach(camera, mask.frequency_per_mm * camera.mask_distance_mm)
+    unreachable = out_of_reach(camera, mask.frequency_per_mm * optics.distance_mm)
     if unreachable is not None:
         yield unreachable

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from dappled.cli.mask.arguments import InstallationArguments, Installed, only_length
+from dappled.cli.mask.arguments import InstallationArguments, only_length
 from dappled.cli.verb import Output, Report, Verb, flag, option
-from dappled.decode.optics import carrier_tables
+from dappled.decode.optics import MaskedOptics, carrier_tables
 from dappled.decode.optics.visibility import order_strengths
 
 THESIS_FOCAL_LENGTHS_MM = (6, 8, 10, 11, 12, 13, 15, 19, 25, 29, 33, 39, 52)  # Table 11
@@ -38,10 +38,10 @@ class TabulateCarriers(InstallationArguments, Verb):
 
     def run(self, output: Output) -> Report:
         """See Verb."""
-        one = self.installed(self.mask)
-        only = only_length(one.camera)
+        camera, one = self.installed(self.mask)
+        only = only_length(camera)
         lengths = self.focal_length or (THESIS_FOCAL_LENGTHS_MM if only is None else (only,))
-        rows = carrier_tables.table(one.mask, one.sensor, one.distance_mm, lengths, law=one.law)
+        rows = carrier_tables.table(one, lengths)
         if self.visibility:
             return _visibility(one, lengths, self.f_number)
         if self.carriers or self.rotation:
@@ -69,15 +69,15 @@ class TabulateCarriers(InstallationArguments, Verb):
 CLASSES = {"mask table": TabulateCarriers}
 
 
-def _facts(one: Installed) -> dict[str, Any]:
+def _facts(one: MaskedOptics) -> dict[str, Any]:
     return {"shape": list(one.sensor.shape), "law": one.law}
 
 
-def _beyond(one: Installed, lengths: Sequence[float]) -> list[str]:
+def _beyond(one: MaskedOptics, lengths: Sequence[float]) -> list[str]:
     """The focal lengths at which the law asks the mask for more than it has; the sentence is the worst one's."""
     found = {}
     for length in sorted(lengths):
-        lattice = carrier_tables.lattice_of(one.law, one.mask, one.sensor, one.distance_mm, length)
+        lattice = carrier_tables.lattice_of(one, length)
         sentence = carrier_tables.beyond_mask(one.mask, one.sensor, lattice)
         if sentence is not None:
             found[length] = sentence
@@ -88,12 +88,10 @@ def _beyond(one: Installed, lengths: Sequence[float]) -> list[str]:
     return [f"{at} {found[shortest]}"]
 
 
-def _carriers(one: Installed, lengths: Sequence[float], rotation_rad: float) -> Report:
+def _carriers(one: MaskedOptics, lengths: Sequence[float], rotation_rad: float) -> Report:
     listed = []
     for length in lengths:
-        lattice = carrier_tables.lattice_of(
-            one.law, one.mask, one.sensor, one.distance_mm, length, rotation_rad=rotation_rad
-        )
+        lattice = carrier_tables.lattice_of(one, length, rotation_rad=rotation_rad)
         for main, orders in ((True, one.mask.orders()), (False, carrier_tables.crossed_orders(one.mask))):
             for carrier in lattice.carriers(orders):
                 row, column = carrier.index(one.sensor.shape)
@@ -106,15 +104,13 @@ def _carriers(one: Installed, lengths: Sequence[float], rotation_rad: float) -> 
     return Report({**_facts(one), "carriers": listed}, lines)
 
 
-def _visibility(one: Installed, lengths: Sequence[float], stops: Sequence[float]) -> Report:
+def _visibility(one: MaskedOptics, lengths: Sequence[float], stops: Sequence[float]) -> Report:
     """The strength of each order, as a share of the mean, at least and at most over the shapes that a stop may have."""
     listed = []
     for length in lengths:
-        lattice = carrier_tables.lattice_of(one.law, one.mask, one.sensor, one.distance_mm, length)
+        lattice = carrier_tables.lattice_of(one, length)
         for stop in stops:
-            for order in order_strengths(
-                one.mask, one.sensor, lattice, mask_distance_mm=one.distance_mm, f_number=stop
-            ):
+            for order in order_strengths(one, lattice, stop):
                 listed.append({"focal_length_mm": length, "f_number": stop, **asdict(order), "cause": order.cause})
     lines = [
         f"law {one.law}, mask {one.distance_mm:g} mm before the sensor; strengths as shares of the mean",

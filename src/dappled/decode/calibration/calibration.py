@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dappled import findings
 from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
 from dappled.findings import FRAME, Code, Finding, Level, finding
 
 _MOST_HARMONICS = 20  # as a mask's profile
@@ -169,7 +169,8 @@ class Calibration:
         return MaskMove(_shift(seen, shares, k, floor), turn)
 
     def _law(self, focal_length_mm: float, mask_distance_mm: float) -> NDArray[np.float64]:
-        return LAWS[self.law](self.mask, self.sensor, mask_distance_mm, focal_length_mm + self.pupil_mm).matrix()
+        optics = MaskedOptics(self.sensor, self.mask, self.law, mask_distance_mm)
+        return optics.lattice(focal_length_mm + self.pupil_mm).matrix()
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a TOML file."""

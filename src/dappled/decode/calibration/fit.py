@@ -19,7 +19,7 @@ from dappled.decode.calibration.law_choice import PLAUSIBLE, judge, steps_bins
 from dappled.decode.calibration.swept_distance import swept_distance
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, at_centre, kappa, origin_of, transfer
-from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics import Lattice, MaskedOptics, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
 from dappled.decode.optics.visibility import pattern_amplitudes
 
@@ -41,79 +41,52 @@ class CalibrationFrame:
 
 def calibrate(
     frames: Sequence[CalibrationFrame],
+    optics: MaskedOptics,
     *,
-    sensor: Sensor,
-    mask: Mask,
-    law: str,
-    mask_distance_mm: float,
     aperture: Aperture | None = None,
     choose_law: bool = False,
     workers: int = 1,
 ) -> Calibration:
     """The calibration that stopped-down frames show; frames of one focal length are averaged.
 
-    `mask_distance_mm` is the stated one; the fitted one follows from the lattice and the law. With `choose_law` frames
+    The fitted distance of the mask follows from the lattice and the law. With `choose_law` frames
     at several focal lengths may show that the other law is right. Raises DecodeError where the carriers can't be found.
     """
     if not frames:
         raise DecodeError("a calibration needs at least one frame")
-    if law not in LAWS:
-        raise DecodeError(f"unknown law {law!r}; known are {', '.join(LAWS)}")
-    aperture = aperture or Aperture(mask.views_per_axis)
-    return from_lattices(
-        [lattice_of(frame, sensor, mask, law, mask_distance_mm, workers=workers) for frame in frames],
-        sensor=sensor,
-        mask=mask,
-        law=law,
-        mask_distance_mm=mask_distance_mm,
-        aperture=aperture,
-        choose_law=choose_law,
-    )
+    lattices = [lattice_of(frame, optics, workers=workers) for frame in frames]
+    return from_lattices(lattices, optics, aperture=aperture, choose_law=choose_law)
 
 
 def from_lattices(
     lattices: Sequence[FrameLattice],
+    optics: MaskedOptics,
     *,
-    sensor: Sensor,
-    mask: Mask,
-    law: str,
-    mask_distance_mm: float,
     aperture: Aperture | None = None,
     choose_law: bool = False,
 ) -> Calibration:
     """`calibrate` from the lattices of the frames, which take little memory."""
-    aperture = aperture or Aperture(mask.views_per_axis)
-    swept = swept_distance(lattices, sensor=sensor, mask=mask, stated_mm=mask_distance_mm)
+    aperture = aperture or Aperture(optics.mask.views_per_axis)
+    swept = swept_distance(lattices, optics)
     focal_sigma = max(shown.focal_sigma_mm for shown in lattices)
-    verdict = judge(
-        _steps(lattices, sensor),
-        sensor=sensor,
-        mask=mask,
-        stated_mm=mask_distance_mm,
-        asked=law,
-        swept=swept,
-        focal_sigma_mm=focal_sigma,
-    )
+    verdict = judge(_steps(lattices, optics.sensor), optics, swept=swept, focal_sigma_mm=focal_sigma)
     if choose_law and verdict.law is not None:
-        law = verdict.law
-    fitted = next(fit for fit in verdict.fits if fit.law == law)
+        optics = optics.by(verdict.law)
+    fitted = next(fit for fit in verdict.fits if fit.law == optics.law)
     sigma = fitted.distance_sigma_mm
     several = fitted.explains and (
         fitted.offset_bins is not None
-        if law != "geometric"
+        if optics.law != "geometric"
         else sigma is not None and sigma <= _KNOWN * fitted.mask_distance_mm
     )
     pupil = fitted.pupil_mm or 0.0 if several else 0.0
-    print_scale = fitted.print_scale if several and law == "geometric" else 1.0
+    print_scale = fitted.print_scale if several and optics.law == "geometric" else 1.0
     fits = []
     for length in sorted({shown.focal_length_mm for shown in lattices}):
         seen = [
             _fit_of(
                 shown,
-                sensor,
-                mask,
-                law,
-                stated_mm=mask_distance_mm,
+                optics,
                 known_mm=fitted.mask_distance_mm if several else None,
                 print_scale=print_scale,
                 aperture=aperture,
@@ -123,7 +96,10 @@ def from_lattices(
         ]
         fits.append(_mean(seen))
     weak = tuple(shown.weak for shown in lattices if shown.weak is not None)
-    return Calibration(sensor.shape, law, mask, sensor, tuple(fits), pupil, verdict.finding, swept, focal_sigma, weak)
+    sensor, mask = optics.sensor, optics.mask
+    return Calibration(
+        sensor.shape, optics.law, mask, sensor, tuple(fits), pupil, verdict.finding, swept, focal_sigma, weak
+    )
 
 
 def _steps(lattices: Sequence[FrameLattice], sensor: Sensor) -> list[tuple[float, tuple[float, float]]]:
@@ -136,18 +112,13 @@ def _steps(lattices: Sequence[FrameLattice], sensor: Sensor) -> list[tuple[float
     return found
 
 
-def lattice_of(
-    frame: CalibrationFrame, sensor: Sensor, mask: Mask, law: str, mask_distance_mm: float, *, workers: int = 1
-) -> FrameLattice:
+def lattice_of(frame: CalibrationFrame, optics: MaskedOptics, *, workers: int = 1) -> FrameLattice:
     """The lattice that a frame shows. Raises DecodeError where it shows too few carriers."""
     shown = frame_lattice(
         frame.plane,
+        optics,
         focal_length_mm=frame.focal_length_mm,
         f_number=frame.f_number,
-        sensor=sensor,
-        mask=mask,
-        law=law,
-        mask_distance_mm=mask_distance_mm,
         workers=workers,
         narrowest_f=frame.narrowest_f,
     )
@@ -156,11 +127,8 @@ def lattice_of(
 
 def _fit_of(
     shown: FrameLattice,
-    sensor: Sensor,
-    mask: Mask,
-    law: str,
+    optics: MaskedOptics,
     *,
-    stated_mm: float,
     known_mm: float | None,
     print_scale: float,
     aperture: Aperture,
@@ -168,10 +136,9 @@ def _fit_of(
     """`known_mm` is the distance that a law fitted to several focal lengths found, None: this one's own; `print_scale`
     the print's frequency over its design's that it found with it, 1 where it found none."""
     distance, fitted = (
-        (known_mm, True)
-        if known_mm is not None
-        else _distance(shown.lattice, shown.focal_length_mm, sensor=sensor, mask=mask, law=law, stated_mm=stated_mm)
+        (known_mm, True) if known_mm is not None else _distance(shown.lattice, shown.focal_length_mm, optics)
     )
+    sensor, mask = optics.sensor, optics.mask
     rotation = lattice_rotation(shown.lattice, sensor)
     cycles = kappa(mask.frequency_per_mm * print_scale, distance, shown.focal_length_mm, shown.f_number)
     through = aperture.transform(angular_frequencies(shown.orders, cycles, rotation)).real
@@ -205,21 +172,20 @@ def _fit_of(
     )
 
 
-def _distance(
-    lattice: Lattice, focal_length_mm: float, *, sensor: Sensor, mask: Mask, law: str, stated_mm: float
-) -> tuple[float, bool]:
+def _distance(lattice: Lattice, focal_length_mm: float, optics: MaskedOptics) -> tuple[float, bool]:
     """(mask distance in mm, whether it was fitted): from the lattice's size at one focal length, by the law.
 
     Under `geometric` a print a thousandth off its design looks like a distance far off: the stated one is kept, and
     each frame's aperture is fitted over a wide range instead. Under `fd` a distance far from the stated one means a
     print of another scale: the stated one is kept then, too.
     """
-    if law == "geometric":
+    sensor, stated_mm = optics.sensor, optics.distance_mm
+    if optics.law == "geometric":
         return stated_mm, False
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])  # (row, column) steps as (y, x) mm
     per_mm = lattice.matrix() @ np.linalg.inv(to_sensor).T  # rows: cycles/mm along y and x
     size = math.sqrt(abs(float(np.linalg.det(per_mm))))
-    expected = LAWS[law](mask, sensor, stated_mm, focal_length_mm).matrix() @ np.linalg.inv(to_sensor).T
+    expected = optics.lattice(focal_length_mm).matrix() @ np.linalg.inv(to_sensor).T
     distance = stated_mm * size / math.sqrt(abs(float(np.linalg.det(expected))))
     believed = abs(distance / stated_mm - 1) <= PLAUSIBLE
     return (distance if believed else stated_mm), believed

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from dappled.decode.calibration.law_search import LawOdds, search_laws
 from dappled.decode.errors import DecodeError, NoCarriers
 from dappled.decode.lightfield.aperture import relative_transfer
-from dappled.decode.optics import Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.optics import Carrier, Lattice, Mask, MaskedOptics, Order
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.mask_lattice import MaskLattice, levels
 from dappled.decode.spectrum.peaks import Measured, fit, measure, residual_bins
@@ -46,27 +46,22 @@ class FrameLattice:
 
 def frame_lattice(
     plane: NDArray[np.float32],
+    optics: MaskedOptics,
     *,
     focal_length_mm: float,
     f_number: float,
-    sensor: Sensor,
-    mask: Mask,
-    law: str,
-    mask_distance_mm: float,
     workers: int = 1,
     narrowest_f: float | None = None,
 ) -> FrameLattice:
     """Find the mask's carriers in a frame, near the prediction of either law. Raises NoCarriers with the reason, which
     says what a lens can do that ends at the stop `narrowest_f`."""
+    sensor, mask = optics.sensor, optics.mask
     if plane.shape != sensor.shape:
         raise DecodeError(f"the calibration frame is {plane.shape}, the camera's are {sensor.shape}")
     spectrum = transform(plane, workers=workers)
     search = search_laws(
         spectrum,
-        sensor=sensor,
-        mask=mask,
-        law=law,
-        mask_distance_mm=mask_distance_mm,
+        optics,
         focal_length_mm=focal_length_mm,
         f_number=f_number,
         anywhere=True,

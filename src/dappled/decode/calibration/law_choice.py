@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from dappled.decode.calibration.swept_distance import SweptDistance
-from dappled.decode.optics import LAWS, Lattice, Mask, Sensor
+from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
 from dappled.findings import Code, Finding, Subject, finding
 
 CALIBRATION = Subject("calibration")
@@ -83,18 +83,16 @@ def steps_bins(lattice: Lattice, sensor: Sensor) -> tuple[float, float]:
 
 def judge(
     seen: Sequence[tuple[float, tuple[float, float]]],
+    optics: MaskedOptics,
     *,
-    sensor: Sensor,
-    mask: Mask,
-    stated_mm: float,
-    asked: str,
     swept: SweptDistance | None = None,
     focal_sigma_mm: float = 0.0,
 ) -> LawVerdict:
-    """Fit all laws to focal lengths in mm with `steps_bins`. `asked` is chosen where the frames don't decide.
+    """Fit all laws to focal lengths in mm with `steps_bins`; that of `optics` is chosen where the frames don't decide.
 
     `swept` is what several f-numbers say of the distance, `focal_sigma_mm` the standard error of the focal lengths.
     """
+    sensor, mask, asked, stated_mm = optics.sensor, optics.mask, optics.law, optics.distance_mm
     lengths = np.array([length for length, _ in seen])
     steps = np.array([step for _, step in seen])
     fits = (

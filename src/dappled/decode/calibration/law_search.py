@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, Sensor
+from dappled.decode.optics import LAWS, Carrier, Lattice, Mask, MaskedOptics
 from dappled.decode.optics.visibility import OrderStrength, order_strengths, under_stops
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.lattice import find_lattice
@@ -73,47 +73,40 @@ class LawSearch:
 
 def search_laws(
     spectrum: Spectrum,
+    optics: MaskedOptics,
     *,
-    sensor: Sensor,
-    mask: Mask,
-    law: str,
-    mask_distance_mm: float,
     focal_length_mm: float,
     f_number: float | None,
     anywhere: bool = False,
     other_laws: bool = True,
     narrowest_f: float | None = None,
 ) -> LawSearch:
-    """Look for a mask's lattice in a whole spectrum near the prediction of each law; `law` wins a tie.
+    """Look for a mask's lattice in a whole spectrum near the prediction of each law; that of `optics` wins a tie.
 
     Where the f-number is unknown (None), no order must stand, and any may. With `anywhere` a full mask that shows
-    nearly all of its carriers is found away from every prediction, too. Without `other_laws` only `law` is tried.
+    nearly all of its carriers is found away from every prediction, too. Without `other_laws` only its own is tried.
     `narrowest_f` is the lens' narrowest stop, for the advice of the sentence.
     """
     peaks = PeakList.of(spectrum)
     odds: list[LawOdds] = []
     asked: list[list[OrderStrength]] = []
     sure: list[tuple[MaskLattice, str]] = []
-    for name in (law, *(other for other in LAWS if other != law and other_laws)):
-        predicted = LAWS[name](mask, sensor, mask_distance_mm, focal_length_mm)
-        expected = order_strengths(mask, sensor, predicted, mask_distance_mm=mask_distance_mm, f_number=f_number)
+    for name in (optics.law, *(other for other in LAWS if other != optics.law and other_laws)):
+        predicted = optics.by(name).lattice(focal_length_mm)
+        expected = order_strengths(optics, predicted, f_number)
         found = find_mask_lattice(peaks, predicted, expected)
         asked.append(expected)
         odds.append(LawOdds(name, None if found is None else found.odds_nats))
         if found is not None and found.sure:
             sure.append((found, name))
-    advice = _advice(
-        mask, sensor, mask_distance_mm, LAWS[law](mask, sensor, mask_distance_mm, focal_length_mm), narrowest_f
-    )
+    advice = _advice(optics, optics.lattice(focal_length_mm), narrowest_f)
     expects, why = unseen(spectrum, asked, advice=advice, f_number=f_number)
     foreign: list[Finding] = []
     for lattice, name in sorted(sure, key=lambda one: -one[0].odds_nats):
         wrong = not_this_mask(
             spectrum,
             lattice,
-            sensor=sensor,
-            mask=mask,
-            mask_distance_mm=mask_distance_mm,
+            optics,
             f_number=f_number,
             most_scale=None if anywhere else _SCALE_OFF[name],
         )
@@ -122,7 +115,7 @@ def search_laws(
         foreign.append(wrong)
     if foreign:
         return LawSearch(tuple(odds), None, None, True, foreign[0])
-    best = _anywhere(spectrum, mask) if anywhere and mask.pattern == "full" else None
+    best = _anywhere(spectrum, optics.mask) if anywhere and optics.mask.pattern == "full" else None
     if expects and len(peaks.prominence) and float(peaks.prominence.max()) > _STANDS_NATS:
         why = replace(why, code=Code.CARRIERS_OTHER_PEAKS)
     return LawSearch(tuple(odds), best, None, expects, None if best is not None else why)
@@ -131,10 +124,8 @@ def search_laws(
 def not_this_mask(
     spectrum: Spectrum,
     found: MaskLattice,
+    optics: MaskedOptics,
     *,
-    sensor: Sensor,
-    mask: Mask,
-    mask_distance_mm: float,
     f_number: float | None,
     most_scale: float | None = None,
 ) -> Finding | None:
@@ -152,11 +143,11 @@ def not_this_mask(
     halves = [one for one in measure(spectrum, between, 1.5, prominence_nats=ALONE_NATS) if one is not None]
     if len(halves) == 2 and min(one.strength for one in halves) > strongest:
         return finding(Code.CARRIERS_HALF_WAY, FRAME)
-    if mask.pattern == "diagonal" and (more := _as_full(spectrum, found)) is not None:
+    if optics.mask.pattern == "diagonal" and (more := _as_full(spectrum, found)) is not None:
         return more
-    expected = order_strengths(mask, sensor, found.lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+    expected = order_strengths(optics, found.lattice, f_number)
     orders = [one.order for one in expected]
-    stops = under_stops(mask, found.lattice, orders, mask_distance_mm=mask_distance_mm, f_number=f_number)
+    stops = under_stops(optics, found.lattice, orders, f_number)
     stand = sorted(should_stand(spectrum, expected), key=lambda one: -one.least)
     if not stand:
         return _lacking(spectrum, found, expected, stops)
@@ -205,14 +196,12 @@ def _lacking(
     return finding(Code.CARRIERS_LACKING, FRAME, orders=names)
 
 
-def missing(
-    spectrum: Spectrum, lattice: Lattice, *, sensor: Sensor, mask: Mask, mask_distance_mm: float, f_number: float
-) -> Finding | None:
+def missing(spectrum: Spectrum, lattice: Lattice, optics: MaskedOptics, f_number: float) -> Finding | None:
     """Why a calibration's lattice can't be this frame's: most of the carriers due on it are not there.
 
     A peak or two near them may be the scene's.
     """
-    expected = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+    expected = order_strengths(optics, lattice, f_number)
     there = should_stand(spectrum, expected)
     if not _spans(there):
         return None
@@ -249,14 +238,14 @@ def unseen(
     return False, finding(Code.CARRIERS_UNOBSERVABLE, FRAME, f_number=f_number, lost=lost, advice=advice)
 
 
-def _advice(mask: Mask, sensor: Sensor, mask_distance_mm: float, lattice: Lattice, narrowest_f: float | None) -> str:
+def _advice(optics: MaskedOptics, lattice: Lattice, narrowest_f: float | None) -> str:
     """At which f-number a white frame must show a mask's carriers, whatever the stop's shape, and what the lens can."""
 
     def plain(f_number: float) -> list[OrderStrength]:
-        seen = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number)
+        seen = order_strengths(optics, lattice, f_number)
         return [one for one in seen if one.on_sensor and one.least > _PLAIN]
 
-    ideal = mask.frequency_per_mm * mask_distance_mm
+    ideal = optics.mask.frequency_per_mm * optics.distance_mm
     tried = ideal * _THIRD ** np.arange(-6, 19)
     needed = next((float(stop) for stop in tried if _spans(plain(float(stop)))), None)
     if needed is None:

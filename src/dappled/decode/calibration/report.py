@@ -11,7 +11,7 @@ import numpy as np
 
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.calibration.law_choice import LawFit, judge, steps_bins
-from dappled.decode.optics import LAWS, Carrier, Order
+from dappled.decode.optics import LAWS, Carrier, MaskedOptics, Order
 from dappled.findings import text, to_rows
 
 
@@ -37,7 +37,7 @@ class Row:
 
 def rows(found: Calibration, fit: LatticeFit, law: str, mask_distance_mm: float) -> list[Row]:
     """The table of one focal length against a law with the stated mask distance, mean first, both half planes."""
-    lattice = LAWS[law](found.mask, found.sensor, mask_distance_mm, fit.focal_length_mm)
+    lattice = MaskedOptics(found.sensor, found.mask, law, mask_distance_mm).lattice(fit.focal_length_mm)
     table = []
     for ky, kx, fy, fx, _ in [(0, 0, 0.0, 0.0, 1.0), *fit.seen]:
         for sign in (1,) if (ky, kx) == (0, 0) else (-1, 1):
@@ -55,10 +55,7 @@ def law_fits(found: Calibration, mask_distance_mm: float) -> tuple[LawFit, ...]:
     steps = [(fit.focal_length_mm, steps_bins(fit.lattice, found.sensor)) for fit in found.fits]
     return judge(
         steps,
-        sensor=found.sensor,
-        mask=found.mask,
-        stated_mm=mask_distance_mm,
-        asked=found.law,
+        MaskedOptics(found.sensor, found.mask, found.law, mask_distance_mm),
         swept=found.swept,
         focal_sigma_mm=found.focal_sigma_mm,
     ).fits

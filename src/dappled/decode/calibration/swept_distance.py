@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from dappled.decode.calibration.lattice_fit import FrameLattice
-from dappled.decode.optics import Mask, Order, Sensor
+from dappled.decode.optics import MaskedOptics, Order, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
 
 _SEARCHED = 1.8  # times or a fraction of the stated distance
@@ -41,9 +41,7 @@ class SweptDistance:
     stops: tuple[float, ...]
 
 
-def swept_distance(
-    frames: Sequence[FrameLattice], *, sensor: Sensor, mask: Mask, stated_mm: float
-) -> SweptDistance | None:
+def swept_distance(frames: Sequence[FrameLattice], optics: MaskedOptics) -> SweptDistance | None:
     """The distance that stopped-down frames of an even wall show by their stops; None where they don't tell.
 
     Frames of one focal length are compared with each other; all give one distance.
@@ -52,7 +50,8 @@ def swept_distance(
     groups = [group for group in groups if len({one.f_number for one in group}) > 1]
     if not groups:
         return None
-    tried = stated_mm * np.exp(np.linspace(-1, 1, _STEPS) * math.log(_SEARCHED))
+    sensor, mask = optics.sensor, optics.mask
+    tried = optics.distance_mm * np.exp(np.linspace(-1, 1, _STEPS) * math.log(_SEARCHED))
     cost = np.zeros((len(_SHAPES), _STEPS))
     freedom = -1
     for group in groups:

@@ -2,6 +2,6 @@
 
 from __future__ import annotations
 
-from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, Order, Sensor
+from dappled.decode.optics.carriers import LAWS, Carrier, Lattice, Mask, MaskedOptics, Order, Sensor
 
-__all__ = ["LAWS", "Carrier", "Lattice", "Mask", "Order", "Sensor"]
+__all__ = ["LAWS", "Carrier", "Lattice", "Mask", "MaskedOptics", "Order", "Sensor"]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dappled.decode.errors import DecodeError
-from dappled.decode.optics.carriers import LAWS, Lattice, Mask, Order, Sensor
+from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order, Sensor
 from dappled.decode.optics.lenses import focal_length, within
 
 
@@ -49,23 +49,19 @@ class FocalRow:
     slice_px: tuple[int, int] | None
 
 
-def lattice_of(
-    law: str, mask: Mask, sensor: Sensor, mask_distance_mm: float, focal_length_mm: float, *, rotation_rad: float = 0.0
-) -> Lattice:
-    """The lattice by a law's name, of a mask turned by `rotation_rad` (from the row axis to the column axis).
+def lattice_of(optics: MaskedOptics, focal_length_mm: float, *, rotation_rad: float = 0.0) -> Lattice:
+    """The lattice of a mask turned by `rotation_rad` (from the row axis to the column axis).
 
     The laws are linear in the mask's frequency vector, so a turned mask's steps are mixtures of the upright one's; on
     pixels that are not square the result is not `Lattice.rotated`. Raises DecodeError for nonsense in any value.
     """
-    if law not in LAWS:
-        raise DecodeError(f"unknown law {law!r}; known are {', '.join(LAWS)}")
     focal_length(focal_length_mm)
     within(
-        "mask distance", mask_distance_mm, "mm", 1e-3, 0.999 * focal_length_mm, hint="it lies between sensor and lens"
+        "mask distance", optics.distance_mm, "mm", 1e-3, 0.999 * focal_length_mm, hint="it lies between sensor and lens"
     )
-    within("mask frequency", mask.frequency_per_mm, "cycles/mm", 1e-3, 1e5)
+    within("mask frequency", optics.mask.frequency_per_mm, "cycles/mm", 1e-3, 1e5)
     within("rotation", rotation_rad, "rad", -math.pi, math.pi, hint="is it in radians?")
-    upright = LAWS[law](mask, sensor, mask_distance_mm, focal_length_mm)
+    upright = optics.lattice(focal_length_mm)
     c, s = math.cos(rotation_rad), math.sin(rotation_rad)
     (ay, ax), (by, bx) = upright.ky, upright.kx
     return Lattice((c * ay + s * by, c * ax + s * bx), (-s * ay + c * by, -s * ax + c * bx))
@@ -102,21 +98,13 @@ def crossed_orders(mask: Mask) -> list[Order]:
     return [order for order in itertools.product(axis, axis) if order not in asked]
 
 
-def table(
-    mask: Mask,
-    sensor: Sensor,
-    mask_distance_mm: float,
-    focal_lengths_mm: Sequence[float],
-    *,
-    law: str = "fd",
-    wavelength_nm: float = 550.0,
-) -> list[FocalRow]:
-    """Tables 11 and 14: where each harmonic lands over focal lengths, on `sensor` (any frame shape, upright pixels)."""
-    height, width = sensor.shape
-    height_mm, width_mm = sensor.size_mm
+def table(optics: MaskedOptics, focal_lengths_mm: Sequence[float], *, wavelength_nm: float = 550.0) -> list[FocalRow]:
+    """Tables 11 and 14: where each harmonic lands over focal lengths (any frame shape, upright pixels)."""
+    mask, (height, width) = optics.mask, optics.sensor.shape
+    height_mm, width_mm = optics.sensor.size_mm
     rows = []
     for length in focal_lengths_mm:
-        lattice = lattice_of(law, mask, sensor, mask_distance_mm, length)
+        lattice = lattice_of(optics, length)
         down, across = abs(lattice.ky[0]), abs(lattice.kx[1])
         harmonics = tuple(
             HarmonicPlace(
@@ -128,11 +116,11 @@ def table(
                 vertical_mm=m * down * height_mm,
                 horizontal_on_sensor=m * across < 0.5,
                 vertical_on_sensor=m * down < 0.5,
-                contrast=contrast(mask_distance_mm, m * mask.frequency_per_mm, wavelength_nm),
+                contrast=contrast(optics.distance_mm, m * mask.frequency_per_mm, wavelength_nm),
             )
             for m in mask.multiples
         )
-        rows.append(FocalRow(length, harmonics, slice_size(lattice, sensor.shape)))
+        rows.append(FocalRow(length, harmonics, slice_size(lattice, optics.sensor.shape)))
     return rows
 
 
@@ -176,16 +164,16 @@ class BestFocalLength:
     slices_mm: float | None
 
 
-def best_focal_length(mask: Mask, sensor: Sensor, mask_distance_mm: float, *, law: str = "fd") -> BestFocalLength:
+def best_focal_length(optics: MaskedOptics) -> BestFocalLength:
     """The focal length that uses an installed mask's sensor best: by bisection, whatever the law, from 1 to 2000 mm.
 
     Under `fd` a longer lens draws the carriers together, so the shortest that fits is the best. Under `geometric` it
     spreads them (towards k·f_m), and the answer is the longest that fits, None where all do.
     """
-    far, lowest = max(mask.multiples), max(1.0, mask_distance_mm / 0.99)
+    far, lowest = max(optics.mask.multiples), max(1.0, optics.distance_mm / 0.99)
 
     def outermost(length_mm: float, orders: float) -> float:
-        lattice = lattice_of(law, mask, sensor, mask_distance_mm, length_mm)
+        lattice = lattice_of(optics, length_mm)
         return orders * max(abs(lattice.ky[0]), abs(lattice.kx[1])) - 0.5
 
     def crossing(orders: float) -> float | None:

@@ -220,6 +220,29 @@ class Sensor:
         return replace(self, shape=(self.shape[0], 2 * self.shape[1]), column_mm=(y / 2, x / 2))
 
 
+@dataclass(frozen=True, slots=True)
+class MaskedOptics:
+    """A mask at `distance_mm` from a sensor, as it was stated, and the name of the law by which it makes carriers."""
+
+    sensor: Sensor
+    mask: Mask
+    law: str
+    distance_mm: float
+
+    def __post_init__(self) -> None:
+        """Raises DecodeError for an unknown law."""
+        if self.law not in LAWS:
+            raise DecodeError(f"unknown law {self.law!r}; known are {', '.join(LAWS)}")
+
+    def by(self, law: str) -> MaskedOptics:
+        """The same by another law."""
+        return replace(self, law=law)
+
+    def lattice(self, focal_length_mm: float) -> Lattice:
+        """Where the law has the carriers, of a mask that is not turned."""
+        return LAWS[self.law](self.mask, self.sensor, self.distance_mm, focal_length_mm)
+
+
 Law = Callable[[Mask, Sensor, float, float], Lattice]
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carrier_tables import beyond_mask, fresnel_number, lattice_of
-from dappled.decode.optics.carriers import Lattice, Mask, Sensor
+from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Sensor
 from dappled.decode.optics.film import FILMS, Film
 from dappled.decode.optics.lenses import depth_sigma_m, ground_sample_m, image_distance_mm, within
 
@@ -195,9 +195,8 @@ def buildable(wanted: DesignRequirements, law: str) -> Design | None:
 
 def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float, sensor: Condition) -> Design:
     p = wanted.p
-    lattice = lattice_of(
-        law, mask, wanted.sensor, distance_mm, wanted.image_mm if law == "geometric" else wanted.focal_length_mm
-    )
+    optics = MaskedOptics(wanted.sensor, mask, law, distance_mm)
+    lattice = lattice_of(optics, wanted.image_mm if law == "geometric" else wanted.focal_length_mm)
     steps = abs(lattice.ky[0]), abs(lattice.kx[1])
     shape = math.floor(steps[0] * wanted.sensor.shape[0]), math.floor(steps[1] * wanted.sensor.shape[1])
     conditions = (

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from dappled.decode.optics.carriers import Lattice, Mask, Order, Sensor
+from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order
 
 _ROUNDING = 0.12  # relative: an f-number given in third stops, and nulls where only their neighbourhood counts
 _WAVELENGTHS_MM = np.array([450e-6, 500e-6, 550e-6, 600e-6, 650e-6])
@@ -73,16 +73,11 @@ class OrderStrength:
 
 
 def order_strengths(
-    mask: Mask,
-    sensor: Sensor,
-    lattice: Lattice,
-    *,
-    mask_distance_mm: float,
-    f_number: float | None,
-    orders: Sequence[Order] | None = None,
+    optics: MaskedOptics, lattice: Lattice, f_number: float | None, orders: Sequence[Order] | None = None
 ) -> list[OrderStrength]:
     """The predicted strength of a mask's orders at a lattice, by default the half plane's without the mean; of an
     unknown f-number (None) at most as behind a pinhole, and at least nothing."""
+    mask, mask_distance_mm = optics.mask, optics.distance_mm
     wanted = [order for order in (mask.half_orders() if orders is None else orders) if order != (0, 0)]
     k = np.array(wanted, dtype=np.float64).reshape(-1, 2)
     amplitudes = pattern_amplitudes(mask)
@@ -101,7 +96,7 @@ def order_strengths(
     frequencies = k @ lattice.matrix()
     pixels = np.abs(np.sinc(frequencies).prod(axis=1))
     common = pattern * np.abs(film) * diffraction * pixels
-    to_mm = np.linalg.inv(np.array([sensor.row_mm, sensor.column_mm])).T
+    to_mm = np.linalg.inv(np.array([optics.sensor.row_mm, optics.sensor.column_mm])).T
     on_sensor = np.hypot(*(frequencies @ to_mm).T)
     return [
         OrderStrength(
@@ -123,10 +118,10 @@ def order_strengths(
 
 
 def designs(
-    mask: Mask, sensor: Sensor, lattice: Lattice, mask_distance_mm: float, *, f_number: float, orders: Sequence[Order]
+    optics: MaskedOptics, lattice: Lattice, f_number: float, orders: Sequence[Order]
 ) -> list[NDArray[np.float64]]:
     """(K,) how strong each order, the mean first, is before the stop: as drawn, and less film, diffraction, pixels."""
-    made = order_strengths(mask, sensor, lattice, mask_distance_mm=mask_distance_mm, f_number=f_number, orders=orders)
+    made = order_strengths(optics, lattice, f_number, orders)
     drawn = np.array([1.0, *(one.pattern for one in made)])
     left = np.array([1.0, *(one.film * one.diffraction * one.pixels for one in made)])
     return [drawn, drawn * left]
@@ -146,7 +141,7 @@ def _on_the_way(
 
 
 def under_stops(
-    mask: Mask, lattice: Lattice, orders: Sequence[Order], *, mask_distance_mm: float, f_number: float | None
+    optics: MaskedOptics, lattice: Lattice, orders: Sequence[Order], f_number: float | None
 ) -> NDArray[np.float64]:
     """(stops, orders) how strong each order is behind stops of many shapes and sizes, as shares of the plane's mean.
 
@@ -154,6 +149,7 @@ def under_stops(
     third wider or narrower, as f-number and mask distance may be off; of any size where it is unknown (None). Each once
     with nothing lost on film and to diffraction, once with what they take of higher harmonics: neither is known well.
     """
+    mask, mask_distance_mm = optics.mask, optics.distance_mm
     k = np.array(orders, dtype=np.float64).reshape(-1, 2)
     amplitudes = pattern_amplitudes(mask)
     pattern = np.array([abs(amplitudes.get(order, 0.0)) for order in orders])

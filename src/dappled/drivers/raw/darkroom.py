@@ -27,7 +27,7 @@ from dappled.decode.joint.clipping import unknown_where_clipped
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
 from dappled.decode.lightfield import LightField
 from dappled.decode.lightfield.falloff import Falloff, falloff
-from dappled.decode.optics import LAWS
+from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum import LinearRows, Plane
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import check_shape, lineariser
@@ -283,7 +283,7 @@ class Darkroom:
             return None
         shape, length = made.light_field.attributes["shape"], made.light_field.attributes["focal_length_mm"]
         decoder = self.mask_decoder((shape[0], shape[1]), made.raw.camera_model or "")
-        predicted = LAWS[search.law](decoder.mask, decoder.sensor, decoder.mask_distance_mm, length)
+        predicted = decoder.optics.by(search.law).lattice(length)
         (a, b), (c, d) = search.found.lattice.matrix() @ np.linalg.inv(predicted.matrix())
         sentence = f"decoded by the law {search.law} from frame {index} on: {search.sentence}"
         return LawDecision(search.law, (float(a), float(b), float(c), float(d)), index, sentence)
@@ -334,11 +334,9 @@ class Darkroom:
         camera = self.camera(model)
         known = self._calibration() if recipe.calibration and recipe.decided is None else None
         law = recipe.law or (camera.law if known is None else known.law)
+        law = law if recipe.decided is None else recipe.decided.law
         return MaskDecoder(
-            camera.sensor(shape),
-            profiles.mask(recipe.mask).mask,
-            law if recipe.decided is None else recipe.decided.law,
-            camera.mask_distance_mm,
+            MaskedOptics(camera.sensor(shape), profiles.mask(recipe.mask).mask, law, camera.mask_distance_mm),
             calibration=known,
             ratio=None if recipe.decided is None else recipe.decided.ratio,
             workers=recipe.workers,

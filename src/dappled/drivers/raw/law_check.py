@@ -83,10 +83,12 @@ def check(
 
 def _searched(decoder: MaskDecoder, plane: Source, lens: FrameLens, *, keep_law: bool) -> LawCheck:
     search = search_frame(decoder, plane, lens)
-    if search.found is not None and keep_law and search.law not in (None, decoder.law):
+    if search.found is not None and keep_law and search.law not in (None, decoder.optics.law):
         own = search_frame(decoder, plane, lens, other_laws=False)
         if own.found is None:
-            other = finding(Code.CARRIERS_OTHER_LAW, FRAME, law=decoder.law, seen=search.law, odds=search.sentence)
+            other = finding(
+                Code.CARRIERS_OTHER_LAW, FRAME, law=decoder.optics.law, seen=search.law, odds=search.sentence
+            )
             return LawCheck(decoder, search, other)
         search = own
     if search.found is not None:
@@ -100,10 +102,7 @@ def search_frame(decoder: MaskDecoder, plane: Source, lens: FrameLens, *, other_
     """Search a frame for its mask's carriers near the prediction of every law, or only of the decoder's."""
     return search_laws(
         _spectrum(decoder, plane),
-        sensor=decoder.sensor,
-        mask=decoder.mask,
-        law=decoder.law,
-        mask_distance_mm=decoder.mask_distance_mm,
+        decoder.optics,
         focal_length_mm=lens.focal_length_mm,
         f_number=lens.f_number,
         other_laws=other_laws,
@@ -114,7 +113,7 @@ def search_frame(decoder: MaskDecoder, plane: Source, lens: FrameLens, *, other_
 def at_found(decoder: MaskDecoder, search: LawSearch) -> MaskDecoder:
     """Return the decoder for the frame that a search found the lattice of, by the law that it obeys."""
     assert search.found is not None
-    return replace(decoder, law=search.law or decoder.law, at=search.found.lattice)
+    return replace(decoder, optics=decoder.optics.by(search.law or decoder.optics.law), at=search.found.lattice)
 
 
 def _missing(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_number: float) -> Finding | None:
@@ -122,10 +121,8 @@ def _missing(decoder: MaskDecoder, plane: Source, focal_length_mm: float, f_numb
     return missing(
         _spectrum(decoder, plane),
         decoder.lattice_at(focal_length_mm),
-        sensor=decoder.sensor,
-        mask=decoder.mask,
-        mask_distance_mm=decoder.mask_distance_mm,
-        f_number=f_number,
+        decoder.optics,
+        f_number,
     )
 
 
@@ -143,9 +140,7 @@ def _foreign(
     return not_this_mask(
         _spectrum(decoder, plane),
         MaskLattice(used, seen, 0.0, math.nan, math.nan),
-        sensor=decoder.sensor,
-        mask=decoder.mask,
-        mask_distance_mm=decoder.mask_distance_mm,
+        decoder.optics,
         f_number=lens.f_number,
     )
 

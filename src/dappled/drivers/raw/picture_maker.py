@@ -83,7 +83,9 @@ class PictureMaker:
             shadow = self._shadow(mosaic, decoder, focal_length_mm, f_number)
             made = picture_of(mosaic, shadow, period_of(shadow.lattice))
         found = self._findings(Subject("frame", str(path)), raw, made, decoder, (focal_length_mm, f_number))
-        return MadePicture(made, raw, decoder.sensor, focal_length_mm, f_number, _colour_matrix(path, raw), found)
+        return MadePicture(
+            made, raw, decoder.optics.sensor, focal_length_mm, f_number, _colour_matrix(path, raw), found
+        )
 
     def _mosaic(self, raw: RawFile) -> MosaicPlane:
         """A frame's linear values with its colours as they are; a staggered chip's samples at their places."""
@@ -112,7 +114,8 @@ class PictureMaker:
         made = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others)
         if made.source == ShadowFrom.NONE and self._recipe.try_laws and not known:
             for law in LAWS:
-                if law != decoder.law and (there := replace(decoder, law=law)).predict(focal_length_mm)[1:]:
+                there = replace(decoder, optics=decoder.optics.by(law))
+                if law != decoder.optics.law and there.predict(focal_length_mm)[1:]:
                     orders, lattice = _orders(there, focal_length_mm, f_number), there.lattice_at(focal_length_mm)
                     tried = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
                     made = tried if tried.source != ShadowFrom.NONE else made
@@ -161,10 +164,10 @@ def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None
 
 def _strengths(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[OrderStrength]:
     lattice = decoder.lattice_at(focal_length_mm)
-    distance = decoder.mask_distance_mm
+    optics = decoder.optics
     if decoder.calibration is not None:
-        distance = decoder.calibration.nearest(focal_length_mm).mask_distance_mm
-    found = order_strengths(decoder.mask, decoder.sensor, lattice, mask_distance_mm=distance, f_number=f_number)
+        optics = replace(optics, distance_mm=decoder.calibration.nearest(focal_length_mm).mask_distance_mm)
+    found = order_strengths(optics, lattice, f_number)
     return [one for one in found if one.on_sensor]
 
 
@@ -179,14 +182,16 @@ def _told(
     """What a calibration predicts, behind a stop of each shape."""
     assert decoder.calibration is not None
     known = decoder.calibration.nearest(focal_length_mm)
-    magnitudes = dict(zip(decoder.mask.half_orders(), known.transfer, strict=True))
+    magnitudes = dict(zip(decoder.optics.mask.half_orders(), known.transfer, strict=True))
     transfers = transfer(orders, [magnitudes[order] for order in orders], known.origin)
-    cycles = kappa(decoder.mask.frequency_per_mm * known.print_scale, known.mask_distance_mm, focal_length_mm, f_number)
+    cycles = kappa(
+        decoder.optics.mask.frequency_per_mm * known.print_scale, known.mask_distance_mm, focal_length_mm, f_number
+    )
     angular = angular_frequencies(orders, cycles, known.rotation_rad)
     lattice = decoder.lattice_at(focal_length_mm)
     made = []
     for shape in SHAPES:
-        through = transfers * Aperture(decoder.mask.views_per_axis, shape).transform(angular)
+        through = transfers * Aperture(decoder.optics.mask.views_per_axis, shape).transform(angular)
         each = np.repeat(through[None, :, None], mosaic.colours, axis=0)
         sigma = np.full(mosaic.colours, _TOLD_SIGMA)
         made.append(Shadow(mosaic.shape, lattice, tuple(orders), each, 0, ShadowFrom.CALIBRATION, sigma))
