@@ -47,3 +47,12 @@ def test_words_take_the_facts() -> None:
     one = finding(Code.FRAME_CLOCK_DISAGREES, Subject("frame", 4), off_s=-8.0)
     assert findings.text(one) == "by the body's clock it was taken -8 s away from its shot"
     assert findings.told(one) == f"frame 4: {findings.text(one)}: compare the picture with its neighbours"
+
+
+def test_facts_from_a_damaged_file_are_shown_as_they_are() -> None:
+    one = Finding(Code.CAMERA_ABSENT, Subject("camera"), {"reason": ""})
+    assert findings.text(one) == "the camera is absent"
+    assert "None" in findings.text(Finding(Code.POSITION_JUMPED, Subject("vehicle")))
+    assert findings.of_json_text('{"code": "camera.absent"}') is None
+    assert findings.of_json_text("the camera is absent") is None
+    assert findings.of_json_text(findings.json_text(one)) == one

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import logging
-import re
 import sys
 from pathlib import Path
 from typing import ClassVar
 
 SERVICE_MANIFEST = "installed.json"  # which `make install` leaves in its environment
 PACKAGED = "packaged"  # which the Debian package has beside dappled's own folder
-_NUMBER = re.compile(r"\d+(?:[.,]\d+)*(?:( [a-z]+?)s?\b)?")
 
 
 class DappledError(Exception):
@@ -43,16 +41,6 @@ def first_line(error: BaseException) -> str:
 def counted(count: int, noun: str, width: int = 0) -> str:
     """A number with its noun: 1 frame, 2 frames."""
     return f"{count:{width}d} {noun}" + ("" if count == 1 else "s")
-
-
-def without_numbers(text: str) -> str:
-    """A sentence in which numbers are left out, with the plural of what they count: two that differ in their numbers
-    alone become equal.
-
-    >>> without_numbers("the disk is full: 1 frame, 12.5 MB"), without_numbers("the disk is full: 2 frames, 3 MB")
-    ('the disk is full: # frame, # MB', 'the disk is full: # frame, # MB')
-    """
-    return _NUMBER.sub(lambda found: f"#{found[1] or ''}", text)
 
 
 def report(log: logging.Logger, what: str, error: BaseException) -> None:

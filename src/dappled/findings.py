@@ -38,6 +38,16 @@ class Code(StrEnum):
 
     APERTURE_DISAGREES = "aperture.disagrees"
     APERTURE_UNEXPLAINED = "aperture.unexplained"
+    BATTERY_VEHICLE_LOW = "battery.vehicle_low"
+    BODY_BATTERY_LOW = "body.battery_low"
+    BODY_CARD_FILLING = "body.card_filling"
+    BODY_CARD_FULL = "body.card_full"
+    BODY_DRIFT = "body.drift"
+    BODY_HOT = "body.hot"
+    BODY_SETTING_WRONG = "body.setting_wrong"
+    BODY_UNCHECKED = "body.unchecked"
+    BODY_UNREAD = "body.unread"
+    BODY_UNREPORTED = "body.unreported"
     CAMERA_ABSENT = "camera.absent"
     CAMERA_CLOCK_FAR = "camera.clock_far"
     CAMERA_FAULTED = "camera.faulted"
@@ -62,12 +72,26 @@ class Code(StrEnum):
     CARRIERS_UNOBSERVABLE = "carriers.unobservable"
     CARRIERS_UNSEARCHED = "carriers.unsearched"
     CARRIERS_UNSEEN = "carriers.unseen"
+    CLOCK_AUTOPILOT_UNKNOWN = "clock.autopilot_unknown"
+    CLOCK_DATE_UNKNOWN = "clock.date_unknown"
+    CLOCK_LOOSE = "clock.loose"
     CLOCK_STEPPED = "clock.stepped"
     CLOCK_UNSTEADY = "clock.unsteady"
+    CLOCK_UTC_UNKNOWN = "clock.utc_unknown"
     COPY_IN_MEMORY = "copy.in_memory"
     COPY_MAY_NOT_LAST = "copy.may_not_last"
     COPY_REMOTE = "copy.remote"
+    DECODE_BEHIND = "decode.behind"
+    DECODE_FAILED = "decode.failed"
+    DECODE_FAILING = "decode.failing"
+    DECODE_IN_DOUBT = "decode.in_doubt"
+    DECODE_MISFIT = "decode.misfit"
+    DECODE_NO_MASK = "decode.no_mask"
+    DECODE_OFF = "decode.off"
+    DECODE_UNCALIBRATED = "decode.uncalibrated"
     DISK_FEW_FILES = "disk.few_files"
+    DISK_FEW_FRAMES = "disk.few_frames"
+    DISK_FILLING = "disk.filling"
     DISK_FULL = "disk.full"
     DISK_NEARLY_FULL = "disk.nearly_full"
     DISK_UNREADABLE = "disk.unreadable"
@@ -92,8 +116,14 @@ class Code(StrEnum):
     FRAME_UNJUDGED = "frame.unjudged"
     FRAME_UNPLACED = "frame.unplaced"
     FRAME_VIGNETTED = "frame.vignetted"
+    FRAMES_BAD = "frames.bad"
+    FRAMES_LENS_MOVED = "frames.lens_moved"
+    GIMBAL_UNHEARD = "gimbal.unheard"
     GNSS_DAMAGED = "gnss.damaged"
+    GNSS_FAILING = "gnss.failing"
     GNSS_NO_RAW = "gnss.no_raw"
+    GNSS_NO_UBX = "gnss.no_ubx"
+    GNSS_SILENT = "gnss.silent"
     KIT_BLIND = "kit.blind"
     KIT_DARK = "kit.dark"
     KIT_DISTANCE_OPEN = "kit.distance_open"
@@ -118,7 +148,12 @@ class Code(StrEnum):
     LENS_UNTOLD = "lens.untold"
     LINK_CLOCK_AHEAD = "link.clock_ahead"
     LINK_CLOCK_BEHIND = "link.clock_behind"
+    LINK_DOWN = "link.down"
+    LINK_NONE = "link.none"
+    LINK_OTHER_SYSTEM = "link.other_system"
+    LINK_REFUSED = "link.refused"
     LINK_SAME_IDS = "link.same_ids"
+    LINK_SILENT = "link.silent"
     LINK_VEHICLE = "link.vehicle"
     LOG_BYTES_SKIPPED = "log.bytes_skipped"
     LOG_CORE = "log.core"
@@ -173,13 +208,17 @@ class Code(StrEnum):
     POSITION_FAR_TELEMETRY = "position.far_telemetry"
     POSITION_IMPOSSIBLE = "position.impossible"
     POSITION_JUMPED = "position.jumped"
+    POSITION_NO_ATTITUDE = "position.no_attitude"
     POSITION_NO_FIX = "position.no_fix"
     POSITION_NOT_INTERPOLATED = "position.not_interpolated"
     POSITION_RECEIVER_SILENT = "position.receiver_silent"
     POSITION_SIGMA_UNKNOWN = "position.sigma_unknown"
     POSITION_TIME_DOUBTED = "position.time_doubted"
     POSITION_TOO_COARSE = "position.too_coarse"
+    POSITION_UNHEARD = "position.unheard"
     POSITION_UNKNOWN = "position.unknown"
+    POSITION_UNSURE = "position.unsure"
+    POSITION_WEAK_FIX = "position.weak_fix"
     POSITION_WITHOUT_FIX = "position.without_fix"
     SEAL_NONE = "seal.none"
     SEAL_NOT_SIGNED = "seal.not_signed"
@@ -187,9 +226,18 @@ class Code(StrEnum):
     SEAL_SIGNED = "seal.signed"
     SEAL_SIGNED_UNTIL = "seal.signed_until"
     SEAL_UNVERIFIED = "seal.unverified"
+    SERIES_LATE = "series.late"
+    SERIES_NO_FIELD = "series.no_field"
+    SERIES_NO_HEIGHT = "series.no_height"
+    SERIES_NO_POSITION = "series.no_position"
+    SERIES_OLD_POSITION = "series.old_position"
+    SERIES_TOO_LOW = "series.too_low"
     SERVICE_STOPPING = "service.stopping"
     SHOT_INTERVAL_BOUNDS = "shot.interval_bounds"
     SHOT_NOT_NOTED = "shot.not_noted"
+    STAGE_BEHIND = "stage.behind"
+    TASK_FAILING = "task.failing"
+    THREAD_ENDED = "thread.ended"
     TIME_MACHINE_DIFFERS = "time.machine_differs"
     TIME_TRIGGER_UNUSABLE = "time.trigger_unusable"
     TIME_WEEK_MENDED = "time.week_mended"
@@ -220,12 +268,14 @@ FRAME = Subject("frame")  # the one whose light field, row or line the finding s
 
 @dataclass(frozen=True, slots=True)
 class Wording:
-    """How a code is told: its sentence with {facts}, what to do, and the page of the documents."""
+    """How a code is told: its sentence with {facts}, what to do, and the page of the documents; how long it stands
+    before it is told unasked, because it usually ends by itself."""
 
     level: Level
     sentence: str
     remedy: str = ""
     page: str = ""
+    settles_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,6 +356,11 @@ def first_of_each(found: Iterable[Finding]) -> list[Finding]:
     return list(first.values())
 
 
+def above_note(found: Iterable[Finding]) -> list[Finding]:
+    """Those that stand between a result and "go"."""
+    return [one for one in found if one.level > Level.NOTE]
+
+
 def in_order(found: Sequence[Finding]) -> list[Finding]:
     """Worst first, then newest: `found` stands in the order of finding."""
     return sorted(found[::-1], key=lambda one: -one.level)  # noqa: C415  sorted() keeps the order of equals
@@ -339,11 +394,20 @@ def text(one: Finding) -> str:
     return _filled(WORDS[one.code].sentence, one.facts)
 
 
+def remedy(one: Finding) -> str:
+    """What to do; "" where nothing is to be done."""
+    return _filled(WORDS[one.code].remedy, one.facts)
+
+
+def named(one: Finding, under: Subject | None = None) -> str:
+    """What was found, of what, where there are several such things; what stands `under` its subject's name needs it not
+    again."""
+    return text(one) if one.subject.which == "" or one.subject == under else f"{one.subject}: {text(one)}"
+
+
 def told(one: Finding, under: Subject | None = None) -> str:
-    """What was found, of what, and what to do; what stands `under` its subject's name needs it not again."""
-    remedy = _filled(WORDS[one.code].remedy, one.facts)
-    whole = text(one) + (f": {remedy}" if remedy else "")
-    return whole if one.subject == under else f"{one.subject}: {whole}"
+    """What was found, of what, and what to do."""
+    return named(one, under) + (f": {todo}" if (todo := remedy(one)) else "")
 
 
 def to_rows(found: Iterable[Finding]) -> list[dict[str, Any]]:

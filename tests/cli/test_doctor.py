@@ -18,8 +18,12 @@ from dappled.config import settings as configuration
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import CANON, UsbBody
-from tests.daemon.health.test_go_no_go import WELL
+from dappled.findings import Code, Subject, finding
+from tests.daemon.health.test_go_no_go import WELL as FACTS
 from tests.system.conftest import dappled
+
+ABSENT = finding(Code.CAMERA_ABSENT, Subject("camera"), reason="no body").to_json() | {"age_s": 0.0}
+WELL = {**FACTS, "camera": {"state": "ready", "reason": ""}, "findings": []}
 
 
 def test_on_a_machine_without_any_camera_it_ends_with_what_to_do_next(capfd: pytest.CaptureFixture[str]) -> None:
@@ -132,7 +136,6 @@ def test_beside_a_running_daemon_it_asks_that_one(
     assert main(["doctor", "--config", config]) == 0
     out = capfd.readouterr().out.splitlines()
     assert out[0] == "a daemon runs here, flight 20261121T101503Z-1a2b3c4d; it reports"
-    assert out[1] == "go       Camera      ready"
     assert out[-2].startswith("caution  settings    ")  # there is no flight.toml to compare with
     assert out[-1] == "GO, with the cautions above"
     assert main(["doctor", "--config", config, "--test-shot"]) == 1
@@ -143,11 +146,12 @@ def test_a_running_daemon_without_a_camera_is_no_go(
     running: Callable[[dict[str, Any]], Path], capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("dappled.cli.doctor.HEAR_S", 60.0)
-    config = str(running(WELL | {"camera": {"state": "absent", "reason": "no body"}}))
+    config = str(running(WELL | {"camera": {"state": "absent", "reason": "no body"}, "findings": [ABSENT]}))
     assert main(["doctor", "--config", config, "--json"]) == 1
     told = json.loads(capfd.readouterr().out)
     assert told["verdict"] == "no-go"
-    assert told["checks"][0] == {"name": "Camera", "state": "no-go", "text": "absent: no body", "todo": ""}
+    first = told["checks"][0]
+    assert (first["name"], first["state"], first["text"]) == ("camera.absent", "no-go", "the camera is absent: no body")
     assert told["next"]
 
 

@@ -97,7 +97,7 @@ def test_it_ends_when_it_has_its_frames(
     assert [one for one in (tmp_path / "flights").rglob("*") if one.stat().st_mode & 0o007] == []
 
 
-def test_frames_that_could_not_be_decoded_are_a_failure_though_all_are_safe(
+def test_frames_that_could_not_be_decoded_are_said_and_a_run_ends_regularly_with_all_of_them_safe(
     config: Path, port: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     masked = '[camera]\nprofile = "reference-36mm"\n'
@@ -105,7 +105,7 @@ def test_frames_that_could_not_be_decoded_are_a_failure_though_all_are_safe(
     config.write_text(text.replace("[camera]\n", masked))
     ground = Ground(port, frames=3)
     ground.start()
-    assert main(["run", "--config", str(config), "--frames", "3", "--for", LONG_S]) == 1
+    assert main(["run", "--config", str(config), "--frames", "3", "--for", LONG_S]) == 0
     ground.join(60)
     assert capsys.readouterr().err.splitlines()[-1] == "3 shots: 3 frames safe, 0 decoded, 3 with a problem"
     (flight,) = flight_report.list_flights(tmp_path / "flights")

@@ -45,8 +45,8 @@ def test_one_screen_says_how_it_is(stream: str, capsys: pytest.CaptureFixture[st
     assert "camera    faulted: it hangs" in said
     assert "udpin:0.0.0.0:14560: 1200 in, 34 out, 2 bad, 0 unsent; signed: 9 good, 3 forged, 1 replayed" in said
     assert "disk      unknown, /x" in said
-    assert "9 requested, 7 safe, 1 failed, 1 pending, 3 refused" in said
-    assert "problem   the camera is faulted: it hangs" in said
+    assert "shots     8 taken, 7 on disk, 3 refused, 3 lost" in said
+    assert "stop      the camera is faulted: it hangs" in said
 
 
 def test_the_record_itself_as_json(stream: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -17,6 +17,7 @@ from dappled.clock import RecordedClock
 from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import BodyState, StateChanged
+from dappled.findings import Code, Finding, Subject, finding
 from tests.daemon.health.test_metrics import HEALTH
 from tests.daemon.health.test_systemd import read
 from tests.flight.makers import shot
@@ -62,15 +63,15 @@ def test_the_camera_is_told_of_when_it_changes() -> None:
     assert camera.state == "ready"
 
 
-def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
+def test_a_finding_is_said_once_each_time_it_begins() -> None:
     said: list[str] = []
     lines: list[str] = []
-    problems: list[str] = []
+    here: list[Finding] = []
     clock = RecordedClock(10**10)
 
     class Daemon:
         def health(self) -> Mapping[str, Any]:
-            return {**HEALTH, "problems": list(problems)}
+            return {**HEALTH, "findings": [{**one.to_json(), "age_s": 0.0} for one in here]}
 
     class Manager:
         def status(self, text: str) -> None:
@@ -84,21 +85,26 @@ def test_a_problem_is_said_once_each_time_it_comes_up() -> None:
     )
     remarks.look()
     assert lines == []  # not yet a second old
-    for here in (["b", "a"], ["a"], ["a", "b"]):
-        problems[:] = here
+    a, b = (finding(Code.THREAD_ENDED, Subject("thread", name), thread=name) for name in "ab")
+    words = {one: f"thread {name}: the {name} thread has ended: restart dappled" for one, name in ((a, "a"), (b, "b"))}
+    for now in ([b, a], [a], [a, b]):
+        here[:] = now
         clock.advance(1)
         remarks.look()
         remarks.look()
-    assert said == ["problem: a", "problem: b", "problem: b"]
-    assert [line.split("; ", 1)[1] for line in lines] == ["b; a", "a", "a; b"]
-    for here in (["disk: 12 MB left"], ["disk: 11 MB left"]):
-        problems[:] = here
-        clock.advance(1)
-        remarks.look()
-    assert said[3:] == ["problem: disk: 12 MB left"]  # numbers that change are no news
-    problems[:] = ["the end"]
+    assert said == [f"stop: {words[one]}" for one in (b, a, b)]
+    assert [line.split("; ", 1)[1] for line in lines] == [
+        f"{words[b]}; {words[a]}",
+        words[a],
+        f"{words[a]}; {words[b]}",
+    ]
+    here[:] = [a.with_facts(thread="other"), finding(Code.SERVICE_STOPPING, Subject("service"))]
+    clock.advance(1)
+    remarks.look()
+    assert len(said) == 3  # facts that change are no news, and notes are none
+    here[:] = [finding(Code.DISK_FULL, Subject("disk"), left_kb=1)]
     remarks.look(now=True)
-    assert said[-1] == "problem: the end"
+    assert said[-1].startswith("stop: the disk is full")
 
 
 def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,11 +7,10 @@ from typing import Any, cast
 
 import pytest
 
-from dappled.clock import RecordedClock
 from dappled.config.settings import PlannedBody
 from dappled.daemon.body_plan import BodyPlan, BodyReport, BodyTemperature
-from dappled.daemon.health import go_no_go
 from dappled.drivers.camera import CameraError, Setting, SettingName, SettingsChanged, StateChanged, check_change
+from dappled.findings import Code, Finding, Level, above_note, text, told
 from dappled.flight import Tag, TimeSource
 from tests.daemon.fakes import no_pose
 
@@ -49,10 +48,14 @@ class Body:
         self.now = tuple(replace(one, value=changed.get(one.name, one.value)) for one in self.now)
 
 
+def said(found: Finding | None) -> str:
+    return "" if found is None else text(found)
+
+
 class Rig:
     def __init__(self, body: Body, planned: PlannedBody | None = None) -> None:
-        self.body, self.clock = body, RecordedClock(10**12)
-        self.plan = BodyPlan(planned or PlannedBody(), "card", body, self.clock)
+        self.body = body
+        self.plan = BodyPlan(planned or PlannedBody(), "card", body)
         self.plan.take(StateChanged("ready", "", 0))
         self.read()
 
@@ -66,9 +69,9 @@ class Rig:
         for _ in range(2):
             self.plan.settings_changed(SettingsChanged(self.body.now, 0, refused))
 
-    def check(self) -> tuple[str, str]:
-        (found,) = go_no_go._body({"body": self.report().values()})
-        return found.state, found.text
+    def check(self) -> list[str]:
+        """What stands between the body and go."""
+        return [told(one) for one in above_note(self.report().findings())]
 
 
 def tag(index: int, **values: float | None) -> Tag:
@@ -82,8 +85,7 @@ def test_a_battery_that_will_not_last_is_told_and_is_a_caution_before_flight(wor
     rig = Rig(Body())
     rig.body.now = (*AS_PLANNED, Setting("battery", word))
     rig.read()
-    assert f"the camera's battery is nearly empty: {word.strip()}" in rig.report().problems()
-    assert rig.check() == ("caution", f"its battery is nearly empty: {word.strip()}")
+    assert rig.check() == [f"the camera's battery is nearly empty: {word.strip()}: change it"]
 
 
 def test_how_warm_the_body_is_is_told_and_is_a_caution_where_it_is_hot() -> None:
@@ -93,10 +95,9 @@ def test_how_warm_the_body_is_is_told_and_is_a_caution_where_it_is_hot() -> None
     assert rig.report().values()["temperature_c"] is None
     rig.plan.take(BodyTemperature(24.0))
     assert rig.report().values()["temperature_c"] == 24.0
-    assert rig.check()[0] == "go"
-    assert rig.check()[1].endswith(", 24 °C")
+    assert rig.check() == []
     rig.plan.take(BodyTemperature(50.0))
-    assert rig.check() == ("caution", "it is 50 °C warm inside")
+    assert [one.code for one in rig.report().findings()] == [Code.BODY_HOT]
     rig.plan.camera_changed(StateChanged("absent", "unplugged", 0))
     rig.plan.take(StateChanged("ready", "", 0))
     assert rig.report().temperature_c is None  # it may be another body
@@ -110,16 +111,14 @@ def test_a_good_one_and_one_that_says_nothing_clear_are_not(word: str, percent: 
     rig = Rig(Body())
     rig.body.now = (*AS_PLANNED, Setting("battery", word))
     rig.read()
-    assert rig.report().problems() == []
     assert rig.report().values()["battery_percent"] == percent
-    assert rig.check()[0] == "go"
+    assert rig.check() == []
 
 
 def test_a_body_as_planned_is_left_alone() -> None:
     rig = Rig(Body())
-    assert rig.check() == ("go", "as planned, room for 250 frames")
+    assert rig.check() == []
     assert not rig.body.asked
-    assert not rig.report().problems()
 
 
 def test_what_can_be_set_is_set_once_and_the_rest_is_no_go() -> None:
@@ -127,30 +126,29 @@ def test_what_can_be_set_is_set_once_and_the_rest_is_no_go() -> None:
     rig = Rig(Body("exposure_mode", exposure_mode="AV", drive_mode="Continuous", image_format="L", auto_power_off="30"))
     asked = [("exposure_mode", "Manual"), ("drive_mode", "Single"), ("image_format", "RAW"), ("auto_power_off", "0")]
     assert sorted(rig.body.asked) == sorted(asked)
-    state, text = rig.check()
-    assert (state, text) == ("no-go", "the camera's exposure mode is AV, not manual as planned: turn the mode dial")
-    assert rig.report().problems() == [text]
+    assert rig.check() == ["camera's exposure mode: it is AV, not manual as planned: turn the mode dial"]
+    assert [one.level for one in rig.report().findings()] == [Level.STOP]
     rig.body.turn(exposure_mode="Manual")
     rig.read()
-    assert rig.check()[0] == "go"
+    assert rig.check() == []
     rig.body.turn(drive_mode="Timer 10 sec")
     rig.read()
-    assert rig.check()[0] == "no-go"
+    assert rig.check() != []
     assert len(rig.body.asked) == 4  # told, and not turned back
     rig.plan.camera_changed(StateChanged("absent", "unplugged", 0))
     assert rig.plan.report() is None
     rig.plan.camera_changed(StateChanged("ready", "", 0))
     assert not rig.report().read
     rig.read()
-    assert rig.check()[0] == "go"  # opened again, it is set again
+    assert rig.check() == []  # opened again, it is set again
 
 
 def test_nothing_is_set_where_that_is_not_wanted() -> None:
     rig = Rig(Body(drive_mode="Continuous"), PlannedBody(check="tell"))
-    assert rig.check() == ("no-go", "the camera's drive mode is Continuous, not single as planned: set it at the body")
+    assert rig.check() == ["camera's drive mode: it is Continuous, not single as planned: set it at the body"]
     assert not rig.body.asked
     rig = Rig(Body(drive_mode="Continuous"), PlannedBody(check="off"))
-    assert rig.check()[0] == "caution"
+    assert [one.code for one in rig.report().findings()] == [Code.BODY_UNCHECKED]
     assert not rig.body.asked
     assert not rig.report().wrong
 
@@ -158,11 +156,10 @@ def test_nothing_is_set_where_that_is_not_wanted() -> None:
 def test_what_the_body_does_not_report_is_unknown_and_not_good() -> None:
     body = Body()
     body.now = tuple(one for one in body.now if one.name not in ("mirror_lockup", "focus_mode"))
-    assert Rig(body).check() == ("caution", "it doesn't report focus mode, mirror lock-up: look at it")
+    assert Rig(body).check() == ["the camera doesn't report focus mode, mirror lock-up: look at it"]
     body.now = ()
-    state, text = Rig(body).check()
-    assert state == "caution"
-    assert text.startswith("its settings can't be read; look at exposure mode, focus mode, drive mode")
+    (unread,) = Rig(body).check()
+    assert unread.startswith("the camera's settings can't be read: look at exposure mode, focus mode, drive mode")
 
 
 @pytest.mark.parametrize(
@@ -189,34 +186,34 @@ def test_what_a_person_sets_in_flight_is_the_plan_from_then_on() -> None:
         rig.plan.change("iso", "123")
     rig.plan.change("iso", "400")
     rig.read()
-    assert rig.check()[0] == "go"
+    assert rig.check() == []
     assert rig.plan.tagged(tag(1, iso=400.0)) is None
-    assert rig.plan.tagged(tag(2)) == "frame 2 was taken with ISO 100, not 400 as planned"
+    assert said(rig.plan.tagged(tag(2))) == "frame 2 was taken with ISO 100, not 400 as planned"
     rig.body.refused = ("iso",)
     rig.plan.change("iso", "Auto")
     rig.read(refused="iso was not set to Auto: busy")
-    assert not rig.report().wrong or "Auto" not in rig.report().wrong[0]
+    assert not any("Auto" in told(one) for one in rig.report().wrong)
 
 
 def test_each_frame_is_compared_with_the_plan() -> None:
     rig = Rig(Body(), PlannedBody(iso="100", shutter_speed="1/1000", aperture="5.6", focal_length_mm=35))
     assert rig.plan.tagged(tag(1)) is None
-    told = (
+    drift = (
         "frame 2 was taken with shutter speed 1/250 s, not 1/1000 as planned; focal length 34 mm, not 35 mm as planned"
     )
-    assert rig.plan.tagged(tag(2, exposure_s=1 / 250, focal_length_mm=34.0)) == told
-    assert rig.report().problems() == [told]
-    assert rig.check() == ("caution", f"{told}; it doesn't report shutter speed, aperture: look at it")
-    rig.clock.advance(61)
-    assert not rig.report().problems()
-    assert rig.plan.tagged(tag(3, iso=None)) == "frame 3 was taken with ISO unknown, not 100 as planned"
+    assert said(rig.plan.tagged(tag(2, exposure_s=1 / 250, focal_length_mm=34.0))) == drift
+    unreported = "the camera doesn't report shutter speed, aperture: look at it"
+    assert rig.check() == [f"{drift}: look at the camera's dials", unreported]
+    assert said(rig.plan.tagged(tag(3, iso=None))) == "frame 3 was taken with ISO unknown, not 100 as planned"
+    assert rig.plan.tagged(tag(4)) is None
+    assert rig.check() == [unreported]  # the next frame as planned ends it
 
 
 def test_without_a_plan_a_frame_is_compared_with_the_one_before() -> None:
     rig = Rig(Body())
     assert rig.plan.tagged(tag(1)) is None
-    told = "frame 2 was taken with ISO 200; frame 1 with ISO 100"
-    assert rig.plan.tagged(tag(2, iso=200.0)) == told
+    drift = "frame 2 was taken with ISO 200; frame 1 with ISO 100"
+    assert said(rig.plan.tagged(tag(2, iso=200.0))) == drift
     assert rig.plan.tagged(tag(3, iso=200.0)) is None
     assert rig.plan.tagged(tag(0)) is None  # it came late
     automatic = Rig(Body(exposure_mode="AV"), PlannedBody(exposure_mode="AV"))
@@ -225,13 +222,10 @@ def test_without_a_plan_a_frame_is_compared_with_the_one_before() -> None:
 
 
 @pytest.mark.parametrize(
-    ("room", "state", "problem"),
-    [("101", "go", ""), ("99", "caution", ""), ("20", "caution", "room for 20 frames"), ("0", "no-go", "it is full")],
+    ("room", "codes"), [("101", []), ("20", [Code.BODY_CARD_FILLING]), ("0", [Code.BODY_CARD_FULL])]
 )
-def test_a_card_that_is_nearly_full_is_told(room: str, state: str, problem: str) -> None:
+def test_a_card_that_is_nearly_full_is_told(room: str, codes: list[Code]) -> None:
     rig = Rig(Body(free_shots=room))
-    assert rig.check()[0] == state
-    assert problem in "".join(rig.report().problems())
-    assert bool(rig.report().problems()) == bool(problem)
+    assert [one.code for one in rig.report().findings()] == codes
     memory = Rig(Body(free_shots=room, capture_target="Internal RAM"), PlannedBody(check="off"))
     assert memory.report().card_frames is None  # what counts then is this computer's disk

@@ -25,18 +25,20 @@ from dappled.daemon import flight_control
 from dappled.daemon import service as module
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.health import go_no_go, resources
-from dappled.daemon.health.go_no_go import Check
+from dappled.daemon.health.standing import in_record
 from dappled.daemon.navigation import UtcCorrection
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChanged, StateChanged
 from dappled.errors import DappledError
+from dappled.findings import told as findings_told
 from dappled.flight import FlightError, LedgerReader, Recording, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
 from tests.daemon.test_settings_check import MASK, calibration
+from tests.standing import codes, problems
 
 S = 10**9
 
@@ -141,7 +143,7 @@ def test_a_disk_without_inodes_or_room_for_the_journal_refuses_in_words(
     with monkeypatch.context() as full:
         full.setattr(layout, "disk_space", lambda _: free)
         decision = service.request(CaptureRequest("test", "console", 1))
-        said = "\n".join(service.health()["problems"])
+        said = "\n".join(problems(service.health()))
     assert (decision.outcome, decision.reason) == ("refused", free.shortage(0))
     assert ("only 3 more files" in said) == (free.files == 3)
     service.stop()
@@ -158,7 +160,7 @@ def test_too_little_memory_refuses_in_words_as_long_as_that_is_fresh(
     decision = service.request(CaptureRequest("test", "console", 1))
     said = "too little memory is left for a photograph: 10 MB; end other programs"
     assert decision.words == f"no photo: {said}"
-    assert said in service.health()["problems"]
+    assert said in problems(service.health())
     monkeypatch.setattr(flight_control, "LOOK_VALID_NS", 0)
     assert service.request(CaptureRequest("test", "console", 2)).accepted
     service.stop()
@@ -232,9 +234,9 @@ def test_stop_twice_and_before_start_is_harmless(camera: FakeCamera, settings: S
 def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: FakeCamera, settings: Settings) -> None:
     service = started(replace(settings, record=replace(settings.record, utc="system")), [])
     try:
-        assert "clock" not in "".join(service.health()["problems"])
+        assert "clock" not in "".join(problems(service.health()))
         service.navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
-        assert "this machine's clock is 3600 s fast" in "".join(service.health()["problems"])
+        assert "this machine's clock is +3600 s away" in "".join(problems(service.health()))
     finally:
         service.stop()
 
@@ -251,8 +253,8 @@ def test_another_component_with_our_ids_is_a_problem(
         with Peer(service.links.port(0), 1, settings.mavlink.component_id) as twin:
             twin.packer.seq = 200
             twin.heartbeat()
-            eventually(lambda: "sends as 1/100 too, which is this camera" in problems(service), "the other camera")
-            assert f"127.0.0.1:{twin.socket.getsockname()[1]}" in problems(service)
+            eventually(lambda: "sends as 1/100 too, which is this camera" in stepped(service), "the other camera")
+            assert f"127.0.0.1:{twin.socket.getsockname()[1]}" in stepped(service)
             service._publish_health()
             assert any("sends as 1/100 too" in text for text in said)
     finally:
@@ -279,19 +281,19 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         service.stop()
 
 
-def problems(service: Service) -> str:
+def stepped(service: Service) -> str:
     """What the health record says after a turn of the working loop."""
     service.step()
-    return "; ".join(service.health()["problems"])
+    return "; ".join(problems(service.health()))
 
 
 def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCamera, settings: Settings) -> None:
     service = started(settings, [])
     try:
         camera.say(SettingsChanged((Setting("battery", "Low"),), 1))
-        eventually(lambda: "battery is nearly empty: Low" in problems(service), "the battery")
+        eventually(lambda: "battery is nearly empty: Low" in stepped(service), "the battery")
         camera.say(SettingsChanged((Setting("battery", "100%"),), 2))
-        eventually(lambda: "battery" not in problems(service), "another battery")
+        eventually(lambda: "battery" not in stepped(service), "another battery")
     finally:
         service.stop()
 
@@ -334,7 +336,7 @@ def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
     try:
         with monkeypatch.context() as broken:
             broken.setattr(service._answers, "dead_threads", lambda: ["answers"])
-            assert "the answers thread has ended: restart dappled" in service.health()["problems"]
+            assert "the answers thread has ended: restart dappled" in problems(service.health())
             assert service.healthy()
             broken.setattr(service._pipeline, "dead_threads", lambda: ["capture"])
             assert not service.healthy()
@@ -352,7 +354,7 @@ def test_a_camera_driver_s_thread_that_dies_is_reported(
         assert service.healthy()
         dead.append("gphoto2")
         assert not service.healthy()
-        assert "the gphoto2 thread has ended: restart dappled" in service.health()["problems"]
+        assert "the gphoto2 thread has ended: restart dappled" in problems(service.health())
     finally:
         service.stop()
 
@@ -382,11 +384,12 @@ def test_one_that_fails_is_tried_again_and_told_once(error: Exception, caplog: p
             task.turn(do, now_ns)
     assert len(tries) == 3
     assert len(caplog.records) == 1
-    assert str(error) in task.problem
+    assert task.failing is not None
+    assert str(error) in findings_told(task.failing)
     broken = False
     task.turn(do, 10 * S)
     task.turn(do, 10 * S)
-    assert (len(tries), task.problem) == (5, "")
+    assert [len(tries), task.failing] == [5, None]
     broken = True
     with caplog.at_level(logging.WARNING):
         task.turn(do, 11 * S)
@@ -404,18 +407,18 @@ def test_a_calibration_of_another_camera_is_no_go_before_the_first_shot_and_refu
     )
     shots: list[PendingShot] = []
     service = started(settings, shots)
-    assert decoding(service).text == f"{MASK}, calibrated"
+    assert decoding(service) == []
     other = Identity("FUJIFILM", "FinePix S5200", "", "usb:")
     camera.say(StateChanged("ready", "", 1, other))
-    eventually(lambda: decoding(service).state == "no-go", "no-go")
-    assert "which fujifilm-s5200 doesn't make: calibrate with that camera" in decoding(service).text
+    eventually(lambda: decoding(service) == ["decode.misfit"], "no-go")
+    assert go_no_go.state(in_record(service.health())) == "no-go"
     assert any(
         text.startswith("frames can't be decoded: the calibration is for frames of ")
-        for text in service.health()["problems"]
+        for text in problems(service.health())
     )
     assert service.request(CaptureRequest("test", "console", 1)).accepted
     camera.say(StateChanged("ready", "", 1, Identity("Canon", "Canon EOS 450D", "", "usb:")))
-    eventually(lambda: decoding(service).text == f"{MASK}, calibrated", "the right camera")
+    eventually(lambda: decoding(service) == [], "the right camera")
     service.stop()
 
 
@@ -425,17 +428,19 @@ def test_frames_that_do_not_decode_are_a_caution_then_no_go_and_are_recorded(
     settings = replace(settings, mask=MaskSettings(MASK), decode=DecodeSettings(enabled=True))
     shots: list[PendingShot] = []
     service = started(settings, shots)
-    for index, state in enumerate(["caution", "caution", "no-go", "no-go"]):  # the fake camera's files are no pictures
+    for index, state in enumerate(
+        ["failed", "failed", "failing", "failing"]
+    ):  # the fake camera's files are no pictures
         assert service.request(CaptureRequest("test", "console", index)).accepted
         eventually(lambda: len(shots) == index + 1, "the shot's end")  # noqa: B023  # called before the next turn
         assert shots[-1].problem.startswith("not decoded")
-        assert decoding(service).state == state
-    assert any(text.startswith("decoding fails: the last 4 frames") for text in service.health()["problems"])
+        assert f"decode.{state}" in decoding(service)
+    assert any(text.startswith("decoding fails: the last 4 frames") for text in problems(service.health()))
     service.stop()
     assert flight_check.check(service.folder).intact
     assert len(list((service.folder / "frames").iterdir())) == 4
 
 
-def decoding(service: Service) -> Check:
-    (found,) = [one for one in go_no_go.checks(service.health()) if one.name == "Decoding"]
-    return found
+def decoding(service: Service) -> list[str]:
+    """The codes of what stands in the way of decoding."""
+    return [code for code in codes(service.health()) if code.startswith("decode.")]

@@ -18,6 +18,7 @@ from dappled.daemon.service import Service
 from dappled.flight import LedgerReader, flight_report
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import CallingObserver
+from tests.standing import problems
 
 DEADLINE_S = 30.0
 
@@ -52,7 +53,7 @@ class Flying:
 
     @property
     def problems(self) -> str:
-        return "\n".join(self.service.health()["problems"])
+        return "\n".join(problems(self.service.health()))
 
     @property
     def camera(self) -> str:

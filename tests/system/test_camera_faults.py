@@ -18,11 +18,13 @@ from typing import Any
 
 import pytest
 
-from dappled.daemon.health import go_no_go
+from dappled.daemon.health.standing import in_record
 from dappled.daemon.pipeline.capture import PendingShot
+from dappled.findings import Code, named
 from dappled.flight import LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
+from tests.standing import codes
 from tests.system.flying import Flying, eventually, flying, settings_of, told
 
 SIZE = 2_000_001
@@ -320,37 +322,32 @@ def camera_process(body: SimulatedBody) -> int:
 def test_a_body_that_is_not_as_planned(here: Path) -> None:
     """Set by the computer where the body lets it, else no-go; a dial turned in flight is told before the next shot."""
 
-    def checked(daemon: Flying) -> tuple[str, str]:
-        found = [one for one in go_no_go.checks(daemon.service.health()) if one.name == "Body"]
-        return (found[0].state, found[0].text) if found else ("", "")
-
-    def says(daemon: Flying, state: str, words: str) -> bool:
-        found = checked(daemon)
-        return found[0] == state and words in found[1]
+    def says(daemon: Flying, words: str) -> bool:
+        found = [named(one) for one in in_record(daemon.service.health()) if one.code == Code.BODY_SETTING_WRONG]
+        return any(words in one for one in found) if words else not found
 
     with a_body() as body:
         for turned in ("drive 1", "power-off 60", "mirror 0"):
             body.ask(f"turn {turned}")
         with daemon_before(here, body) as daemon:
-            eventually(lambda: checked(daemon) == ("go", "as planned, room for 100 frames"), "the body as planned")
+            eventually(
+                lambda: not any(code.startswith("body.") for code in codes(daemon.service.health())), "as planned"
+            )
             for turned, words in (
-                ("dial 2", "exposure mode is AV, not manual as planned: turn the mode dial"),
+                ("dial 2", "exposure mode: it is AV, not manual as planned"),
                 ("dial 3", ""),
-                ("focus 0", "focus mode is One Shot"),
+                ("focus 0", "focus mode: it is One Shot"),
                 ("focus 3", ""),
-                ("mirror 1", "mirror lock-up is on"),
+                ("mirror 1", "mirror lock-up: it is on"),
                 ("mirror 0", ""),
-                ("drive 0x10", "drive mode is Timer 10 sec"),
+                ("drive 0x10", "drive mode: it is Timer 10 sec"),
                 ("drive 0", ""),
             ):
                 body.ask(f"turn {turned}")
-                eventually(partial(says, daemon, "no-go" if words else "go", words), turned)
+                eventually(partial(says, daemon, words), turned)
             body.ask("turn room 3")
             body.ask("turn battery 0")
             assert daemon.shoot().problem == ""
-            problems = (
-                "the camera's card is nearly full: room for 3 frames",
-                "the camera's battery is nearly empty: Low",
-            )
-            eventually(lambda: set(problems) <= set(daemon.service.health()["problems"]), "what runs out")
+            low = {"body.card_filling", "body.battery_low"}
+            eventually(lambda: low <= set(codes(daemon.service.health())), "what runs out")
         assert body.releases == 2

@@ -20,6 +20,7 @@ import pytest
 from pymavlink import mavutil
 
 from dappled.mocks.simulation import free_port
+from tests.standing import problems
 from tests.system.conftest import dappled
 from tests.tools import tool
 
@@ -161,7 +162,7 @@ def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: 
         assert f"problem   {text}" in asked.stdout, asked.stderr
         with httpx.Client(base_url=f"http://127.0.0.1:{pages}", timeout=30) as page:
             state = page.get("/api/state").json()
-            assert any(text in problem for problem in state["health"]["problems"])
+            assert any(text in problem for problem in problems(state["health"]))
             assert re.search(r"^dappled_problems [1-9]", page.get("/metrics").text, re.MULTILINE)
         with closing(mavutil.mavlink_connection(f"udpout:127.0.0.1:{links}", source_system=254)) as late:
             heard = listening(late, time.monotonic() + 60)  # it missed what was said before

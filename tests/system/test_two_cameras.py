@@ -21,6 +21,7 @@ from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 from tests.daemon.camera_protocol.rig import Peer
+from tests.standing import codes
 from tests.system.flying import eventually
 
 BYTES = {"left": 50_000, "right": 60_000}  # so that a frame shows which body it is of
@@ -135,4 +136,4 @@ def is_ready(settings: Path) -> bool:
         record = status.health(status.stream_endpoint(settings), 5)
     except NotRunningError:
         return False
-    return record["camera"]["state"] == "ready" and "MAVLink" not in "".join(record["problems"])
+    return record["camera"]["state"] == "ready" and not any(code.startswith("link.") for code in codes(record))

@@ -16,6 +16,7 @@ from dappled.flight.checks import flight_check
 from dappled.mocks.simulation import Simulation, World
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting
+from tests.standing import problems
 from tests.system.conftest import dappled
 
 SECOND_NS = 10**9
@@ -34,14 +35,14 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
     with simulation as simulated:
         service = Service(simulated, clock=SystemClock(utc_minus_monotonic_ns=0))
         service.start()
-        assert "UTC is not known yet" in "".join(service.health()["problems"])
+        assert "UTC is not known yet" in "".join(problems(service.health()))
         try:
             service.run(lambda: service.health()["camera"]["state"] == "ready")
             station = simulation.ground_station(1)
             service.run(lambda: not station.running())
             until = time.monotonic() + 30
             service.run(lambda: service.navigation.utc.learnt is not None or time.monotonic() > until)
-            assert "UTC" not in "".join(service.health()["problems"])
+            assert "UTC" not in "".join(problems(service.health()))
         finally:
             service.stop()
         code, _ = station.wait(10)

@@ -24,11 +24,13 @@ from dappled.config.schema import read_toml
 from dappled.config.settings import Settings
 from dappled.daemon import settings_check, test_shot
 from dappled.daemon.health import frame_checks, go_no_go, host_checks
-from dappled.daemon.health.go_no_go import Check
+from dappled.daemon.health.host_checks import Check
+from dappled.daemon.health.standing import in_record
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.test_shot import Latency
 from dappled.drivers import usb_bus
 from dappled.errors import DappledError, counted
+from dappled.findings import named, remedy
 
 _WORDS = {"go": "go", "caution": "caution", "no-go": "NO GO"}
 _VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}
@@ -72,7 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
         checked = host_checks.run(settings)
         report: dict[str, Any] = {"checks": _facts(checked)}
         ready = all(one.state != "no-go" for one in checked if one.name in ("camera", "disk"))
-        good = not go_no_go.next_step(checked)
+        good = not host_checks.next_step(checked)
         lines = _lines(checked)
         if (arguments.test_shot or arguments.latency) and ready:
             more, shot = _shoot(settings, arguments, folder, truth)
@@ -80,7 +82,7 @@ def run(arguments: argparse.Namespace) -> int:
         elif arguments.test_shot or arguments.latency:
             lines.append("no shot was fired: the camera or the disk is not ready")
     lines.append(_last(checked, report.get("verdict")))
-    report["next"] = go_no_go.next_step(checked)
+    report["next"] = host_checks.next_step(checked)
     print(json.dumps(report, indent=2) if arguments.json else "\n".join(lines))
     return 0 if good else 1
 
@@ -94,7 +96,7 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
             "(dappled trigger, the ground station, the console)"
         )
     report, user = status.health(endpoint, HEAR_S, status.unit(arguments.config)), status.stranger(endpoint)
-    checks = go_no_go.checks(report)
+    checks = [Check(one.code.value, go_no_go.state([one]), named(one), remedy(one)) for one in in_record(report)]
     looked: list[Check] = []
     if report["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
         looked = [
@@ -102,12 +104,12 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
             for check in (host_checks.bodies, host_checks.grabbers)
             for one in check(settings, host_checks.Machine())
         ]
-    verdict = go_no_go.verdict(checks)
+    verdict = host_checks.verdict(checks)
     if arguments.config is not None:
         compared = _differences(arguments.config, settings, report, endpoint)
         looked += compared
-        verdict = go_no_go.verdict([*checks, *compared])
-    todo = go_no_go.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
+        verdict = host_checks.verdict([*checks, *compared])
+    todo = host_checks.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     if arguments.json:
         facts = _facts([*checks, *looked])
         found = {"flight": report["flight"], "user": user, "checks": facts, "verdict": verdict, "next": todo}
@@ -169,7 +171,7 @@ def _facts(checks: Sequence[Check]) -> list[dict[str, str]]:
 
 
 def _last(checks: Sequence[Check], verdict: str | None) -> str:
-    todo = go_no_go.next_step(checks)
+    todo = host_checks.next_step(checks)
     if todo:
         return f"next: {todo}"
     if verdict is not None:
@@ -208,7 +210,7 @@ def _shoot(
                 "test_shot": [
                     {"name": one.name, "state": one.state, "text": one.text, "measured": one.measured} for one in judged
                 ],
-                "verdict": go_no_go.verdict(judged),
+                "verdict": host_checks.verdict(judged),
             }
             lines += _lines(judged)
     if arguments.latency and latencies:

@@ -22,7 +22,6 @@ from dappled.config.schema import ConfigError, refuse
 from dappled.config.settings import Settings
 from dappled.daemon import settings_check
 from dappled.daemon.flight_handover import FlightHandover, flights
-from dappled.daemon.health.go_no_go import FAILING
 from dappled.daemon.health.systemd import Notifier
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
@@ -151,7 +150,6 @@ def serve(settings: Settings, arguments: argparse.Namespace, simulation: Simulat
             goal.begin(service)
             service.run(turn)
             problems.look(now=True)
-            tally.decoding_fails |= service.health()["decode"]["failed_in_a_row"] >= FAILING
             manager.working(time.monotonic_ns(), now=True)  # closing one flight and opening the next takes a while
         return not asked.is_set()
 
@@ -169,7 +167,7 @@ def serve(settings: Settings, arguments: argparse.Namespace, simulation: Simulat
         stack.callback(frames.close)
         flights(settings, fly)
     remark(tally.summary())
-    return 1 if (goal.short or tally.decoding_fails) and not asked.is_set() else 0  # a signal is a regular end
+    return 1 if goal.short and not asked.is_set() else 0  # a signal is a regular end
 
 
 def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) -> None:

@@ -15,9 +15,13 @@ from typing import Any
 
 from dappled.cli.arguments import seconds
 from dappled.config import settings
+from dappled.daemon.health.go_no_go import state
+from dappled.daemon.health.record import four_numbers
+from dappled.daemon.health.standing import ALL_IS_WELL, in_record
 from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import WireError
 from dappled.errors import DappledError
+from dappled.findings import above_note, told
 
 SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
 
@@ -139,13 +143,21 @@ def screen(record: Mapping[str, Any]) -> str:
         f"link      {link['urls']} open, {link['packets']} packets, {link['positions']} positions",
         *(f"          {_link(one)}" for one in link["each"]),
         f"disk      {free}, {disk['folder']}",
-        f"shots     {shots['wished']} requested, {_counts(shots, 'safe', 'failed', 'pending', 'refused')}",
+        f"shots     {', '.join(f'{count} {what}' for what, count in four_numbers(shots).items())}",
     ]
     for stage in record["stages"]:
         if "waiting" in stage:
             lines.append(f"{stage['name']:9} {_counts(stage, 'done', 'waiting', 'failed', 'dropped')}")
-    lines += [f"problem   {text}" for text in record["problems"]] or ["all is well"]
+    found = in_record(record)
+    lines.append(f"{state(found).upper() if above_note(found) else ALL_IS_WELL}")
+    lines += [f"{one.level.word:9} {told(one)}{_for(row)}" for one, row in zip(found, record["findings"], strict=True)]
     return "\n".join(lines)
+
+
+def _for(row: Mapping[str, Any]) -> str:
+    """Since when a finding stands."""
+    age_s = row.get("age_s", 0)
+    return "" if age_s < 60 else f" (for {age_s / 60:.0f} min)"
 
 
 def _link(facts: Mapping[str, Any]) -> str:

@@ -58,8 +58,8 @@ class StopCondition:
 
     @property
     def short(self) -> bool:
-        """Whether fewer good frames were taken than requested."""
-        return self._frames is not None and self._tally.good < self._frames
+        """Whether fewer frames are safe than requested."""
+        return self._frames is not None and self._tally.safe < self._frames
 
     def begin(self, flight: BegunFlight) -> None:
         """A flight has begun: its shots come on top of those of earlier flights, which have ended."""

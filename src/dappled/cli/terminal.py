@@ -18,14 +18,14 @@ from datetime import UTC, datetime
 from typing import Any, Protocol
 
 from dappled.clock import Clock, SystemClock
-from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.health.record import line as status_line
+from dappled.daemon.health.standing import NewFindings, unasked
 from dappled.daemon.health.systemd import JournalHandler
 from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.errors import counted
-from dappled.findings import plain
+from dappled.findings import plain, told
 from dappled.workers import Loop, Worker
 
 log = logging.getLogger("dappled.run")
@@ -124,13 +124,9 @@ class CameraRemarks:
 
 
 class Tally:
-    """Counts the shots that have ended, over all flights of the process. Any thread may `add`.
-
-    `decoding_fails`: the last frames of a flight could not be decoded.
-    """
+    """Counts the shots that have ended, over all flights of the process. Any thread may `add`."""
 
     def __init__(self) -> None:
-        self.decoding_fails = False
         self.count = self.safe = self.decoded = self.good = 0
         self._lock = threading.Lock()
 
@@ -191,7 +187,7 @@ class ProblemRemarks:
         clock: Clock | None = None,
     ) -> None:
         self._daemon, self._manager, self._say, self._clock = daemon, manager, say, clock or SystemClock()
-        self._problems = NewProblems()
+        self._new = NewFindings()
         self._due_ns = self._clock.monotonic_ns() + _PROBLEMS_EVERY_NS
 
     def look(self, *, now: bool = False) -> None:
@@ -201,8 +197,8 @@ class ProblemRemarks:
             return
         self._due_ns = now_ns + _PROBLEMS_EVERY_NS
         record = self._daemon.health()
-        for text in sorted(self._problems.among(record["problems"])):
-            self._say(f"problem: {text}", logging.WARNING, problem=text)
+        for one in self._new.among(unasked(record)):
+            self._say(f"{one.level.word}: {told(one)}", logging.WARNING, finding=one.code.value)
         self._manager.status(status_line(record))
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dappled.clock import Clock
 from dappled.config.settings import PlannedBody
 from dappled.drivers.camera import (
     EXPOSURES,
@@ -22,13 +21,13 @@ from dappled.drivers.camera import (
     off_plan,
     taken_with,
 )
-from dappled.errors import counted
+from dappled.findings import Code, Finding, Level, Subject, Value, finding
 from dappled.flight import Tag
 
 log = logging.getLogger(__name__)
 CARD_FRAMES = 20  # fewer than that, and the pilot is told
+HOT_C = 50.0  # inside a body; Canon's may be used in air of up to 40 °C
 LOW_PERCENT = 25
-_LAPSED_NS = 60 * 10**9
 _LOW_WORDS = ("low", "empty", "exhausted", "critical")
 _OFF = ("off", "0", "disable", "disabled", "never", "none")
 _WORDS: Mapping[tuple[str, str], tuple[str, ...]] = {
@@ -73,42 +72,49 @@ BodyNews = StateChanged | SettingsChanged | Tag | BodyTemperature
 
 @dataclass(frozen=True, slots=True)
 class BodyReport:
-    """How the body stands to the plan. `wrong` are sentences; `unknown` are the titles of planned settings that the
-    body doesn't report. `drift` says what the last frames were taken with instead; `card_frames` is the room on its
-    card, None where it reports none or stores elsewhere. `battery` is its word for what its battery holds, "" where it
-    says nothing, `battery_percent` that as a number, where it is one; `temperature_c` is that of the last frame's file.
-    `read`: its settings were read; `checked`: they are compared.
+    """How the body stands to the plan. `wrong` settings are not as planned; `unknown` are the titles of planned
+    settings that the body doesn't report. `drift` says what the last frames were taken with instead; `card_frames` is
+    the room on its card, None where it reports none or stores elsewhere. `battery` is its word for what its battery
+    holds, "" where it says nothing, `battery_percent` that as a number, where it is one; `temperature_c` is that of the
+    last frame's file. `read`: its settings were read; `checked`: they are compared.
     """
 
     read: bool
     checked: bool
-    wrong: tuple[str, ...]
+    wrong: tuple[Finding, ...]
     unknown: tuple[str, ...]
-    drift: str
+    drift: Finding | None
     card_frames: int | None
     battery: str
     battery_percent: int | None
     battery_low: bool
     temperature_c: float | None
 
-    def problems(self) -> list[str]:
-        """What the pilot is told, a sentence each."""
-        found = [*self.wrong, *([self.drift] if self.drift else [])]
-        if self.card_frames is not None and self.card_frames <= CARD_FRAMES:
-            room = f"room for {counted(self.card_frames, 'frame')}" if self.card_frames else "it is full"
-            found.append(f"the camera's card is nearly full: {room}")
+    def findings(self) -> Iterator[Finding]:
+        """What is not as it should be."""
+        about, settings = Subject("camera"), ", ".join(self.unknown)
+        yield from self.wrong
+        if self.drift is not None:
+            yield self.drift
+        if self.card_frames == 0:
+            yield finding(Code.BODY_CARD_FULL, about)
+        elif self.card_frames is not None and self.card_frames <= CARD_FRAMES:
+            yield finding(Code.BODY_CARD_FILLING, about, frames=self.card_frames)
         if self.battery_low:
-            found.append(f"the camera's battery is nearly empty: {self.battery}")
-        return found
+            yield finding(Code.BODY_BATTERY_LOW, about, battery=self.battery)
+        if self.temperature_c is not None and self.temperature_c >= HOT_C:
+            yield finding(Code.BODY_HOT, about, degrees_c=self.temperature_c)
+        if not self.checked:
+            yield finding(Code.BODY_UNCHECKED, about)
+        elif settings:
+            yield finding(Code.BODY_UNREPORTED if self.read else Code.BODY_UNREAD, about, settings=settings)
 
     def values(self) -> dict[str, Any]:
         """As the health record has it."""
         return {
             "read": self.read,
             "checked": self.checked,
-            "wrong": list(self.wrong),
             "unknown": list(self.unknown),
-            "drift": self.drift,
             "card_frames": self.card_frames,
             "battery": self.battery,
             "battery_percent": self.battery_percent,
@@ -125,8 +131,8 @@ class BodyPlan:
     `exposure` is what frames are compared with now, nothing where the plan isn't checked; any thread may read it.
     """
 
-    def __init__(self, planned: PlannedBody, capture_target: str, body: BodySettings, clock: Clock) -> None:
-        self._check, self._body, self._clock = planned.check, body, clock
+    def __init__(self, planned: PlannedBody, capture_target: str, body: BodySettings) -> None:
+        self._check, self._body = planned.check, body
         self._planned = plan_of(planned, capture_target)
         self._requested: dict[SettingName, str] = {}
         self.exposure: ExposurePlan = {}
@@ -135,7 +141,7 @@ class BodyPlan:
         self._may_set, self._ready = True, False
         self._manual = planned.exposure_mode == "manual"
         self._last: dict[SettingName, tuple[float, int]] = {}
-        self._drift, self._drift_ns = "", 0
+        self._drift: Finding | None = None
         self._temperature_c: float | None = None
 
     # what a ground station uses
@@ -152,8 +158,8 @@ class BodyPlan:
 
     # what the camera reports
 
-    def take(self, news: BodyNews) -> str | None:
-        """Take what the camera reported, in order. Returns a sentence for a frame that is not as planned."""
+    def take(self, news: BodyNews) -> Finding | None:
+        """Take what the camera reported, in order. Returns what is to be said of a frame that is not as planned."""
         match news:
             case StateChanged():
                 self.camera_changed(news)
@@ -182,18 +188,17 @@ class BodyPlan:
             self._may_set = False
             self._set()
 
-    def tagged(self, tag: Tag) -> str | None:
-        """Compare a frame with the plan, and where the plan leaves an exposure open with the frame before. Returns a
-        sentence where they differ."""
+    def tagged(self, tag: Tag) -> Finding | None:
+        """Compare a frame with the plan, and where the plan leaves an exposure open with the frame before. Returns how
+        they differ."""
         if self._check == "off":
             return None
         said = [*off_plan(tag, self.exposure)]
         for name, value in taken_with(tag).items():
             if name not in self.exposure and value is not None and (was := self._changed(name, value, tag.index)):
                 said.append(was)
-        if not said:
-            return None
-        self._drift, self._drift_ns = f"frame {tag.index} was taken with {'; '.join(said)}", self._clock.monotonic_ns()
+        about: dict[str, Value] = {"frame": tag.index, "taken_with": "; ".join(said)}
+        self._drift = Finding(Code.BODY_DRIFT, Subject("camera"), about, Level.CAUTION) if said else None
         return self._drift
 
     # what others ask
@@ -207,18 +212,22 @@ class BodyPlan:
         # A focal length that no body reports is compared by each frame's EXIF.
         unknown = tuple(_TITLES[name] for name in plan if name not in now and name != "focal_length")
         battery, percent, low = _battery(now.get("battery", ""))
-        fresh = self._drift and self._clock.monotonic_ns() - self._drift_ns <= _LAPSED_NS
         return BodyReport(
             read=bool(self._found),
             checked=self._check != "off",
             wrong=tuple(
-                f"the camera's {_TITLES[name]} is {now[name]}, not {wanted} as planned: "
-                f"{_BY_HAND.get(name, 'set it at the body')}"
+                finding(
+                    Code.BODY_SETTING_WRONG,
+                    Subject("camera's", _TITLES[name]),
+                    value=now[name],
+                    planned=wanted,
+                    remedy=_BY_HAND.get(name, "set it at the body"),
+                )
                 for name, wanted in plan.items()
                 if name in now and not _is(name, wanted, now[name])
             ),
             unknown=unknown,
-            drift=self._drift if fresh else "",
+            drift=self._drift,
             card_frames=_card_frames(now),
             battery=battery,
             battery_percent=percent,

@@ -47,6 +47,7 @@ class FlightControl:
         self._settings, self._clock, self._recording, self._shots = settings, clock, recording, shots
         self._writer, self._navigation, self._camera = writer, navigation, camera
         self._sender, self._alarms, self._handover = sender, alarms, handover
+        self.lost_triggers = 0
         self._looked: tuple[Finding | None, int] = (None, 0)
 
     # ShotSink
@@ -119,6 +120,7 @@ class FlightControl:
 
     def lost(self, triggers: Finding) -> None:
         """See CameraModel."""
+        self.lost_triggers += triggers.number("triggers")
         self._writer.later(LOST, findings.json_text(triggers))
 
     # DistanceReceiver

@@ -35,8 +35,9 @@ from dappled.daemon.console.requests import ConsoleRequests
 from dappled.daemon.flight_control import DecodingParameter, FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
-from dappled.daemon.health.logbook import Logbook, NewProblems
+from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.health.record import DecodingState
+from dappled.daemon.health.standing import StandingFindings, unasked
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
@@ -63,6 +64,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report, sentence
+from dappled.findings import Code, Finding, Level, Subject
 from dappled.flight import Recording, seal_key
 from dappled.flight import recording as flights
 
@@ -116,7 +118,7 @@ class Service:
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock)
-        self._alarms = Alarms()
+        self._alarms, self._standing = Alarms(), StandingFindings()
         self._stack = ExitStack()
         self._stopping = threading.Event()
         self._started = False
@@ -210,7 +212,7 @@ class Service:
         survey = LiveSurvey(self.navigation, reported, shots)
         self._distance = distance_trigger(self.shutter, survey, clock, settings)
         self._gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, self.navigation, clock), clock)
-        self._body = BodyPlan(settings.body, settings.camera.capture_target, camera, clock)
+        self._body = BodyPlan(settings.body, settings.camera.capture_target, camera)
         self._parameters = self._settable(self._body, names, decodes=recipe is not None)
         self.component = Component(
             sender,
@@ -370,7 +372,7 @@ class Service:
         """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
         while self._events.of_body:
             if drift := self._body.take(self._events.of_body.popleft()):
-                self._logbook.add(drift, "warning")
+                self._logbook.add(findings.text(drift), "warning")
 
     def _follow_vehicle(self) -> None:
         self.navigation.belongs_to(self.component.vehicle)
@@ -378,7 +380,7 @@ class Service:
     def _publish_health(self) -> None:
         record = self.health()
         self._publisher.publish("health", record)
-        for text, severity in self._alarms.lines(record["problems"], again=self.component.audience_has_grown()):
+        for text, severity in self._alarms.lines(unasked(record), again=self.component.audience_has_grown()):
             self.component.say(text, severity)
 
     def healthy(self) -> bool:
@@ -393,14 +395,14 @@ class Service:
             self._answers,
             *(part for part in (self._depth, self._console) if part is not None),
         ]
-        doubts = (
-            self.component.doubt(),
-            *(findings.told(one) for one in self.component.findings() if one.level > findings.Level.NOTE),
-            None if (off := navigation.utc.doubt()) is None else findings.told(off),
-            *map(findings.told, navigation.telemetry.doubts(self._clock.utc_ns())),
-            *([] if (short := self._control.shortage) is None else [findings.text(short)]),
-            *map(findings.told, self.links.findings()),
+        found = (
+            *self.component.findings(),
+            navigation.utc.doubt(),
+            *navigation.telemetry.doubts(self._clock.utc_ns()),
+            self._control.shortage,
+            *self.links.findings(),
             None if self._gnss is None else self._gnss.problem(),
+            *(task.failing for task in self._tasks),
         )
         return health.record(
             self._settings.now,
@@ -425,7 +427,9 @@ class Service:
             ),
             utc_known=navigation.utc.known,
             dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
-            doubts=[text for text in (*doubts, *(task.problem for task in self._tasks)) if text],
+            found=[one for one in found if one is not None],
+            standing=self._standing,
+            lost=self._control.lost_triggers,
             parameters=[asdict(one) for one in self._parameters.all()],
             frame_bytes=self._writer.frame_bytes,
             body=self._body.report(),
@@ -456,16 +460,14 @@ class Service:
 class PeriodicTask:
     """When a task of the working loop is due: in every turn, or every `every_ns`.
 
-    A task that fails is tried again a second later. The log has each failure that its last try did not have. Times are
-    monotonic.
+    A task that fails is tried again a second later. The log has the first of the same failures. Times are monotonic.
     """
 
     def __init__(self, name: str, *, every_ns: int = 0) -> None:
         self.name = name
-        self.problem = ""
+        self.failing: Finding | None = None
         self._every_ns = every_ns
         self._due_ns = 0
-        self._new = NewProblems()
 
     def turn(self, do: Callable[[], object], now_ns: int) -> None:
         """Do it if it is due."""
@@ -474,15 +476,14 @@ class PeriodicTask:
         try:
             do()
         except Exception as error:  # noqa: BLE001  # a disk that refuses, or a bug in one task: the flight goes on
-            self.problem = f"{self.name}: {sentence(error)}"
-            self._due_ns = now_ns + AGAIN_NS
-            if self._new.among([self.problem]):
+            if self.failing is None or self.failing.facts["error"] != type(error).__name__:
                 report(log, self.name, error)
+            facts: dict[str, findings.Value] = {"error": type(error).__name__, "why": sentence(error)}
+            self.failing = Finding(Code.TASK_FAILING, Subject("task", self.name), facts, Level.CAUTION)
+            self._due_ns = now_ns + AGAIN_NS
         else:
-            self.problem = ""
+            self.failing = None
             self._due_ns = now_ns + self._every_ns
-            if self._new:
-                self._new.among([])
 
 
 def _close(recording: Recording) -> None:

@@ -309,16 +309,16 @@ def autopilot_heartbeat(rig: Rig, system: int) -> None:
 def test_an_autopilot_that_boots_after_the_camera_is_taken_and_fires_it() -> None:
     rig = Rig()
     assert "HEARTBEAT" in rig.tick(3.1)
-    assert (rig.system_id, rig.component.doubt()) == (1, None)
+    assert (rig.system_id, rig.component.findings()) == (1, [])
     rig.clock.advance(60)
     autopilot_heartbeat(rig, 7)
     rig.tick(1.3)
-    assert (rig.system_id, rig.component.vehicle, rig.component.doubt()) == (7, 7, None)
+    assert (rig.system_id, rig.component.vehicle, rig.component.findings()) == (7, 7, [])
     rig.hear(mavlink.MAVLink_camera_trigger_message(1, 1), (7, 1))
     assert rig.fired == [5]
     autopilot_heartbeat(rig, 8)
     rig.tick(1.3)
-    assert (rig.system_id, rig.component.doubt()) == (7, None)
+    assert (rig.system_id, [one.code for one in rig.component.findings()]) == (7, [Code.LINK_VEHICLE])
 
 
 def test_several_autopilots_that_come_late_leave_the_configured_system_and_it_is_said() -> None:
@@ -329,9 +329,10 @@ def test_several_autopilots_that_come_late_leave_the_configured_system_and_it_is
         rig.tick(0.5)
     rig.tick(1)
     assert rig.system_id == 1
-    assert rig.component.doubt() == ("autopilots 7, 8 are heard, the camera belongs to system 1: set mavlink.system_id")
+    (found,) = rig.component.findings()
+    assert (found.code, dict(found.facts)) == (Code.LINK_OTHER_SYSTEM, {"heard": "7, 8", "system": 1})
     autopilot_heartbeat(rig, 1)
-    assert rig.component.doubt() is None
+    assert [one.code for one in rig.component.findings()] == [Code.LINK_VEHICLE]
 
 
 @pytest.mark.parametrize("kind", ["ANTENNA_TRACKER", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB"])
@@ -343,8 +344,7 @@ def test_what_is_no_vehicle_is_none_whatever_autopilot_it_names(kind: str, *, la
         number = getattr(mavlink, f"MAV_TYPE_{kind}") if system == 1 else mavlink.MAV_TYPE_QUADROTOR
         rig.hear(mavlink.MAVLink_heartbeat_message(number, 3, 0, 0, 4, 3), (system, 1))
     rig.tick(3.1)
-    assert (rig.system_id, rig.component.vehicle, rig.component.doubt()) == (7, 7, None)
-    assert rig.component.findings() == []
+    assert (rig.system_id, rig.component.vehicle, rig.component.findings()) == (7, 7, [])
 
 
 def test_of_several_vehicles_the_one_that_fires_the_camera_counts_and_the_others_are_told() -> None:

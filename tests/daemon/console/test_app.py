@@ -32,7 +32,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.area import PlannedArea
 from dappled.drivers.child_process import ChannelError, ProcessChannel
-from dappled.findings import FRAME, Code, finding
+from dappled.findings import FRAME, Code, Subject, finding
 from tests import globe
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)
@@ -40,10 +40,12 @@ POSE = {
     "source": "interpolated", "utc_ns": 1, "latitude_deg": 41.6, "longitude_deg": -91.5, "altitude_msl_m": 223.0,
     "height_above_home_m": 20.0, "attitude": [1.0, 0.0, 0.0, 0.0], "position_sigma_m": 0.1, "attitude_sigma_deg": 1.0,
 }  # fmt: skip
+NO_ATTITUDE = {**finding(Code.POSITION_NO_ATTITUDE, Subject("vehicle")).to_json(), "age_s": 7.0}
 HEALTH = {
     "utc_ns": 1_800_000_000_000_000_000, "camera": {"state": "ready", "reason": ""},
     "link": {"urls": 1, "silent": 0, "packets": 5, "positions": 5}, "disk": {"free_bytes": 10**11, "folder": "/x"},
-    "shots": {"wished": 0, "safe": 0, "failed": 0, "pending": 0, "refused": 0}, "stages": [], "problems": [],
+    "shots": {"wished": 0, "safe": 0, "failed": 0, "pending": 0, "refused": 0, "lost": 0}, "stages": [],
+    "findings": [NO_ATTITUDE],
     "interval_s": None, "clock": {"source": "timesync", "sigma_ms": 0.1}, "vehicle": None, "min_free_bytes": 0,
     "decode": {"mask": "m", "calibration": "c", "running": True},
 }  # fmt: skip
@@ -412,9 +414,11 @@ def test_a_page_hears_state_frames_and_log(rig: Rig) -> None:
         state = events(lines, "state")
         while state["health"] is None:
             state = events(lines, "state")
-        assert state["verdict"] == "caution"  # no attitude
+        assert state["verdict"] == "caution"
         assert list(rig.feed.path) == [(2.0, 41.0)]
-        assert {"name": "Camera", "state": "go", "text": "ready"} in state["checks"]
+        words = "the attitude is unknown: frames are tagged without the direction of view"
+        shown = {"code": "position.no_attitude", "state": "caution", "text": words, "todo": "", "age_s": 7.0}
+        assert state["findings"] == [shown]
         eventually(lambda: rig.feed.hub.watched, "the page counts")
     eventually(lambda: len(rig.feed.hub) == 0, "a page that went away is forgotten")
 

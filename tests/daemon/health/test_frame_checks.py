@@ -12,7 +12,7 @@ from PIL import Image
 from scipy import ndimage
 
 from dappled.daemon.health.frame_checks import check_frame, sharpness
-from dappled.daemon.health.go_no_go import Check, verdict
+from dappled.daemon.health.host_checks import Check, verdict
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError

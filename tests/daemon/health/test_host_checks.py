@@ -12,8 +12,7 @@ import pytest
 
 from dappled.config.settings import CameraSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import host_checks
-from dappled.daemon.health.go_no_go import Check, next_step
-from dappled.daemon.health.host_checks import Machine
+from dappled.daemon.health.host_checks import Check, Machine, next_step
 from dappled.drivers.camera import CameraError
 from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody
 from tests.daemon.fakes import FakeCamera

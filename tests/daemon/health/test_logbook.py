@@ -6,7 +6,7 @@ import logging
 from dataclasses import replace
 
 from dappled.clock import RecordedClock
-from dappled.daemon.health.logbook import Logbook, NewProblems, of_shot
+from dappled.daemon.health.logbook import Logbook, of_shot
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.flight import Cause, Frame, Shot
 
@@ -51,15 +51,3 @@ def test_a_shot_in_words() -> None:
         "warning",
     )
     assert of_shot(PendingShot(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")
-
-
-def test_a_problem_is_new_once_though_its_numbers_change() -> None:
-    new = NewProblems()
-    assert (new.among([]), bool(new)) == ([], False)
-    assert (new.among(["409 MB left"]), bool(new)) == (["409 MB left"], True)
-    assert new.among(["408 MB left", "no camera"]) == ["no camera"]
-    assert new.among(["407 MB left", "no camera"], again=True) == ["407 MB left", "no camera"]
-    assert new.among(["decode fell behind by 1 frame"]) == ["decode fell behind by 1 frame"]
-    assert new.among(["decode fell behind by 2 frames"]) == []
-    assert (new.among([]), bool(new)) == ([], False)
-    assert new.among(["409 MB left"]) == ["409 MB left"]

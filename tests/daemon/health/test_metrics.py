@@ -27,12 +27,20 @@ HEALTH: dict[str, Any] = {
         ],
     },
     "disk": {"free_bytes": None, "folder": "/x"},
-    "shots": {"wished": 9, "safe": 7, "failed": 1, "pending": 1, "refused": 3},
+    "shots": {"wished": 9, "safe": 7, "failed": 1, "pending": 1, "refused": 3, "lost": 2},
     "stages": [
         {"name": "tag", "capacity": 8, "waiting": 1, "accepted": 8, "dropped": 0, "done": 7, "failed": 0},
         {"name": "publish", "sent": {"frame": 7, "health": 60}, "dropped": {}},
     ],
-    "problems": ["the camera is faulted: it hangs"],
+    "findings": [
+        {
+            "code": "camera.faulted",
+            "level": "stop",
+            "subject": {"kind": "camera", "which": ""},
+            "facts": {"reason": "it hangs"},
+            "age_s": 3.0,
+        }
+    ],
 }
 
 
@@ -54,7 +62,7 @@ def test_every_number_is_there() -> None:
     assert told["dappled_stage_waiting", "tag"] == 1
     assert told["dappled_stage_done_total", "tag"] == 7
     assert told["dappled_published_total", "health"] == 60
-    assert told["dappled_problems", ""] == 1
+    assert told["dappled_finding", "camera.faulted"] == 2
 
 
 def test_what_is_unknown_has_no_line() -> None:

@@ -9,10 +9,10 @@ from typing import Any, cast
 import jsonschema
 import pytest
 
-from dappled.config.settings import MaskSettings, MavlinkSettings, RecordSettings, Settings
+from dappled.config.settings import DecodeSettings, MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
 from dappled.daemon.health.record import DecodingState
-from dappled.daemon.navigation import Telemetry
+from dappled.daemon.navigation import BootClock, Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
@@ -22,16 +22,24 @@ from dappled.daemon.vehicle_battery import VehicleBattery
 from dappled.decode.geometry import Gnss, Pose
 from dappled.drivers.camera import BodyState
 from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
+from dappled.findings import Code, Subject, finding
 from dappled.workers import Worker
 from tests.daemon.fakes import FakeCamera
 from tests.schemas import schema
+from tests.standing import codes, problems
 
 WELL = Settings(
     mask=MaskSettings("mask-1"),
+    decode=DecodeSettings(calibration="c.toml"),
     mavlink=MavlinkSettings(("udpin:127.0.0.1:1",)),
     record=RecordSettings(warn_free_mb=0, min_free_mb=0),
 )
 S = 10**9
+LATE = finding(Code.SERIES_LATE, Subject("series"), apart_m=9.0, spacing_m=8.5)
+SAME_IDS = finding(Code.LINK_SAME_IDS, Subject("link", "x"), source="y", system=1, component=100)
+NORTH = (1.0, 0.0, 0.0, 0.0)
+HERE = Pose("interpolated", 0, None, 0.7, -1.6, 200.0, 20.0, None, NORTH, 0.1, None, None, 9)
+CLOCK = BootClock("timesync", 0, 0, 0.0, 10**5)
 ENVELOPE = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
 LINK = LinkStatistics("udpin:127.0.0.1:1", 5, 5, 0, 0, 0, 0, 100 * S, None)
 
@@ -46,7 +54,7 @@ def record(
     shots.state, shots.reason = cast(BodyState, state), more.pop("reason", "")
     return health.record(
         settings,
-        utc_ns=1,
+        utc_ns=1_800_000_000 * S,
         monotonic_ns=101 * S,
         began_monotonic_ns=more.pop("began", 90 * S),
         shots=shots,
@@ -58,15 +66,13 @@ def record(
         folder=folder,
         utc_known=more.pop("utc_known", True),
         dead_threads=more.pop("dead", ()),
-        doubts=more.pop("doubts", ()),
-        decoding=more.pop("decoding", None),
-        **more,
+        **{"decoding": DecodingState(True), "vehicle": HERE, "clock": CLOCK, **more},
     )
 
 
 def test_well(tmp_path: Path) -> None:
     found = record(tmp_path)
-    assert found["problems"] == []
+    assert found["findings"] == []
     jsonschema.validate({**ENVELOPE, **found}, schema("health"))
 
 
@@ -102,7 +108,7 @@ def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: P
         ({"settings": replace(WELL, mavlink=MavlinkSettings())}, "no MAVLink link is configured"),
         ({"settings": replace(WELL, mask=MaskSettings())}, "no mask is configured"),
         ({"settings": replace(WELL, record=RecordSettings(min_free_mb=10_000_000))}, "the disk is nearly full"),
-        ({"doubts": ["autopilot 7 is heard"]}, "autopilot 7 is heard"),
+        ({"found": [SAME_IDS]}, "sends as 1/100 too"),
         ({"utc_known": False}, "UTC is not known yet"),
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
         ({"decoding": DecodingState(True, DecodeFailures(1, 1, "dark"))}, "1 frame kept, not decoded: dark"),
@@ -117,20 +123,19 @@ def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: P
     ],
 )
 def test_one_problem_one_sentence(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
-    (problem,) = record(tmp_path, **changes)["problems"]
+    (problem,) = problems(record(tmp_path, **changes))
     assert words in problem
 
 
-def test_a_start_is_no_problem(tmp_path: Path) -> None:
+def test_a_start_is_a_caution_and_no_silence(tmp_path: Path) -> None:
     silent = replace(LINK, last_heard_monotonic_ns=None)
-    assert record(tmp_path, link=silent, state="starting", began=100 * S)["problems"] == []
+    assert codes(record(tmp_path, link=silent, state="starting", began=100 * S)) == ["camera.starting"]
 
 
 def test_a_folder_that_is_gone_is_unknown_not_zero(tmp_path: Path) -> None:
     found = record(tmp_path / "gone")
     assert found["disk"]["free_bytes"] is None
-    (problem,) = found["problems"]
-    assert "new shots are refused" in problem
+    assert codes(found) == ["disk.unreadable"]
 
 
 @pytest.mark.parametrize(
@@ -142,36 +147,36 @@ def test_a_gimbal_that_is_not_heard_is_a_problem_where_the_camera_is_on_it(
     settings = replace(WELL, pose=replace(WELL.pose, on_gimbal=on_gimbal))
     level = (1.0, 0.0, 0.0, 0.0)
     vehicle = replace(Pose.unknown(1, 5), age_ms=100.0, gimbal_attitude=level if heard else None)
-    found = record(tmp_path, settings, vehicle=vehicle)["problems"]
+    found = problems(record(tmp_path, settings, vehicle=vehicle))
     assert any("pose.on_gimbal" in text for text in found) == problem
     silent = replace(vehicle, age_ms=None)  # nothing is heard of the vehicle at all, which is told already
-    assert not any("pose.on_gimbal" in text for text in record(tmp_path, settings, vehicle=silent)["problems"])
+    assert not any("pose.on_gimbal" in text for text in problems(record(tmp_path, settings, vehicle=silent)))
 
 
 def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) -> None:
     """As long as another link is heard; one that falls silent, or is refused, is a problem."""
     never = replace(LINK, url="udpin:127.0.0.1:2", last_heard_monotonic_ns=None)
     found = record(tmp_path, links=[never], positions=5)
-    assert (found["problems"], found["link"]["silent"]) == ([], 1)
-    (problem,) = record(tmp_path, links=[replace(never, last_heard_monotonic_ns=95 * S)], positions=5)["problems"]
+    assert (problems(found), found["link"]["silent"]) == ([], 1)
+    (problem,) = problems(record(tmp_path, links=[replace(never, last_heard_monotonic_ns=95 * S)], positions=5))
     assert "udpin:127.0.0.1:2: nothing was heard for 5 s" in problem
-    (problem,) = record(tmp_path, links=[replace(never, signing=SigningStatistics(0, 3, 1, 0, 7))], positions=5)[
-        "problems"
-    ]
+    (problem,) = problems(
+        record(tmp_path, links=[replace(never, signing=SigningStatistics(0, 3, 1, 0, 7))], positions=5)
+    )
     assert "3 forged" in problem
-    here = Pose("interpolated", 0, None, 0.7, -1.6, 200.0, 20.0, None, None, 0.1, None, 40.0, 9)
+    here = replace(HERE, age_ms=40.0)
     left = replace(never, last_heard_monotonic_ns=95 * S)  # `dappled trigger` came and went
-    assert record(tmp_path, links=[left], positions=5, vehicle=here)["problems"] == []
-    assert record(tmp_path, links=[left], positions=5, vehicle=replace(here, age_ms=6000.0))["problems"] != []
-    assert len(record(tmp_path, link=never)["problems"]) == 1
-    silent = record(tmp_path, links=[never])["problems"]  # the autopilot's cable may be the silent one
+    assert problems(record(tmp_path, links=[left], positions=5, vehicle=here)) == []
+    assert problems(record(tmp_path, links=[left], positions=5, vehicle=replace(here, age_ms=6000.0))) != []
+    assert len(problems(record(tmp_path, link=never))) == 1
+    silent = problems(record(tmp_path, links=[never]))  # the autopilot's cable may be the silent one
     assert any("udpin:127.0.0.1:2: nothing was heard for 5 s" in text for text in silent)
 
 
 def test_photographs_by_distance_are_an_interval_in_metres(tmp_path: Path) -> None:
     none = record(tmp_path)
     assert none["interval"] is None
-    by_overlap = SpacingStatistics(Spacing(overlap=0.7), 8.5, 12, 1, None, "the body is not ready in time")
+    by_overlap = SpacingStatistics(Spacing(overlap=0.7), 8.5, 12, 3, 1, None, LATE)
     found = record(tmp_path, series=by_overlap)
-    assert found["interval"] == {"taken": 12, "count": None, "next_s": None, "distance_m": 8.5}
-    assert "the body is not ready in time" in found["problems"]
+    assert found["interval"] == {"taken": 12, "refused": 3, "count": None, "next_s": None, "distance_m": 8.5}
+    assert codes(found) == ["series.late"]

@@ -1,22 +1,30 @@
-"""What the pilot is told of problems: each once, and that they are gone."""
+"""What the pilot is told of findings: each once, and that they have ended."""
 
 from __future__ import annotations
 
 from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, GroundStations, PilotMessages
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.findings import Code, Finding, Subject, finding, told
+
+CAMERA = finding(Code.CAMERA_ABSENT, Subject("camera"), reason="")
 
 
-def test_a_problem_is_told_once_though_its_numbers_change_and_its_end_too() -> None:
+def disk(left_mb: int) -> Finding:
+    return finding(Code.DISK_FILLING, Subject("disk"), left_mb=left_mb, least_mb=200)
+
+
+def test_a_finding_is_told_once_though_its_numbers_change_and_its_end_too() -> None:
     alarms = Alarms()
     warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
     assert alarms.lines([]) == []
-    assert alarms.lines(["409 MB left"]) == [("409 MB left", warning)]
+    assert alarms.lines([disk(409)]) == [(told(disk(409)), warning)]
     troubled = [alarms.troubled]
-    assert alarms.lines(["408 MB left", "no camera"]) == [("no camera", warning)]
-    assert alarms.lines(["407 MB left"]) == []
+    assert alarms.lines([CAMERA, disk(408)]) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
+    troubled += [alarms.troubled]
+    assert alarms.lines([disk(407)]) == []
     assert alarms.lines([]) == [("all is well again", info)]
-    assert [*troubled, alarms.troubled] == [True, False]
-    assert alarms.lines(["409 MB left"]) == [("409 MB left", warning)]
+    assert [*troubled, alarms.troubled] == [False, True, False]
+    assert alarms.lines([disk(409)]) == [(told(disk(409)), warning)]
 
 
 def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
@@ -29,8 +37,8 @@ def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
 
 def test_what_lasts_is_told_again_when_it_is_asked_for() -> None:
     alarms = Alarms()
-    alarms.lines(["no camera"])
-    assert alarms.lines(["no camera"], again=True) == [("no camera", mavlink.MAV_SEVERITY_WARNING)]
+    alarms.lines([CAMERA])
+    assert alarms.lines([CAMERA], again=True) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
     assert alarms.lines([], again=True) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
     assert alarms.lines([], again=True) == []
 

@@ -12,12 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dappled import findings
-from dappled.daemon.health.logbook import NewProblems
 from dappled.daemon.navigation import Telemetry
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
-from dappled.findings import Code, Finding
+from dappled.findings import Code, Finding, text
 from dappled.flight import digest, log_reading
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
@@ -217,11 +215,10 @@ def test_a_jump_is_told_for_a_minute_and_once() -> None:
     telemetry = telemetry_of(changed=stepped(30.0, up_m=-40.0, until_s=AT_S + 5))
     after_ns = START_NS + round(AT_S * 1e9) + 6 * 10**9
     (told,) = telemetry.doubts(after_ns)
-    assert (told.code, round(float(str(told.facts["by_m"])), 1)) == (Code.POSITION_JUMPED, 50.0)
+    assert text(told).startswith("the autopilot's position jumped by 50.0 m against its velocity")
     assert telemetry.doubts(after_ns + 61 * 10**9) == ()
     (other,) = telemetry_of(changed=stepped(7.0)).doubts(after_ns)
-    problems = NewProblems()
-    assert [bool(problems.among([findings.told(one)])) for one in (told, other)] == [True, False]
+    assert other.kind == told.kind
     good = telemetry_of()
     assert (good.doubts(after_ns), good.statistics().jumps) == ((), 0)
 

@@ -14,6 +14,7 @@ from dappled.config.settings import PoseSettings
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger, Height, Spacing, seen_m
 from dappled.decode.geometry import Pose, from_euler, metres_per_radian
+from dappled.findings import Code, text
 from tests.daemon.fakes import NO_CAMERA, FakeSink, no_pose
 
 HOME = (math.radians(41.6), math.radians(-91.5), 220.0)
@@ -181,7 +182,7 @@ def test_what_is_unknown_takes_no_photograph_by_overlap_and_is_said(change: dict
     for _ in range(100):
         rig.fly(0.1)
         found = rig.trigger.statistics()
-        told.append("" if found is None else found.problem or "")
+        told.append("" if found is None or found.trouble is None else text(found.trouble))
     assert any(says in text for text in told)
     if "hz" not in change:
         assert len(rig.shots_m) == count
@@ -205,7 +206,8 @@ def test_a_body_that_is_not_ready_is_waited_for_and_too_fast_is_said() -> None:
     found = rig.trigger.statistics()
     assert found is not None
     assert found.late == len(gaps(rig))
-    assert "fly slower" in (found.problem or "")
+    assert found.trouble is not None
+    assert found.trouble.code == Code.SERIES_LATE
     assert rig.shutter.statistics().refused == 0
 
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from dappled.config.profiles import VerdictBounds
 from dappled.config.settings import PlannedBody
 from dappled.daemon.body_plan import exposure_of, plan_of
-from dappled.daemon.health.record import DecodingState
 from dappled.daemon.pipeline.verdicts import (
     FixedPlan,
     FrameFacts,
@@ -242,16 +241,15 @@ def test_no_gimbal_rates_no_motion() -> None:
 def test_three_bad_ones_in_a_row_are_a_problem_and_a_good_one_ends_it() -> None:
     judge, bad = Judge(NADIR, on_gimbal=False), Verdict("bad", (finding(Code.FRAME_CLIPPED, FRAME, share=0.1),))
     for count in range(1, 4):
-        assert judge.counts.problem(count) is None
+        assert list(judge.counts.findings(count)) == []
         judge.count(count, bad, count)
         judge.count(count, unjudged("no telemetry"), count)  # proves nothing, either way
         assert judge.counts.bad_in_a_row == count
     judge.count(4, Verdict("bad", (finding(Code.FRAME_DARK, FRAME, share=0.0),)), 4)
-    told = judge.counts.problem(5) or ""  # one sentence, whatever follows
-    assert told.startswith("4 bad frames in a row, the first: 10.0% of its pixels are clipped")
-    assert judge.counts.problem(5 + 61 * 10**9) is None
+    (found,) = judge.counts.findings(5 + 61 * 10**9)  # one sentence, whatever follows
+    assert text(found).startswith("4 bad frames in a row, the first: 10.0% of its pixels are clipped")
     judge.count(5, Verdict("good"), 6)
-    assert judge.counts.problem(6) is None
+    assert list(judge.counts.findings(6)) == []
     assert judge.counts.by_state == {"bad": 4, "unknown": 3, "good": 1}
     assert judge.counts.last[-1] == (5, "good", ())
 
@@ -261,11 +259,11 @@ def test_files_that_come_late_raise_no_alarm_of_long_ago_and_end_none() -> None:
     for frame in (20, 1, 2, 3, 4):
         judge.count(frame, bad, frame)
     assert judge.counts.bad_in_a_row == 1
-    assert judge.counts.judged_ns == 20
     judge.count(5, Verdict("good"), 30)
     judge.count(21, bad, 31)
     judge.count(22, bad, 32)
-    assert (judge.counts.problem(33) or "").startswith("3 bad frames in a row")
+    (found,) = judge.counts.findings(33)
+    assert text(found).startswith("3 bad frames in a row, the first: 10.0% of its pixels are clipped")
     assert judge.counts.by_state == {"bad": 7, "good": 1}
 
 
@@ -294,13 +292,13 @@ def test_a_lens_that_is_turned_in_flight_is_told_at_once_for_a_minute() -> None:
     told = []
     for frame, lens in enumerate(taken):
         judge.count(frame + 10, good, frame * second, lens)
-        told.append(DecodingState(running=True, verdicts=judge.counts).problems(frame * second))
+        told.append([text(one) for one in judge.counts.findings(frame * second)])
     first = ["the f-number changed from 5.6 to 8 at frame 13"]
     both = ["the focal length changed from 20 to 50 mm, the f-number changed from 8 to 5.6 at frame 15"]
     assert told == [[], [], [], first, first, both]
     judge.count(2, good, 6 * second, (24.0, 2.0))  # a file that comes late
-    assert judge.counts.drifted(64 * second) == both[0]
-    assert judge.counts.drifted(66 * second) is None
+    assert [text(one) for one in judge.counts.findings(64 * second)] == both
+    assert list(judge.counts.findings(66 * second)) == []
 
 
 def leaves(rng: np.random.Generator) -> NDArray[np.float32]:

@@ -18,6 +18,7 @@ from dappled.drivers.gnss.port import GnssPort, address
 from dappled.drivers.gnss.ubx import Edge
 from dappled.drivers.mavlink import LinkError, MavlinkMessage, mavlink, pack
 from dappled.errors import DappledError
+from dappled.findings import text
 from tests.drivers.gnss.test_ubx import GPS_MS, NEW_FALLING, SATURDAY_S, VALID, WEEK, mark, message
 from tests.needs import without
 from tests.system.flying import eventually
@@ -60,6 +61,10 @@ def terminal() -> Iterator[tuple[int, str]]:
             os.close(descriptor)
 
 
+def said(port: GnssPort) -> str:
+    return "" if (found := port.problem()) is None else text(found)
+
+
 def reading(device: str, book: Book, edge: Edge = "falling") -> GnssPort:
     port = GnssPort(address(f"{device},115200"), edge, book, SystemClock())
     port.start()
@@ -96,7 +101,7 @@ def test_a_device_that_is_not_there_is_told_and_waited_for(terminal: tuple[int, 
     link = f"{tmp_path}/receiver"
     book = Book()
     port = reading(link, book)
-    eventually(lambda: "there is no such device" in (port.problem() or ""), "the problem")
+    eventually(lambda: "there is no such device" in said(port), "the problem")
     os.symlink(device, link)
     eventually(lambda: port.problem() is None, "the device")
     os.write(near, MARK)
@@ -110,7 +115,7 @@ def test_a_full_disk_is_told_and_what_comes_later_is_logged(terminal: tuple[int,
     book.full = True
     port = reading(device, book)
     os.write(near, RAW)
-    eventually(lambda: "the disk is full" in (port.problem() or ""), "the problem")
+    eventually(lambda: "the disk is full" in said(port), "the problem")
     book.full = False
     os.write(near, MARK)
     eventually(lambda: book.bytes().endswith(MARK), "what came later")
@@ -139,7 +144,7 @@ def test_a_file_that_is_no_device_is_told(tmp_path: object) -> None:
     with open(path, "wb"):
         pass
     port = reading(path, Book())
-    eventually(lambda: "is not a serial device" in (port.problem() or ""), "the problem")
+    eventually(lambda: "is not a serial device" in said(port), "the problem")
     port.stop()
 
 
@@ -166,7 +171,7 @@ def test_silence_is_told(terminal: tuple[int, str]) -> None:
     eventually(lambda: port._heard_ns is not None, "some bytes")
     assert port.problem() is None
     clock.ahead_ns = 6 * 10**9
-    assert "nothing was heard for 5 s" in (port.problem() or "")
+    assert "nothing was heard for 5 s" in said(port)
     os.write(near, b"$GNGGA")
-    eventually(lambda: "no UBX message" in (port.problem() or ""), "NMEA alone is of no use")
+    eventually(lambda: "no UBX message" in said(port), "NMEA alone is of no use")
     port.stop()

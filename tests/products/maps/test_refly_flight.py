@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from dappled import findings
 from dappled.clock import RecordedClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.pipeline.shutter import Shutter
@@ -123,7 +124,7 @@ def test_a_body_that_is_too_slow_for_the_mission_is_told() -> None:
     def told() -> float:
         wait_s = serve()
         found = vehicle.trigger.statistics()
-        problems.add(None if found is None else found.problem)
+        problems.add(None if found is None or found.trouble is None else findings.told(found.trouble))
         return wait_s
 
     vehicle.trigger.serve = told  # type: ignore[method-assign]

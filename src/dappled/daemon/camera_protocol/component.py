@@ -188,20 +188,19 @@ class Component:
         """The system whose telemetry counts (see `SystemIdentity.vehicle`)."""
         return self._identity.vehicle()
 
-    def doubt(self) -> str | None:
-        """A sentence where the camera may belong to the wrong system (see `SystemIdentity.doubt`)."""
-        return self._identity.doubt()
-
     def findings(self) -> list[Finding]:
-        """Other vehicles on the links, and other components that send with our own ids: who hears both can't tell them
-        apart."""
-        rivals = self._identity.rivals()
+        """That the camera may belong to the wrong system (see `SystemIdentity.doubt`); other vehicles on the links, and
+        other components that send with our own ids: who hears both can't tell them apart."""
+        rivals, other = self._identity.rivals(), self._identity.doubt()
         now_ns = self._clock.monotonic_ns()
         system, component = self._links.system_id, self._links.component_id
         same = [
-            finding(Code.LINK_SAME_IDS, Subject("link", link), source=source, system=system, component=component)
-            for link, (source, heard_ns) in sorted(self._same_ids.items())
-            if now_ns - heard_ns <= _SAME_IDS_NS
+            *([] if other is None else [other]),
+            *(
+                finding(Code.LINK_SAME_IDS, Subject("link", link), source=source, system=system, component=component)
+                for link, (source, heard_ns) in sorted(self._same_ids.items())
+                if now_ns - heard_ns <= _SAME_IDS_NS
+            ),
         ]
         return same if rivals is None else [*same, rivals]
 

@@ -110,14 +110,13 @@ class SystemIdentity:
                 self._decided = heard[0]
         return self.settled
 
-    def doubt(self) -> str | None:
-        """A sentence where autopilots are heard, but not the one of the system that the camera belongs to."""
+    def doubt(self) -> Finding | None:
+        """Autopilots are heard, but not the one of the system that the camera belongs to."""
         heard = sorted(self.autopilots)
         if not self.settled or self._none_yet or not heard or self.system_id in heard:
             return None
         ids = ", ".join(map(str, heard))
-        who = f"autopilot {ids} is" if len(heard) == 1 else f"autopilots {ids} are"
-        return f"{who} heard, the camera belongs to system {self.system_id}: set mavlink.system_id"
+        return finding(Code.LINK_OTHER_SYSTEM, Subject("service"), heard=ids, system=self.system_id)
 
     def rivals(self) -> Finding | None:
         """Why the camera's own vehicle counts, of several that are heard."""

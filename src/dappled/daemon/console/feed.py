@@ -8,7 +8,7 @@ import logging
 import time
 import weakref
 from collections import OrderedDict, deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,11 +19,12 @@ from dappled.daemon.console.requests import token
 from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import go_no_go
+from dappled.daemon.health.standing import in_record
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.subscriber import AsyncSubscriber
 from dappled.daemon.stream.wire import Message
 from dappled.errors import DappledError, report
-from dappled.findings import FRAME, from_rows, told
+from dappled.findings import FRAME, Finding, from_rows, named, remedy, told
 
 log = logging.getLogger(__name__)
 FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
@@ -33,6 +34,12 @@ _ASK_S, _KEEP_ALIVE_S = 20.0, 10.0
 _END = ""  # in a page's queue: nothing follows
 
 Event = dict[str, Any]
+
+
+def _shown(one: Finding, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A finding as the page shows it."""
+    about = {"code": one.code.value, "state": go_no_go.state([one]), "text": named(one)}
+    return {**about, "todo": remedy(one), "age_s": row["age_s"]}
 
 
 class FeedError(DappledError):
@@ -195,16 +202,16 @@ class Feed:
         return next(reversed(self.frames), None)
 
     def state(self) -> Event:
-        """The newest health record as an event, with its checks."""
+        """The newest health record as an event, with its findings in words."""
         health = self.health
         if health is None:
-            return {"is": "state", "health": None, "checks": [], "verdict": None, "token": self._token()}
-        checks = go_no_go.checks(health)
+            return {"is": "state", "health": None, "findings": [], "verdict": None, "token": self._token()}
+        found = in_record(health)
         return {
             "is": "state",
             "health": health,
-            "checks": [{"name": one.name, "state": one.state, "text": one.text} for one in checks],
-            "verdict": go_no_go.verdict(checks),
+            "findings": [_shown(one, row) for one, row in zip(found, health["findings"], strict=True)],
+            "verdict": go_no_go.state(found),
             "frames_left": go_no_go.frames_left(health),
             "area": None if self.area is None else self.area.facts(),
             "token": self._token(),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.daemon.health.go_no_go import Check, State
+from dappled.daemon.health.host_checks import Check, State
 from dappled.daemon.pipeline.verdicts import DIRECTIONS, fineness
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
+from typing import Any, Literal
 
 from dappled import findings
 from dappled.config.settings import Settings
 from dappled.daemon.health import resources
-from dappled.daemon.health.go_no_go import Check
 from dappled.daemon.navigation.machine_clock import kernel_synchronised
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import CameraError, StateChanged
@@ -38,6 +38,35 @@ class Machine:
     dev: Path = Path("/dev")
     open_s: float = OPEN_S
     unsynchronised: Callable[[], bool] = field(default=lambda: not kernel_synchronised())
+
+
+State = Literal["go", "caution", "no-go"]
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """The result of one check. "go": ready; "caution": a flight is possible, with a loss that the text names;
+    "no-go": the flight brings no good frames.
+
+    `todo` says what to do about it, "" where nothing is to be done. `measured` holds the numbers behind the text.
+    """
+
+    name: str
+    state: State
+    text: str
+    todo: str = ""
+    measured: Mapping[str, Any] = field(default_factory=dict)
+
+
+def verdict(checks: Sequence[Check]) -> State:
+    """The worst state of the checks."""
+    states = {one.state for one in checks}
+    return "no-go" if "no-go" in states else "caution" if "caution" in states else "go"
+
+
+def next_step(checks: Sequence[Check]) -> str:
+    """What to do first: the `todo` of the first no-go; "" where there is none."""
+    return next((one.todo for one in checks if one.state == "no-go" and one.todo), "")
 
 
 HostCheck = Callable[[Settings, Machine], list[Check]]

@@ -1,17 +1,16 @@
-"""The last lines of the log, the sentences in it, and which problems of the health record are new."""
+"""The last lines of the log, and the sentences in it."""
 
 from __future__ import annotations
 
 import logging
 import threading
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.errors import sentence, without_numbers
+from dappled.errors import sentence
 
 LineLevel = Literal["info", "warning"]
 
@@ -56,22 +55,6 @@ class Logbook(logging.Handler):
         except (TypeError, ValueError) as error:  # the message's arguments don't fit it
             text = sentence(error)
         self.add(text, "warning")
-
-
-class NewProblems:
-    """Finds the problems that the last call did not have. One whose numbers have changed is still the same problem."""
-
-    def __init__(self) -> None:
-        self._known: set[str] = set()
-
-    def __bool__(self) -> bool:
-        """Whether there was any problem at the last call."""
-        return bool(self._known)
-
-    def among(self, problems: Sequence[str], *, again: bool = False) -> list[str]:
-        """The new ones; with `again` all. These are the known ones from now on."""
-        known, self._known = self._known, {without_numbers(text) for text in problems}
-        return [text for text in problems if again or without_numbers(text) not in known]
 
 
 def of_shot(pending: PendingShot) -> tuple[str, LineLevel]:

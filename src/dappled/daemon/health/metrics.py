@@ -10,6 +10,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from dappled.daemon.health import go_no_go
+from dappled.findings import Level
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _STATES = ("absent", "starting", "ready", "busy", "faulted")
@@ -36,7 +37,7 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
     yield _gauge(
         "camera_state", "1 for the camera's state, 0 for the others", {name: name == state for name in _STATES}, "state"
     )
-    ended = {name: shots.get(name) for name in ("safe", "failed", "refused")}
+    ended = {name: shots.get(name) for name in ("safe", "failed", "refused", "lost")}
     yield _counter("shots", "Shots of this flight, by how they ended", ended, "state")
     yield _counter("wishes", "Capture requests that became shots", {"": shots["wished"]})
     yield _gauge("shots_pending", "Shots under way", {"": shots["pending"]})
@@ -70,7 +71,8 @@ def families(health: Mapping[str, Any]) -> Iterator[Metric]:
     judged = (health.get("decode") or {}).get("judged") or {}
     judged_by = {state: judged.get(state) for state in ("good", "usable", "bad", "unknown")}
     yield _counter("frames_judged", "Frames, by their verdict", judged_by, "verdict")
-    yield _gauge("problems", "Problems in the health record", {"": len(health["problems"])})
+    levels = {row["code"]: Level[row["level"].upper()] for row in reversed(health["findings"])}
+    yield _gauge("finding", "Findings that stand, by code: 0 a note, 1 a caution, 2 a stop", levels, "code")
 
 
 def _gauge(name: str, what: str, samples: Mapping[str, float | None], label: str = "") -> Metric:

@@ -1,4 +1,4 @@
-"""Make the health record: the state of camera, links, disk, shots and queues, with a sentence for each problem."""
+"""Make the health record: the state of camera, links, disk, shots and queues, and the list of what was found."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dappled import findings
 from dappled.config.settings import RecordSettings, Settings
 from dappled.daemon.body_plan import BodyReport
-from dappled.daemon.health.go_no_go import FAILING
+from dappled.daemon.health import go_no_go
+from dappled.daemon.health.standing import ALL_IS_WELL, StandingFindings, in_record
 from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
@@ -23,19 +23,12 @@ from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.daemon.vehicle_battery import VehicleBattery
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
-from dappled.errors import counted
+from dappled.findings import Code, Finding, Level, Subject, above_note, finding, to_rows, told
 from dappled.flight import FlightError, layout
 from dappled.workers import Statistics
 
 SILENT_NS = 5 * 10**9
 _RECEIVER_MS = 5000.0
-_NO_LINK = "no MAVLink link is configured: frames are tagged without poses"
-_NO_MASK = "no mask is configured: frames are kept, not decoded (set mask.profile)"
-_NO_GIMBAL = (
-    "no gimbal's attitude arrives (GIMBAL_DEVICE_ATTITUDE_STATUS, MOUNT_ORIENTATION), and the camera is on one "
-    "(pose.on_gimbal): frames are tagged without the direction of view"
-)
-_NO_UTC = "UTC is not known yet: all time stamps will be corrected when the autopilot gets it from its satellites"
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,24 +41,10 @@ class DecodingState:
     misfit: str = ""
     verdicts: VerdictCounts = field(default_factory=VerdictCounts)
 
-    def problems(self, now_ns: int) -> list[str]:
-        """What is wrong, a sentence each. Time is monotonic."""
-        failed = self.failures
-        found = [f"frames can't be decoded: {self.misfit}"] if self.misfit else []
-        if failed.in_a_row >= FAILING:
-            found.append(f"decoding fails: the last {_frames(failed.in_a_row)} are kept, not decoded: {failed.reason}")
-        elif failed.count:
-            found.append(f"decoding failed: {_frames(failed.count)} kept, not decoded: {failed.reason}")
-        judged = (self.verdicts.problem(now_ns), self.verdicts.drifted(now_ns))
-        return [*found, *(one for one in judged if one is not None)]
-
     def judged(self) -> dict[str, Any]:
         """The verdicts, as JSON values."""
         counts = self.verdicts
-        last = [
-            {"frame": frame, "state": state, "reasons": findings.to_rows(reasons)}
-            for frame, state, reasons in counts.last
-        ]
+        last = [{"frame": frame, "state": state, "reasons": to_rows(reasons)} for frame, state, reasons in counts.last]
         return {
             **{state: counts.by_state.get(state, 0) for state in STATES},
             "bad_in_a_row": counts.bad_in_a_row,
@@ -91,39 +70,29 @@ def record(
     decoding: DecodingState | None = None,
     utc_known: bool = True,
     dead_threads: Sequence[str] = (),
-    doubts: Sequence[str] = (),
+    found: Sequence[Finding] = (),
+    standing: StandingFindings | None = None,
+    lost: int = 0,
     parameters: Sequence[Mapping[str, Any]] = (),
     frame_bytes: float | None = None,
     body: BodyReport | None = None,
     series: SpacingStatistics | None = None,
     battery: VehicleBattery | None = None,
 ) -> dict[str, Any]:
-    """The header of a `health` message. Its `problems` are sentences, none when all is well.
+    """The header of a `health` message. Its `findings` are the one list of the service, worst first, then newest.
 
-    `doubts` are further problems, found by other parts. `dead_threads` have ended without being asked to. `parameters`
-    are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames, None before the first.
-    `body` is how the camera's settings stand to the plan; None where nothing is compared. `series` are photographs by
-    distance, while they run. `battery` is the vehicle's; None while the autopilot doesn't report it.
+    `found` are those of other parts; `standing` knows since when each stands. `dead_threads` have ended without being
+    asked to. `parameters` are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames,
+    None before the first. `lost` counts the autopilot's triggers that became no request. `body` is how the camera's
+    settings stand to the plan; None where nothing is compared.
+    `series` are photographs by distance, while they run. `battery` is the vehicle's; None while the autopilot doesn't
+    report it.
     """
     decoding = decoding or DecodingState()
     fresh = vehicle is not None and vehicle.age_ms is not None and vehicle.age_ms * 1e6 < SILENT_NS
     link, silences = _link(settings, links, telemetry, monotonic_ns, began_monotonic_ns, fresh=fresh)
     disk, shortages = _disk(settings.record, folder)
-    problems = [
-        *(f"the {name} thread has ended: restart dappled" for name in dead_threads),
-        *([] if shots.state == "starting" or (gone := shots.without_camera()) is None else [findings.text(gone)]),
-        *silences,
-        *doubts,
-        *([] if series is None or series.problem is None else [series.problem]),
-        *([] if body is None else body.problems()),
-        *([_NO_GIMBAL] if fresh and settings.pose.on_gimbal and vehicle and not vehicle.gimbal_attitude else []),
-        *([] if utc_known else [_NO_UTC]),
-        *shortages,
-        *([] if settings.mask.profile else [_NO_MASK]),
-        *decoding.problems(monotonic_ns),
-        *(f"{one.name} fell behind by {_frames(one.dropped)}, kept in the record" for one in stages if one.dropped),
-    ]
-    return {
+    facts = {
         "utc_ns": utc_ns,
         "camera": {"state": shots.state, "reason": shots.reason},
         "body": None if body is None else body.values(),
@@ -135,10 +104,9 @@ def record(
             "failed": shutter.failed,
             "pending": shutter.pending,
             "refused": shutter.refused,
+            "lost": lost,
         },
         "stages": [*(asdict(one) for one in stages), _publish(publisher)],
-        "problems": problems,
-        "dead": list(dead_threads),
         "utc_known": utc_known,
         "interval_s": shutter.interval_s,
         "interval": _interval(shutter, series),
@@ -161,22 +129,37 @@ def record(
         "frame_bytes": frame_bytes,
         "settings": list(parameters),
     }
+    missing = shots.without_camera()
+    deaf = fresh and settings.pose.on_gimbal and vehicle is not None and not vehicle.gimbal_attitude
+    now = [
+        *(finding(Code.THREAD_ENDED, Subject("service"), thread=name) for name in dead_threads),
+        *([] if missing is None else [missing]),
+        *silences,
+        *found,
+        *([] if series is None or series.trouble is None else [series.trouble]),
+        *([] if body is None else body.findings()),
+        *([finding(Code.GIMBAL_UNHEARD, Subject("vehicle"))] if deaf else []),
+        *shortages,
+        *go_no_go.judge(facts),
+        *decoding.verdicts.findings(monotonic_ns),
+    ]
+    opened = (standing or StandingFindings()).refresh(now, monotonic_ns)
+    return facts | {"findings": [one.to_json(monotonic_ns) for one in opened]}
 
 
-def _link_problem(link: LinkStatistics, *, heard: bool, fresh: bool) -> str | None:
+def _silence(link: LinkStatistics, *, heard: bool, fresh: bool, level: Level) -> Finding | None:
     """What is wrong with a silent link. None for one on which nobody was heard yet, where the vehicle was `heard` on
     another, and for any one while the vehicle's position is `fresh`: a ground station is not there, or has left;
-    nothing is lost, and go/no-go and the counters show it."""
+    nothing is lost, and the counters show it."""
+    about, signing = Subject("link", link.url), link.signing
     if link.error:
-        return link.error
-    if (fresh or (heard and link.last_heard_monotonic_ns is None)) and not _refused(link):
+        return finding(Code.LINK_DOWN, about, level, why=link.error)
+    if signing is not None and signing.refused > 0:
+        facts = {"unsigned": signing.unsigned_refused, "forged": signing.forged, "replayed": signing.replayed}
+        return Finding(Code.LINK_REFUSED, about, facts, level)
+    if fresh or (heard and link.last_heard_monotonic_ns is None):
         return None
-    return f"MAVLink link {link.url}: {_silence(link)}"
-
-
-def _refused(link: LinkStatistics) -> bool:
-    """Whether packets came that signing refused."""
-    return link.signing is not None and link.signing.refused > 0
+    return finding(Code.LINK_SILENT, about, level)
 
 
 def _link(
@@ -187,15 +170,16 @@ def _link(
     began_monotonic_ns: int,
     *,
     fresh: bool,
-) -> tuple[dict[str, Any], list[str]]:
-    """The state of the links, and a problem for each that should be heard."""
+) -> tuple[dict[str, Any], list[Finding]]:
+    """The state of the links, and a finding for each that should be heard: a stop where all of them are silent."""
     silent = [
         link
         for link in links
         if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
     ]
     heard = telemetry.positions > 0
-    problems = [text for link in silent if (text := _link_problem(link, heard=heard, fresh=fresh))]
+    level = Level.STOP if len(silent) == len(links) else Level.CAUTION
+    found = [one for link in silent if (one := _silence(link, heard=heard, fresh=fresh, level=level))]
     facts = {
         "urls": len(links),
         "silent": len(silent),
@@ -205,47 +189,34 @@ def _link(
         "jumps": telemetry.jumps,
         "each": [_counters(link) for link in links],
     }
-    return facts, problems if settings.mavlink.url else [_NO_LINK, *problems]
+    return facts, found if settings.mavlink.url else [finding(Code.LINK_NONE, Subject("service")), *found]
 
 
-def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[str]]:
-    """What the disk has left, None where that is unknown; and a problem where it is full, or will be."""
+def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[Finding]]:
+    """What the disk has left, None where that is unknown; and a finding where it is full, or will be."""
     facts: dict[str, Any] = {"free_bytes": None, "free_files": None, "folder": str(folder)}
     try:
         space = layout.disk_space(folder)
     except FlightError as error:
-        return facts, [f"{error}; new shots are refused"]
+        return facts, [finding(Code.DISK_UNREADABLE, Subject("disk"), why=str(error))]
     facts |= {"free_bytes": space.available, "free_files": space.files}
     if (short := space.shortage(record.min_free_mb)) is not None:
-        return facts, [f"{findings.text(short)}; new shots are refused"]
+        return facts, [short]
     if space.available >= record.warn_free_mb * 1_000_000:
         return facts, []
-    left = f"{space.available // 10**6} MB left"
-    return facts, [f"the disk is filling up: {left}; shots are refused below {record.min_free_mb} MB"]
+    sizes = {"left_mb": space.available // 10**6, "least_mb": record.min_free_mb}
+    return facts, [Finding(Code.DISK_FILLING, Subject("disk"), sizes, Level.CAUTION)]
 
 
 def _interval(shutter: ShutterStatistics, series: SpacingStatistics | None) -> dict[str, Any] | None:
     """How far an interval has got, or photographs by distance; None while neither runs."""
     if shutter.interval_s is None and series is not None:
-        return {"taken": series.taken, "count": None, "next_s": None, "distance_m": series.spacing_m}
+        counts = {"taken": series.taken, "refused": series.refused}
+        return {**counts, "count": None, "next_s": None, "distance_m": series.spacing_m}
     if shutter.interval_s is None:
         return None
-    return {"taken": shutter.interval_taken, "count": shutter.interval_count, "next_s": shutter.interval_next_s}
-
-
-def _silence(link: LinkStatistics) -> str:
-    """Why a link is not usable, as far as this end knows."""
-    signing = link.signing
-    if signing is None or not _refused(link):
-        return "nothing was heard for 5 s"
-    return (
-        f"nothing with a valid signature was heard for 5 s ({counted(signing.unsigned_refused, 'packet')} unsigned, "
-        f"{signing.forged} forged, {signing.replayed} too old); give both ends the same key"
-    )
-
-
-def _frames(count: int) -> str:
-    return counted(count, "frame")
+    counts = {"taken": shutter.interval_taken, "refused": shutter.interval_refused}
+    return {**counts, "count": shutter.interval_count, "next_s": shutter.interval_next_s}
 
 
 def _counters(link: LinkStatistics) -> dict[str, Any]:
@@ -296,8 +267,18 @@ def _receiver(vehicle: Pose) -> dict[str, Any] | None:
     return {"fix_type": gnss.fix_type, "satellites": gnss.satellites}
 
 
+def four_numbers(shots: Mapping[str, int]) -> dict[str, int]:
+    """What became of all requests so far: taken are those that have, or will have, a photograph."""
+    return {
+        "taken": shots["wished"] - shots["failed"],
+        "on disk": shots["safe"],
+        "refused": shots["refused"],
+        "lost": shots["failed"] + shots["lost"],
+    }
+
+
 def line(health: Mapping[str, Any]) -> str:
     """A health record in one line, for `systemctl status`."""
-    shots, problems = health["shots"], health["problems"]
+    shots, found = health["shots"], above_note(in_record(health))
     counts = f"camera {health['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
-    return f"{counts}; {'; '.join(problems)}" if problems else f"{counts}; all is well"
+    return f"{counts}; {'; '.join(map(told, found)) or ALL_IS_WELL}"

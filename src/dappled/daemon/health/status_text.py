@@ -1,4 +1,4 @@
-"""Make STATUSTEXT messages for the pilot: sentences in pieces, none repeated at once, new problems and their end."""
+"""Make STATUSTEXT messages for the pilot: sentences in pieces, none repeated at once, findings that begin and end."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 
-from dappled.daemon.health.logbook import NewProblems
+from dappled.daemon.health.standing import NewFindings
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.findings import Finding, Level, told, worst
 
 PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
@@ -16,6 +17,7 @@ AGAIN_NS = 10 * 10**9
 AWAY_NS = 60 * 10**9
 LISTENS_NS = 5 * 10**9
 _REMEMBERED = 32
+_SEVERITIES = {Level.CAUTION: mavlink.MAV_SEVERITY_WARNING, Level.STOP: mavlink.MAV_SEVERITY_ERROR}
 
 
 class PilotMessages:
@@ -34,21 +36,19 @@ class PilotMessages:
 
 
 class Alarms:
-    """Warns of each problem once, when it comes up, and says when the last one has gone."""
+    """Warns of each finding above a note once, when it begins, and says when the last one has ended."""
 
     def __init__(self) -> None:
-        self._problems = NewProblems()
+        self._new = NewFindings()
+        self.troubled = False
 
-    @property
-    def troubled(self) -> bool:
-        """Whether there was a problem at the last call of `lines`."""
-        return bool(self._problems)
-
-    def lines(self, problems: Sequence[str], *, again: bool = False) -> list[tuple[str, int]]:
-        """The sentences to send now, each with its severity. `again` repeats the problems that last."""
-        before = bool(self._problems)
-        lines = [(text, mavlink.MAV_SEVERITY_WARNING) for text in self._problems.among(problems, again=again)]
-        if before and not problems:
+    def lines(self, found: Sequence[Finding], *, again: bool = False) -> list[tuple[str, int]]:
+        """The sentences to send now, each with its severity. `again` repeats those that last. From now on it is
+        `troubled` where one of them is a stop."""
+        before, new = bool(self._new), self._new.among(found, again=again)
+        self.troubled = worst(found) is Level.STOP
+        lines = [(told(one), _SEVERITIES[one.level]) for one in new]
+        if before and not self._new:
             lines.append(("all is well again", mavlink.MAV_SEVERITY_INFO))
         return lines
 

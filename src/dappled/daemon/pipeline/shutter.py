@@ -54,8 +54,8 @@ class ShotDecision:
 class ShutterStatistics:
     """Counters of this flight. shots = pending + succeeded + failed.
 
-    `interval_s` is None while no interval runs; else `interval_taken` of `interval_count` (None: for ever) are taken or
-    missed, and the next is due in `interval_next_s`.
+    `interval_s` is None while no interval runs; else `interval_taken` of `interval_count` (None: for ever) are taken,
+    `interval_refused` were refused instead, and the next is due in `interval_next_s`.
     """
 
     shots: int
@@ -66,6 +66,7 @@ class ShutterStatistics:
     next_index: int
     interval_s: float | None
     interval_taken: int = 0
+    interval_refused: int = 0
     interval_count: int | None = None
     interval_next_s: float | None = None
 
@@ -78,12 +79,14 @@ class _Interval:
     due_ns: int
     command: CaptureRequest
     began_ns: int
-    taken: int = 1
+    taken: int = 1  # or refused
+    refused: int = 0
     driven: bool = False  # the autopilot runs the same interval, and sets its pace
 
-    def took(self) -> None:
-        """One more shot of it was taken or missed."""
+    def took(self, *, accepted: bool = True) -> None:
+        """One more shot of it was taken, or refused."""
         self.taken += 1
+        self.refused += not accepted
         if self.left is not None:
             self.left -= 1
 
@@ -229,7 +232,7 @@ class Shutter:
                         broadcast=interval.command.broadcast,
                     )
                 )
-                interval.took()
+                interval.took(accepted=decision.accepted)
                 if interval.left == 0:
                     self._interval = interval = None
                 elif interval.interval_ns:
@@ -251,7 +254,8 @@ class Shutter:
                 self._failed,
                 self._next_index,
                 None if interval is None else interval.interval_ns / 1e9,
-                0 if interval is None else interval.taken,
+                0 if interval is None else interval.taken - interval.refused,
+                0 if interval is None else interval.refused,
                 None if interval is None or interval.left is None else interval.taken + interval.left,
                 None if interval is None else max(0, interval.due_ns - self._clock.monotonic_ns()) / 1e9,
             )

@@ -20,17 +20,18 @@ from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import IntervalEnd, Shutter
 from dappled.decode.geometry import Pose, Quaternion, Vector3, conjugate, metres_per_radian, turned
 from dappled.errors import report
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 MOST_M = 10_000.0
 KIND = "distance"  # of its capture requests
+_SERIES = Subject("series")
 BY_ITSELF = "settings"  # the source of a series that nobody asked for
 _LOOK_S, _WATCH_S, _IDLE_S, _AGAIN_S = 0.02, 0.2, 60.0, 1.0
 _LOWER = 0.8
 _STALE_MS = 1000.0
 _LATE = 1.25  # spacings
-_SHOWN_NS = 60 * 10**9
 _LEAST_HEIGHT_M = 2.0  # a barometer's height is no better
 
 
@@ -77,15 +78,16 @@ class SurveyFacts(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class SpacingStatistics:
-    """The photographs so far, `late` ones among them, and how far apart they are to be now (None: nobody knows).
-    `problem` says why none is taken, or that they come late."""
+    """The photographs so far, `late` ones among them, those that were `refused` instead, and how far apart they are to
+    be now (None: nobody knows). `trouble` says why none is taken, or that they come late."""
 
     wanted: Spacing
     spacing_m: float | None
     taken: int
+    refused: int
     late: int
     height: Height | None
-    problem: str | None
+    trouble: Finding | None
 
 
 @dataclass(slots=True)
@@ -99,10 +101,11 @@ class _Way:
     last: tuple[float, float, float] | None = None
     spacing_m: float | None = None
     height: Height | None = None
-    taken: int = 0
+    asked: int = 0
+    refused: int = 0
     late: int = 0
-    problem: str | None = None
-    late_ns: int | None = None
+    trouble: Finding | None = None
+    is_late: bool = False  # the last one was
     apart_m: float = 0.0
 
 
@@ -180,13 +183,13 @@ class DistanceTrigger:
             way = self._way
             if way is None:
                 return None
-            problem = way.problem
-            if problem is None and way.late_ns is not None and self._clock.monotonic_ns() - way.late_ns < _SHOWN_NS:
-                problem = (
-                    f"photographs are up to {way.apart_m:.1f} m apart where {way.spacing_m or 0:.1f} m are wanted: "
-                    "the body is not ready in time, fly slower"
-                )
-            return SpacingStatistics(way.wanted, way.spacing_m, way.taken, way.late, way.height, problem)
+            trouble = way.trouble
+            if trouble is None and way.is_late:
+                spacing_m = way.spacing_m or 0.0
+                trouble = finding(Code.SERIES_LATE, _SERIES, apart_m=way.apart_m, spacing_m=spacing_m)
+            return SpacingStatistics(
+                way.wanted, way.spacing_m, way.asked - way.refused, way.refused, way.late, way.height, trouble
+            )
 
     def serve(self) -> float:
         """Take the photograph that is due; seconds until the next look. The thread's work."""
@@ -198,10 +201,10 @@ class DistanceTrigger:
             way = self._way
             if way is None:
                 return _WATCH_S if watches else _IDLE_S
-            place, way.problem = _place(pose)
+            place, way.trouble = _place(pose)
             if place is None:
                 return _LOOK_S
-            way.spacing_m, way.height, way.problem = self._spacing(way.wanted, pose)
+            way.spacing_m, way.height, way.trouble = self._spacing(way.wanted, pose)
             apart_m = math.inf if way.last is None else _apart_m(way.last, place)
             if way.last is None and not way.at_once:
                 way.last = place
@@ -213,12 +216,14 @@ class DistanceTrigger:
             missed = way.spacing_m is not None and math.isfinite(apart_m) and apart_m >= 2 * way.spacing_m
             if not missed and self._around.busy():
                 return _LOOK_S
-            way.taken += 1
-            request = CaptureRequest(way.source, KIND, way.taken, acknowledged=False)
+            way.asked += 1
+            request = CaptureRequest(way.source, KIND, way.asked, acknowledged=False)
             accepted = self._shutter.request(request).accepted
-            if missed or not accepted or (way.spacing_m and _LATE * way.spacing_m < apart_m < math.inf):
+            way.refused += not accepted
+            too_far = bool(way.spacing_m and _LATE * way.spacing_m < apart_m < math.inf)
+            way.is_late = missed or not accepted or too_far
+            if way.is_late:
                 way.late += 1
-                way.late_ns = self._clock.monotonic_ns()
                 way.apart_m = apart_m if math.isfinite(apart_m) else 0.0
             way.last = place
             return _LOOK_S
@@ -238,19 +243,16 @@ class DistanceTrigger:
             if self._way is None:
                 self.begin(self._configured, BY_ITSELF, at_once=True)
 
-    def _spacing(self, wanted: Spacing, pose: Pose | None) -> tuple[float | None, Height | None, str | None]:
+    def _spacing(self, wanted: Spacing, pose: Pose | None) -> tuple[float | None, Height | None, Finding | None]:
         """(metres, the height that they are by, why they are unknown)."""
         if wanted.distance_m:
             return wanted.distance_m, None, None
         height, field = self._around.height(), self._around.field()
         if height is None or height.metres < _LEAST_HEIGHT_M:
-            return (
-                None,
-                height,
-                f"no photographs by overlap: {'the height is unknown' if height is None else 'too low'}",
-            )
+            code = Code.SERIES_NO_HEIGHT if height is None else Code.SERIES_TOO_LOW
+            return None, height, finding(code, _SERIES)
         if field is None:
-            return None, height, "no photographs by overlap: the focal length, or the sensor's size, is unknown"
+            return None, height, finding(Code.SERIES_NO_FIELD, _SERIES)
         velocity, attitude = (None, None) if pose is None else (pose.velocity_ned_m_s, pose.attitude)
         return seen_m(height.metres, field, velocity, attitude, self._mount) * (1 - wanted.overlap), height, None
 
@@ -289,12 +291,12 @@ def seen_m(
     return height_m * min(sides)
 
 
-def _place(pose: Pose | None) -> tuple[tuple[float, float, float] | None, str | None]:
+def _place(pose: Pose | None) -> tuple[tuple[float, float, float] | None, Finding | None]:
     """((latitude, longitude, altitude), None), moved on by what has been flown since; (None, why not)."""
     if pose is None or pose.latitude_rad is None or pose.longitude_rad is None or pose.altitude_msl_m is None:
-        return None, "no photographs by distance: there is no position"
+        return None, finding(Code.SERIES_NO_POSITION, _SERIES)
     if pose.age_ms is None or _is_stale(pose):
-        return None, "no photographs by distance: the position is older than a second"
+        return None, finding(Code.SERIES_OLD_POSITION, _SERIES)
     north_m, east_m = metres_per_radian(pose.latitude_rad, pose.altitude_msl_m)
     north, east, _ = pose.velocity_ned_m_s or (0.0, 0.0, 0.0)
     age_s = pose.age_ms / 1e3

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Protocol
@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
-from dappled.errors import counted
-from dappled.findings import FRAME, Code, Finding, Level, Value, finding, plain, text, to_rows, told
+from dappled.findings import FRAME, Code, Finding, Level, Subject, Value, finding, plain, text, to_rows, told
 from dappled.flight import Tag
 
 VerdictState = Literal["good", "usable", "bad", "unknown"]
@@ -210,27 +209,23 @@ def _worse(value: float, usable: float, bad: float) -> VerdictState | None:
 @dataclass(frozen=True, slots=True)
 class VerdictCounts:
     """How a flight's frames were judged: by state, how many bad ones since the last good or usable one and why the
-    first of them, when the newest frame was judged (monotonic), and the last `LAST` as (frame, state, reasons).
+    first of them, and the last `LAST` as (frame, state, reasons).
     `drift` says how the lens' settings last changed from one frame to a newer one, at `drift_ns`."""
 
     by_state: Mapping[VerdictState, int] = field(default_factory=dict)
     bad_in_a_row: int = 0
     reason: Finding | None = None
     last: tuple[tuple[int, VerdictState, tuple[Finding, ...]], ...] = ()
-    judged_ns: int = 0
-    drift: str = ""
+    drift: Finding | None = None
     drift_ns: int = 0
 
-    def drifted(self, now_ns: int) -> str | None:
-        """A sentence for the pilot, for a minute after the lens' settings have changed."""
-        return self.drift if self.drift and now_ns - self.drift_ns <= _LAPSED_NS else None
-
-    def problem(self, now_ns: int) -> str | None:
-        """A sentence for the pilot, where three or more frames were bad without a good or usable one between them. It
-        lapses a minute after the last frame."""
-        if self.bad_in_a_row < BAD_IN_A_ROW or now_ns - self.judged_ns > _LAPSED_NS or self.reason is None:
-            return None
-        return f"{counted(self.bad_in_a_row, 'bad frame')} in a row, the first: {text(self.reason)}"
+    def findings(self, now_ns: int) -> Iterator[Finding]:
+        """Three or more frames that were bad without a good or usable one between them; a change of the lens' settings,
+        for a minute."""
+        if self.bad_in_a_row >= BAD_IN_A_ROW and self.reason is not None:
+            yield finding(Code.FRAMES_BAD, Subject("flight"), in_a_row=self.bad_in_a_row, why=text(self.reason))
+        if self.drift is not None and now_ns - self.drift_ns <= _LAPSED_NS:
+            yield self.drift
 
 
 class Judge:
@@ -299,13 +294,12 @@ class Judge:
         elif found.state != "unknown" and not late:
             in_a_row, reason = 0, None
         last = (*before.last, (frame, found.state, found.reasons))[-LAST:]
-        judged_ns = before.judged_ns if late else now_ns
         drift, drift_ns = before.drift, before.drift_ns
         if not late:
             if moved := _moved(self._lens, lens):
-                drift, drift_ns = f"{moved} at frame {frame}", now_ns
+                drift, drift_ns = finding(Code.FRAMES_LENS_MOVED, Subject("flight"), moved=moved, frame=frame), now_ns
             self._lens = (lens[0] or self._lens[0], lens[1] or self._lens[1])
-        self.counts = VerdictCounts(dict(self._states), in_a_row, reason, last, judged_ns, drift, drift_ns)
+        self.counts = VerdictCounts(dict(self._states), in_a_row, reason, last, drift, drift_ns)
         return found
 
     def _defocus(self, lens: LensSettings, seen: PictureFacts) -> tuple[float | None, str]:

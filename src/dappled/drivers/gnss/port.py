@@ -14,6 +14,7 @@ from dappled.drivers.gnss.ubx import Edge, UbxStream, time_mark
 from dappled.drivers.mavlink import LinkError, MavlinkMessage
 from dappled.drivers.mavlink.channels import Address, ByteChannel, over_serial, serial_address
 from dappled.errors import DappledError, report
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -66,16 +67,16 @@ class GnssPort:
         """See HasThreads."""
         return self._loop.dead_threads()
 
-    def problem(self) -> str | None:
+    def problem(self) -> Finding | None:
         """Why nothing, or nothing of use, is recorded; None while the stream comes."""
-        name = f"GNSS receiver {self._at.host}"
-        if self._error or self._unlogged:
-            return f"{name}: {self._error or self._unlogged}"
+        receiver = Subject("GNSS receiver", self._at.host)
+        if why := self._error or self._unlogged:
+            return finding(Code.GNSS_FAILING, receiver, why=why)
         now_ns = self._clock.monotonic_ns()
         if now_ns - (self._heard_ns or self._began_ns) > _SILENT_NS:
-            return f"{name}: nothing was heard for 5 s: check cable and baud rate ({self._at.port})"
+            return finding(Code.GNSS_SILENT, receiver, baud=self._at.port)
         if now_ns - (self._message_ns or self._began_ns) > _SILENT_NS:
-            return f"{name}: no UBX message for 5 s: switch on UBX output (RXM-RAWX, TIM-TM2), check the baud rate"
+            return finding(Code.GNSS_NO_UBX, receiver)
         return None
 
     def _run(self) -> None:

@@ -14,7 +14,7 @@ const frames = new Map();   // index → frame event
 let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
 let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
 let isRecording = false;   // of `dappled open`: there is no daemon
-let interval = null, lastChecks = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
+let interval = null, lastFindings = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
 const handlers = {
@@ -40,14 +40,14 @@ function recording(given) {
   for (const id of ["tab-live", "clock-box"]) $(id).hidden = isRecording;
 }
 
-function showState({ health, checks, verdict, area = null, frames_left: framesLeft = null }) {
+function showState({ health, findings, verdict, area = null, frames_left: framesLeft = null }) {
   heardAt = performance.now();
   utcAt = health.utc_ns;
   if (flight && health.flight && health.flight !== flight) location.reload();
   if (ended) return;   // the daemon's last record: the flight is over
   if (!flight) $("flight").textContent = health.flight;
-  showVerdict(verdict, checks);
-  showChecks(checks);
+  showVerdict(verdict, findings);
+  showFindings(findings);
   showCounters(health);
   interval = health.interval ?? null;
   showInterval();
@@ -62,11 +62,15 @@ function showState({ health, checks, verdict, area = null, frames_left: framesLe
 }
 
 // `stale`: what was last heard, which may be wrong by now: grey, and without ticks.
-function showChecks(checks, stale = false) {
-  lastChecks = checks;
+function showFindings(findings, stale = false) {
+  lastFindings = findings;
   const state = (one) => (stale ? "unknown" : one.state);
-  $("checks").replaceChildren(...checks.map((one) => element("li", { "data-state": state(one) }, mark(state(one)), element("b", {}, one.name), element("span", {}, one.text))));
+  const item = (one) => element("li", { "data-state": state(one), "data-code": one.code }, mark(state(one)), element("span", {}, told(one)), element("small", {}, ageWords(one.age_s)));
+  $("checks").replaceChildren(...findings.map(item));
 }
+
+const told = (one) => (one.todo ? `${one.text}: ${one.todo}` : one.text);
+const ageWords = (seconds) => (seconds < 60 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
 
 function showInterval() {
   const live = interval && !ended;
@@ -80,12 +84,12 @@ function showInterval() {
   $("progress").textContent = !live ? "" : `${count}, ${due < 0.5 ? "next now" : `next in ${Math.round(due)} s`}`;
 }
 
-function showVerdict(verdict, checks) {
-  const bad = checks.filter((one) => one.state === "no-go"), cautions = checks.filter((one) => one.state === "caution");
+const VERDICTS = { go: "Go", caution: "Caution", "no-go": "No-go" };
+
+function showVerdict(verdict, findings) {
   $("verdict").dataset.state = verdict;
-  $("verdict-word").textContent = verdict === "no-go" ? "No-go" : "Go";
-  const names = (list) => list.map((one) => one.name.toLowerCase()).join(", ");
-  $("verdict-text").textContent = verdict === "no-go" ? (bad.length === 1 ? `${names(bad)}: ${bad[0].text}` : names(bad)) : verdict === "caution" ? `with caution: ${names(cautions)}` : `all ${checks.length} checks pass`;
+  $("verdict-word").textContent = VERDICTS[verdict];
+  $("verdict-text").textContent = verdict === "go" ? "all is well" : told(findings[0]);
 }
 
 // What a photographer looks at, of the body as it is now; what is not known is "unknown", and never 0.
@@ -138,11 +142,10 @@ function showCounters(health) {
   const publish = stages.publish ?? { sent: {}, dropped: {} };
   const dropped = Object.values(publish.dropped).reduce((sum, n) => sum + n, 0);
   rows($("counters"), [
-    ["requested", shots.wished],
-    ["safe on disk", shots.safe],
-    ["under way", shots.pending],
-    ["failed", shots.failed, shots.failed > 0],
+    ["taken", shots.wished - shots.failed],
+    ["on disk", shots.safe],
     ["refused", shots.refused, shots.refused > 0],
+    ["lost", shots.failed + shots.lost, shots.failed + shots.lost > 0],
     ["decoded", stages.decode ? stages.decode.done : dash],
     ["not decoded", stages.decode ? stages.decode.dropped + stages.decode.failed : dash, stages.decode && stages.decode.dropped + stages.decode.failed > 0],
     ["published", publish.sent.slices ?? 0],
@@ -234,7 +237,7 @@ function tick() {
   if (stale !== wasStale && !isRecording) {
     wasStale = stale;
     document.body.toggleAttribute("data-stale", stale);
-    if (lastChecks) showChecks(lastChecks, stale);
+    if (lastFindings) showFindings(lastFindings, stale);
   }
   if (ended) {
     $("verdict").dataset.state = "ended";

@@ -1,0 +1,70 @@
+"""The one list of what is found in a service: since when each finding stands; and which ones are new."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from dappled.findings import WORDS, Code, Finding, Subject, above_note, in_order
+
+ALL_IS_WELL = "all is well"
+
+
+@dataclass(frozen=True, slots=True)
+class StandingFinding:
+    """A finding as it was seen last, and when it began (monotonic)."""
+
+    finding: Finding
+    began_ns: int
+
+    def to_json(self, now_ns: int) -> dict[str, Any]:
+        """As the health record has it, with its age."""
+        return {**self.finding.to_json(), "age_s": round((now_ns - self.began_ns) / 1e9, 1)}
+
+
+class StandingFindings:
+    """What stands. A finding begins when a part reports it first, is refreshed while the part does, and ends when the
+    part sees that it is over and reports it no more: nothing ends because it is old."""
+
+    def __init__(self) -> None:
+        self._standing: dict[tuple[Code, Subject], StandingFinding] = {}
+
+    def refresh(self, found: Iterable[Finding], now_ns: int) -> list[StandingFinding]:
+        """All that is found now, worst first, then newest. Of two of one kind the first counts."""
+        before, self._standing = self._standing, {}
+        for one in found:
+            known = before.get(one.kind)
+            now = StandingFinding(one, now_ns) if known is None else replace(known, finding=one)
+            self._standing.setdefault(one.kind, now)
+        by_age = sorted(self._standing.values(), key=lambda one: one.began_ns)
+        place = {one.kind: number for number, one in enumerate(in_order([each.finding for each in by_age]))}
+        return sorted(by_age, key=lambda one: place[one.finding.kind])
+
+
+def in_record(health: Mapping[str, Any]) -> list[Finding]:
+    """The findings of a health record, in their order."""
+    return [Finding.from_json(row) for row in health["findings"]]
+
+
+def unasked(health: Mapping[str, Any]) -> list[Finding]:
+    """Those of a health record that a person is told without asking: what usually ends by itself may settle first."""
+    rows = zip(in_record(health), health["findings"], strict=True)
+    return [one for one, row in rows if row["age_s"] >= WORDS[one.code].settles_s]
+
+
+class NewFindings:
+    """Which findings above a note the last call did not have. One whose numbers have changed is still the same."""
+
+    def __init__(self) -> None:
+        self._known: set[tuple[Code, Subject]] = set()
+
+    def __bool__(self) -> bool:
+        """Whether there was any at the last call."""
+        return bool(self._known)
+
+    def among(self, found: Sequence[Finding], *, again: bool = False) -> list[Finding]:
+        """The new ones; with `again` all. These are the known ones from now on."""
+        known, now = self._known, above_note(found)
+        self._known = {one.kind for one in now}
+        return [one for one in now if again or one.kind not in known]

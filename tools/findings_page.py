@@ -1,0 +1,37 @@
+"""Write docs/findings.md from `dappled.findings`: what can be found, in words, what to do, and where more is said."""
+
+from __future__ import annotations
+
+from itertools import groupby
+from pathlib import Path
+
+from dappled.findings import WORDS
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "findings.md"
+HEAD = """# What can be found
+
+Whatever a person may have to know is a finding: a code, a level, what it is about, and facts. Health record, ledger,
+wire and `--json` hold these; the console, `dappled status`, the pilot's messages, the metrics and the log show them in
+these words, worst first, then newest. A *note* stands in the way of nothing. Above it nothing is "go": a *caution*
+costs something, and with a *stop* no good frame is made, or none is taken. Words in braces are facts; one with `?` is
+left out where it is unknown. A finding ends when the part that reported it sees that it is over.
+
+This page is made from the table in the code: `python tools/findings_page.py`.
+"""
+TITLES = "| code | level | what was found | what to do |\n| --- | --- | --- | --- |"
+
+
+def page() -> str:
+    """The page as it should be."""
+    parts = [HEAD]
+    for about, each in groupby(WORDS.items(), lambda one: one[0].value.partition(".")[0]):
+        rows = [f"## {about}\n\n{TITLES}"]
+        for code, words in each:
+            more = f"{' ' if words.remedy else ''}([more]({words.page}))" if words.page else ""
+            rows.append(f"| `{code.value}` | {words.level.word} | {words.sentence} | {words.remedy}{more} |")
+        parts.append("\n".join(rows) + "\n")
+    return "\n".join(parts)
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
