@@ -95,6 +95,7 @@ class Code(StrEnum):
     DISK_FULL = "disk.full"
     DISK_NEARLY_FULL = "disk.nearly_full"
     DISK_UNREADABLE = "disk.unreadable"
+    FLIGHT_FILES_REMOVED = "flight.files_removed"
     FLIGHT_NEXT_BEGINS = "flight.next_begins"
     FLIGHT_VEHICLE_UNDECIDED = "flight.vehicle_undecided"
     FRAME_BLACK = "frame.black"

@@ -30,6 +30,7 @@ from dappled.decode.calibration import Calibration, LatticeFit
 from dappled.decode.optics import Lattice
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
+from dappled.findings import Code, Subject, finding, json_text
 from dappled.flight import Ledger, recording, seals
 from dappled.products.exports import light_files
 from tests.drivers.raw.test_reading import dng
@@ -422,7 +423,9 @@ def _flight(flights: Path) -> Path:
     line = b'{"destination":"/d","name":"frames/000001.cr2","sha256":"%s","size":300,"utc_ns":1}\n' % (b"0" * 64)
     (path / "offloaded.jsonl").write_bytes(line)
     with seals.reopened(flight.folder, clock, "a test"), Ledger(flight.folder.ledger, clock) as ledger:
-        ledger.add_event("offloaded", f"offloaded.jsonl (SHA-256 {hashlib.sha256(line).hexdigest()}) names each")
+        sha256 = hashlib.sha256(line).hexdigest()
+        removed = finding(Code.FLIGHT_FILES_REMOVED, Subject("flight"), files=1, which="", there="", sha256=sha256)
+        ledger.add_event("offloaded", json_text(removed))
     return path
 
 

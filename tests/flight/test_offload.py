@@ -6,6 +6,7 @@ other devices, bind mounts and file systems.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -139,7 +140,10 @@ def test_prune_removes_the_frames_and_check_says_where_they_are(closed: Path, tm
     assert f"2 files (frames/000000.cr2 to frames/000001.cr2) were offloaded to {done.destination}" in note
     with LedgerReader.open(closed / "flight.sqlite") as ledger:
         (event,) = [event for event in ledger.events() if event.kind == "offloaded"]
-    assert f"2 files (frames/000000.cr2 to frames/000001.cr2) were copied to {done.destination}" in event.text
+    assert event.finding is not None
+    facts = event.finding.facts
+    assert (facts["files"], facts["there"]) == (2, str(done.destination))
+    assert facts["sha256"] == hashlib.sha256((closed / "offloaded.jsonl").read_bytes()).hexdigest()
     rows = [json.loads(line) for line in (closed / "offloaded.jsonl").read_text().splitlines()]
     assert [row["name"] for row in rows] == ["frames/000000.cr2", "frames/000001.cr2"]
     assert not (done.destination / "offloaded.jsonl").exists()

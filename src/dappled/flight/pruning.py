@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
-from dappled.errors import counted
+from dappled.findings import Code, Subject, finding, json_text
 from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -27,7 +26,6 @@ from dappled.shown import printable
 
 RECORD = "offloaded.jsonl"
 EVENT = "offloaded"
-_SHA256 = re.compile(r"offloaded\.jsonl \(SHA-256 ([0-9a-f]{64})\)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,8 +60,8 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     except ClaimError as error:
         raise FlightError(f"{path} can't be read: {error}") from error
     with LedgerReader.open(folder.ledger) as ledger:
-        texts = [event.text for event in ledger.events() if event.kind == EVENT]
-    if hashlib.sha256(data).hexdigest() not in {found for text in texts for found in _SHA256.findall(text)}:
+        noted = [found for event in ledger.events() if event.kind == EVENT and (found := event.finding) is not None]
+    if hashlib.sha256(data).hexdigest() not in {one.facts.get("sha256") for one in noted}:
         raise FlightError(f"{path} was changed: the ledger has no event with its SHA-256; use another copy of it")
     try:
         rows = [Removed(**json.loads(line)) for line in data.decode().splitlines()]
@@ -115,11 +113,11 @@ def note(
     names = sorted(sure)
     which = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"
     with Ledger(folder.ledger, clock) as ledger:
-        ledger.add_event(
-            EVENT,
-            f"{counted(len(sure), 'file')} ({which}) were copied to {printable(str(there))}, read back there, and are "
-            f"removed here; {RECORD} (SHA-256 {sha256}) names each",
+        to = printable(str(there))
+        noted = finding(
+            Code.FLIGHT_FILES_REMOVED, Subject("flight"), files=len(sure), which=which, there=to, sha256=sha256
         )
+        ledger.add_event(EVENT, json_text(noted))
     try:
         durable.write_file(folder.path / RECORD, data)
     except OSError as error:
