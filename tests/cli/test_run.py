@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import gc
 import json
 import os
@@ -209,3 +210,25 @@ def test_a_simulated_camera_flies_with_the_autopilot_that_the_settings_lead_to(
         poses = list(ledger.poses().values())
     assert [pose.source for pose in poses] == ["interpolated"] * 2
     assert [pose.attitude_sigma_rad for pose in poses] == [None, None]
+
+
+def restarted(code: int) -> bool:
+    """Whether systemd starts the service again after this exit code, by the rules as they are written in its unit."""
+    unit = configparser.ConfigParser(strict=False, interpolation=None)
+    unit.optionxform = str  # type: ignore[assignment, method-assign]
+    unit.read(Path(__file__).parents[2] / "systemd" / "dappled.service", encoding="utf-8")
+    rules = unit["Service"]
+    assert rules["Restart"] == "on-failure"
+    fine = {0, *map(int, rules["SuccessExitStatus"].split())}
+    return code not in fine | set(map(int, rules["RestartPreventExitStatus"].split()))
+
+
+def test_a_regular_end_is_not_restarted_whatever_its_cautions_and_a_wrong_configuration_neither(
+    config: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert not restarted(main(["run", "--config", str(config), "--for", "0"]))
+    assert "caution: " in capsys.readouterr().err  # nobody is heard, and nothing is decoded
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text("[camera]\ndrivr = 1\n")
+    assert not restarted(main(["run", "--config", str(wrong)]))
+    assert restarted(1)
