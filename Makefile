@@ -81,7 +81,7 @@ clean-room: ## the README's commands in bare Debian roots (SUITES="bookworm trix
 wheel: ## the wheel in bare environments of Python 3.11 to 3.14: installs, flies a frame, opens its light field; as root
 	@for suite in bookworm noble trixie forky; do tools/clean-room $$suite "python3 tools/wheel_trial.py" || exit 1; done
 
-docs: ## build the documents' site in build/site: strict, links checked, nothing fetched by its pages
+docs: setup ## build the documents' site in build/site: strict, links checked, nothing fetched by its pages
 	@test -n "$(PYTHON)" || { echo "dappled needs Python 3.11 or newer on PATH" >&2; exit 1; }
 	@$(PYTHON) tools/bootstrap.py docs
 	@NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build -q

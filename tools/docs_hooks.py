@@ -1,8 +1,10 @@
-"""Hooks of mkdocs: pages beside docs/ become pages of the site, and no page fetches anything from a network."""
+"""Hooks of mkdocs: pages beside docs/ become pages of the site, the verbs write one of their own, and no page fetches
+anything from a network."""
 
 from __future__ import annotations
 
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +24,10 @@ def on_files(files: Any, config: Any) -> Any:
     """Add the pages; README.md is the first page of the site."""
     for name in BESIDE:
         files.append(File.generated(config, name, content=at_top((ROOT / name).read_text(encoding="utf-8"))))
+    verbs = subprocess.run(
+        [ROOT / ".venv/bin/python", ROOT / "tools/command_line_page.py"], capture_output=True, text=True, check=True
+    )
+    files.append(File.generated(config, "command-line.md", content=verbs.stdout))
     return files
 
 

@@ -163,7 +163,7 @@ def test_two_frames_of_one_name_are_not_written_over_each_other(
     other.parent.mkdir()
     other.write_bytes(stopped.read_bytes())
     code, _, err = _told(capsys, stopped.parent, str(stopped), str(other), "-o", str(tmp_path / "out"))
-    assert code == 1
+    assert code == 2
     assert f"{stopped} and {other} would both be written as" in err
     assert not (tmp_path / "out").exists()
 
@@ -180,8 +180,7 @@ def test_bands_fall_off_softly_where_that_is_asked_for(
         made[taper] = light_files.load(out).slices
     rough = {taper: float(np.abs(np.diff(slices[0].real)).mean()) for taper, slices in made.items()}
     assert rough["1"] < 0.95 * rough["0"]
-    for words, said in ((["--taper", "2"], "from 0 to 1"), (["--taper", "0.5"], "printed mask")):
-        mask = MASK if said == "from 0 to 1" else "lenslet"
-        code, _, err = _told(capsys, stopped.parent, str(stopped), *words, "-o", str(tmp_path / "x.npz"), mask=mask)
-        assert code == 1
-        assert said in err
+    words = ["--taper", "0.5", "-o", str(tmp_path / "x.npz")]
+    code, _, err = _told(capsys, stopped.parent, str(stopped), *words, mask="lenslet")
+    assert code == 1
+    assert "printed mask" in err

@@ -87,7 +87,6 @@ def test_the_example_is_small_and_whole_or_not_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        (["nowhere.zarr"], "nowhere.zarr does not exist"),
         (["FIELD", "--mask", "mask-2"], "is decoded already: leave mask out"),
         (["FIELD", "--bind", "0.0.0.0:0"], "would be open to the network without a token"),
         (["FIELD", "--bind", "here"], "must be host:port"),

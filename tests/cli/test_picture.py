@@ -124,5 +124,5 @@ def test_lenslets_and_two_frames_into_one_file_are_refused(
     assert _call(frame, tmp_path / "a.dng", mask="lenslet") == 1
     assert "not behind lenslets" in capsys.readouterr().err
     twice = [str(frame), str(frame)]
-    assert main(["picture", *twice, "--mask", "reference-5x5", "-o", str(tmp_path / "a.dng")]) == 1
+    assert main(["picture", *twice, "--mask", "reference-5x5", "-o", str(tmp_path / "a.dng")]) == 2
     assert "name a folder" in capsys.readouterr().err

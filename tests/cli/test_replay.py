@@ -14,7 +14,7 @@ from dappled.flight import recording
 @pytest.mark.parametrize(
     "words",
     [
-        ["--telemetry", "other.tlog"],
+        ["--telemetry", "."],
         ["--match", "*.dng"],
         ["--start", "2026-11-21T10:15:03Z"],
         ["--interval", "1.0"],  # also what would be taken for a folder
@@ -26,7 +26,7 @@ def test_what_is_for_folders_is_refused_for_a_flight(
 ) -> None:
     flight = recording.begin(tmp_path / "flights", RecordedClock(1_790_000_000 * 10**9))
     flight.close()
-    assert main(["replay", str(flight.folder.path), *words]) == 1
-    err = capsys.readouterr().err
-    assert err.startswith(f"dappled replay: {words[-2]} is for a folder of frames: ")
-    assert len(err.strip().splitlines()) == 1
+    assert main(["replay", str(flight.folder.path), *words]) == 2
+    usage, sentence = capsys.readouterr().err.splitlines()
+    assert usage.startswith("usage: dappled replay ")
+    assert sentence.startswith(f"dappled replay: {words[-2]} is for a folder of frames: ")

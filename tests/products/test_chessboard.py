@@ -111,8 +111,9 @@ def test_the_command_keeps_the_lens_in_a_profile(
     assert lens is not None
     assert lens.v_mm == pytest.approx(TRUE.v_mm, rel=0.01)
     assert profiles.camera(str(output)).lens(35.0) is None
-    assert main([*words, "--focal-length", "50", "--board", "nine", "--overwrite"]) == 1
-    assert "--board nine" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main([*words, "--focal-length", "50", "--board", "nine", "--overwrite"])
+    assert "--board: nine: give its inner corners" in capsys.readouterr().err
     assert math.isfinite(lens.distortion[0])
 
 

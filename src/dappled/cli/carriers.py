@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 import io
-import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,10 +12,9 @@ from typing import Any
 from PIL import Image
 
 from dappled import durable
-from dappled.cli import decode_arguments
-from dappled.cli.arguments import add_overwrite, refuse_existing
+from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
+from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.config import profiles
-from dappled.config.schema import ConfigError
 from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.decoder import CarriersFrom
 from dappled.decode.optics import Carrier, Lattice, Mask, Order
@@ -32,31 +28,6 @@ from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
 from dappled.errors import counted
 from dappled.findings import FRAME, Finding, told
-
-
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled carriers frame.dng --mask reference-5x5 --picture spectrum.png\n"
-        "  dappled carriers --shape 2776 3688 --camera fujifilm-s5200 --mask mask-2 --focal-length 13\n"
-        "  dappled carriers lytro.png --mask lenslet"
-    )
-    decode_arguments.add_frames(parser, "?")
-    decode_arguments.add_recipe(parser)
-    parser.add_argument(
-        "--crossed",
-        action="store_true",
-        help="also list the orders between harmonics, which the pattern is not designed to make",
-    )
-    parser.add_argument("--shape", type=int, nargs=2, metavar=("H", "W"), help="only predict, for frames of this size")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="draw the spectrum with its boxes")
-    add_overwrite(parser)
-    parser.add_argument(
-        "--look", choices=LOOKS, help="what the picture shows (default: magnitude; with --around: phase)"
-    )
-    parser.add_argument(
-        "--around", type=int, nargs=2, metavar=("KY", "KX"), help="draw the bins around this carrier, each as a square"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,22 +67,144 @@ class Table:
         return sum(m is not None and not m.suspect and (c.ky, c.kx) != (0, 0) for c, m in self.rows)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    plane = None
-    if arguments.picture:
-        refuse_existing(arguments, arguments.picture)
-    if arguments.frames is None:
-        table = _predicted(arguments)
-    else:
-        plane, table = _measured(arguments)
-    if arguments.picture:
-        if plane is None:
-            raise DarkroomError("--picture draws a frame's spectrum: name the frame")
-        _save(_picture(plane, table, arguments), arguments.picture)
-    print(json.dumps(_as_json(table), indent=2) if arguments.json else _as_text(table))
-    if table.doubt:
-        print(f"dappled carriers: {told(table.doubt, FRAME)}", file=sys.stderr)
-    return 1 if table.checked is not None and table.checked.contradiction else 0
+@dataclass(frozen=True, kw_only=True)
+class ShowCarriers(Overwriting, RecipeArguments, Verb):
+    """Show the predicted and the measured carriers."""
+
+    examples = (
+        "dappled carriers frame.dng --mask reference-5x5 --picture spectrum.png",
+        "dappled carriers --shape 2776 3688 --camera fujifilm-s5200 --mask mask-2 --focal-length 13",
+        "dappled carriers lytro.png --mask lenslet",
+    )
+
+    frame: Path | None = argument("FRAME", FRAME_HELP, default=None, there=True)
+    mask: str = option("--mask", "mask profile or TOML file, or lenslet")
+    crossed: bool = flag(
+        "--crossed", "also list the orders between harmonics, which the pattern is not designed to make"
+    )
+    shape: tuple[int, int] | None = option(
+        "--shape", "only predict, for frames of this size", None, metavar=("H", "W"), low=1,
+    )  # fmt: skip
+    picture: Path | None = option("--picture", "draw the spectrum with its boxes", None, metavar="FILE.png")
+    look: Look | None = option(
+        "--look", "what the picture shows", None, choices=LOOKS, otherwise="magnitude; with --around: phase",
+    )  # fmt: skip
+    around: tuple[int, int] | None = option(
+        "--around", "draw the bins around this carrier, each as a square", None, metavar=("KY", "KX"),
+    )  # fmt: skip
+
+    def check(self) -> None:
+        """See Verb."""
+        self.refuse_existing(self.picture)
+        if self.frame is None:
+            if not self.shape or self.camera == "auto" or self.mask == profiles.LENSLET:
+                raise CallError("name a frame, or give --shape, --camera, --mask and --focal-length to predict")
+            if self.focal_length is None:
+                raise CallError("without a frame the focal length is unknown: give --focal-length, in mm")
+            if self.picture:
+                raise CallError("--picture draws a frame's spectrum: name the frame")
+        Darkroom(self.recipe()).check()
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        if self.frame is None:
+            table = self._predicted()
+        else:
+            plane, table = self._measured(self.frame)
+            if self.picture:
+                _save(self._picture(plane, table), self.picture)
+        if table.doubt:
+            output.warn(told(table.doubt, FRAME))
+        failed = table.checked is not None and bool(table.checked.contradiction)
+        return Report(_as_json(table), _lines(table), failed=failed)
+
+    def _picture(self, plane: Plane, table: Table) -> Any:
+        if self.around is None:
+            return picture(plane, table, self.look or "magnitude")
+        (carrier,) = table.used.carriers([self.around])
+        if not carrier.on_sensor:
+            raise DarkroomError(
+                f"the carrier {carrier.ky} {carrier.kx} falls off the sensor: choose another one with --around"
+            )
+        return around(plane, (carrier.fy, carrier.fx), look=self.look or "phase")
+
+    def _predicted(self) -> Table:
+        assert self.shape is not None
+        assert self.focal_length is not None
+        camera = profiles.camera(self.camera)
+        darkroom = Darkroom(self.recipe())
+        decoder = darkroom.mask_decoder(self.shape, next(iter(camera.models), ""))
+        mask = decoder.optics.mask
+        lattice = decoder.lattice_at(self.focal_length)
+        orders = sorted([*mask.orders(), *(crossed_orders(mask) if self.crossed else [])])
+        rows = [(carrier, None) for carrier in lattice.carriers(orders)]
+        return Table(decoder.optics.sensor.shape, decoder.optics.law, self.focal_length, lattice, rows, _main(mask))
+
+    def _measured(self, frame: Path) -> tuple[Plane, Table]:
+        darkroom = Darkroom(self.recipe())
+        raw = darkroom.read(frame)
+        with darkroom.naming(frame):
+            plane = darkroom.plane(raw)
+            shape = (plane.shape[0], plane.shape[1])
+            if self.mask == profiles.LENSLET:
+                found = find_lattice(transform(plane, workers=2))
+                pairs = list(zip(found.carriers, found.measured, strict=True))
+                rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
+                main = frozenset(found.orders) | {(0, 0)}
+                return plane, Table(
+                    shape, "found", None, found.lattice, rows, main, found, "found", None, found.rotation_rad
+                )
+            decoder = known_to(
+                darkroom.mask_decoder(shape, raw.camera_model or ""), None if self.focal_length else raw.focal_sigma_mm
+            )
+            length = self.focal_length or raw.focal_length_mm
+            if length is None:
+                raise DarkroomError(f"{frame} doesn't say its focal length: give --focal-length MM")
+            spectrum = transform(plane, workers=2)
+            predicted = decoder.predict(length)
+            used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
+            stop = self.f_number or raw.f_number
+            stops = darkroom.camera(raw.camera_model or "").f_numbers
+            lens = FrameLens(length, stop, None if stops is None else stops[1])
+            checked = check(
+                decoder,
+                plane,
+                lens,
+                used,
+                list(zip(predicted, seen, strict=True)),
+                carriers_from=carriers_from,
+                keep_law=bool(self.law),
+            )
+            if checked.decoder is not decoder:
+                decoder = checked.decoder
+                predicted = decoder.predict(length)
+                used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
+            known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
+            lattice = decoder.lattice_at(length)
+            mask = decoder.optics.mask
+            halves = lattice.carriers(mask.half_orders())
+            if self.crossed:
+                between = [order for order in crossed_orders(mask) if order > (0, 0)]
+                halves += lattice.carriers(between)
+                near = measure(spectrum, used.carriers(between), 2.0)
+                known |= dict(zip(between, near, strict=True))
+            rows = _both_halves([(c, known.get((c.ky, c.kx))) for c in halves])
+            turned = lattice_rotation(used, decoder.optics.sensor)
+            return plane, Table(
+                shape,
+                decoder.optics.law,
+                length,
+                lattice,
+                rows,
+                _main(mask),
+                carriers_from=carriers_from,
+                own=used,
+                rotation_rad=turned,
+                checked=checked,
+            )
+
+
+CLASSES = {"carriers": ShowCarriers}
 
 
 def _save(shown: Any, path: Path) -> None:
@@ -137,96 +230,6 @@ def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
         measured=[m for _, m in half],
         look=look,
     )
-
-
-def _picture(plane: Plane, table: Table, arguments: argparse.Namespace) -> Any:
-    if arguments.around is None:
-        return picture(plane, table, arguments.look or "magnitude")
-    (carrier,) = table.used.carriers([tuple(arguments.around)])
-    if not carrier.on_sensor:
-        raise DarkroomError(
-            f"the carrier {carrier.ky} {carrier.kx} falls off the sensor: choose another one with --around"
-        )
-    return around(plane, (carrier.fy, carrier.fx), look=arguments.look or "phase")
-
-
-def _predicted(arguments: argparse.Namespace) -> Table:
-    if not arguments.shape or arguments.camera == "auto" or arguments.mask == profiles.LENSLET:
-        raise ConfigError("name a frame, or give --shape, --camera, --mask and --focal-length to predict")
-    if not arguments.focal_length or arguments.focal_length <= 0:
-        raise ConfigError("without a frame the focal length is unknown: give --focal-length, in mm")
-    camera = profiles.camera(arguments.camera)
-    darkroom = Darkroom(decode_arguments.recipe(arguments))
-    decoder = darkroom.mask_decoder((arguments.shape[0], arguments.shape[1]), next(iter(camera.models), ""))
-    mask = decoder.optics.mask
-    lattice = decoder.lattice_at(arguments.focal_length)
-    orders = sorted([*mask.orders(), *(crossed_orders(mask) if arguments.crossed else [])])
-    rows = [(carrier, None) for carrier in lattice.carriers(orders)]
-    return Table(decoder.optics.sensor.shape, decoder.optics.law, arguments.focal_length, lattice, rows, _main(mask))
-
-
-def _measured(arguments: argparse.Namespace) -> tuple[Plane, Table]:
-    darkroom = Darkroom(decode_arguments.recipe(arguments))
-    raw = darkroom.read(arguments.frames)
-    with darkroom.naming(arguments.frames):
-        plane = darkroom.plane(raw)
-        shape = (plane.shape[0], plane.shape[1])
-        if arguments.mask == profiles.LENSLET:
-            found = find_lattice(transform(plane, workers=2))
-            pairs = list(zip(found.carriers, found.measured, strict=True))
-            rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
-            main = frozenset(found.orders) | {(0, 0)}
-            return plane, Table(
-                shape, "found", None, found.lattice, rows, main, found, "found", None, found.rotation_rad
-            )
-        decoder = known_to(
-            darkroom.mask_decoder(shape, raw.camera_model or ""), None if arguments.focal_length else raw.focal_sigma_mm
-        )
-        length = arguments.focal_length or raw.focal_length_mm
-        if length is None:
-            raise DarkroomError(f"{arguments.frames} doesn't say its focal length: give --focal-length MM")
-        spectrum = transform(plane, workers=2)
-        predicted = decoder.predict(length)
-        used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
-        stop = arguments.f_number or raw.f_number
-        stops = darkroom.camera(raw.camera_model or "").f_numbers
-        lens = FrameLens(length, stop, None if stops is None else stops[1])
-        checked = check(
-            decoder,
-            plane,
-            lens,
-            used,
-            list(zip(predicted, seen, strict=True)),
-            carriers_from=carriers_from,
-            keep_law=bool(arguments.law),
-        )
-        if checked.decoder is not decoder:
-            decoder = checked.decoder
-            predicted = decoder.predict(length)
-            used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
-        known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
-        lattice = decoder.lattice_at(length)
-        mask = decoder.optics.mask
-        halves = lattice.carriers(mask.half_orders())
-        if arguments.crossed:
-            between = [order for order in crossed_orders(mask) if order > (0, 0)]
-            halves += lattice.carriers(between)
-            near = measure(spectrum, used.carriers(between), 2.0)
-            known |= dict(zip(between, near, strict=True))
-        rows = _both_halves([(c, known.get((c.ky, c.kx))) for c in halves])
-        turned = lattice_rotation(used, decoder.optics.sensor)
-        return plane, Table(
-            shape,
-            decoder.optics.law,
-            length,
-            lattice,
-            rows,
-            _main(mask),
-            carriers_from=carriers_from,
-            own=used,
-            rotation_rad=turned,
-            checked=checked,
-        )
 
 
 def measure_mean() -> Measured:
@@ -291,7 +294,7 @@ def _as_json(table: Table) -> dict[str, Any]:
     return whole
 
 
-def _as_text(table: Table) -> str:
+def _lines(table: Table) -> list[str]:
     lines = [f"{'ky':>3} {'kx':>3} {'row':>9} {'col':>9}   {'seen row':>9} {'seen col':>9} {'strength':>8}"]
     for carrier, seen in table.rows:
         row, column = carrier.index(table.shape)
@@ -308,7 +311,7 @@ def _as_text(table: Table) -> str:
     if any((c.ky, c.kx) not in table.main for c, _ in table.rows):
         lines.append("x: a crossed order, between the two diagonals of harmonics")
     lines.append(_summary(table))
-    return "\n".join(lines)
+    return lines
 
 
 def _summary(table: Table) -> str:

@@ -8,12 +8,13 @@ import importlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, Field, dataclass, fields
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import dappled
 from dappled.cli.table import GROUPS, VERBS
-from dappled.cli.verb import Argument, CallError, OldVerb, Verb
+from dappled.cli.verb import Argument, CallError, Verb
 from dappled.errors import DappledError
 
 _LAST = {"anyway": 1, "overwrite": 2, "json": 3}
@@ -76,33 +77,32 @@ def read(words: Sequence[str]) -> Call:
     one: CommandParser = parsed.parser
     if unknown:
         one.refuse_unknown(unknown[0])
-    if hasattr(parsed, "old"):
-        parsed.verb = path
-        old = OldVerb(json=getattr(parsed, "json", False), arguments=parsed, ending=parsed.old)
-        return Call(path, old, parsed.debug, one.short_usage())
     made = verb_class(path)
-    values = {spec.name: _plain(getattr(parsed, spec.name)) for spec in fields(made)}
+    values = {spec.name: _plain(spec, getattr(parsed, spec.name)) for spec in fields(made)}
     return Call(path, made(**values), parsed.debug, one.short_usage())
 
 
 def check(verb: Verb) -> None:
     """Refuse what is wrong by itself: files that are not there, then what the verb refuses. Raises DappledError."""
     for spec in fields(verb):
-        if "argument" in spec.metadata and spec.metadata["argument"].there:
+        if spec.metadata["argument"].there:
             value = getattr(verb, spec.name)
             for path in value if isinstance(value, tuple) else () if value in (None, "") else (value,):
-                _must_be_there(path)
+                _must_be_there(Path(path))
     verb.check()
 
 
-def _must_be_there(path: Any) -> None:
+def _must_be_there(path: Path) -> None:
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
         raise CallError(f"{path}: no such file or folder; check the path") from None
 
 
-def _plain(value: Any) -> Any:
+def _plain(spec: Field[Any], value: Any) -> Any:
+    """A field's value as it was read: words as a tuple; the default where argparse has none."""
+    if value is None and spec.default is not MISSING:
+        return spec.default
     return tuple(value) if isinstance(value, list) else value
 
 
@@ -125,10 +125,7 @@ def parser(path: str = "") -> CommandParser:
                 own = [verb_class(other).examples[0] for other in VERBS if other.startswith(f"{group} ")]
                 one.epilog = _told(own)
         leaf = branches[group].add_parser(last, **_described(line))
-        if name == path and hasattr(loaded := importlib.import_module(f"dappled.cli.{VERBS[path][0]}"), "configure"):
-            loaded.configure(leaf)
-            leaf.set_defaults(old=loaded.run, parser=leaf)
-        elif name == path:
+        if name == path:
             _fill(leaf, verb_class(name))
     return top
 
@@ -167,7 +164,7 @@ def _fill(one: CommandParser, made: type[Verb]) -> None:
     hints = get_type_hints(made)
     groups: dict[str, Any] = {"": one}
     alone: dict[str, Any] = {}
-    for spec in sorted(fields(made), key=lambda each: _LAST.get(each.name, 0)):
+    for spec in sorted(fields(made), key=_place):
         form: Argument = spec.metadata["argument"]
         if form.group not in groups:
             groups[form.group] = one.add_argument_group(form.group)
@@ -177,6 +174,10 @@ def _fill(one: CommandParser, made: type[Verb]) -> None:
                 form.alone, home.add_mutually_exclusive_group() if form.alone not in alone else home
             )
         _add(home, spec, form, hints[spec.name])
+
+
+def _place(spec: Field[Any]) -> int:
+    return -1 if spec.metadata["argument"].first else _LAST.get(spec.name, 0)
 
 
 def _add(home: Any, spec: Field[Any], form: Argument, hint: Any) -> None:
@@ -189,7 +190,7 @@ def _add(home: Any, spec: Field[Any], form: Argument, hint: Any) -> None:
         given |= {"action": argparse.BooleanOptionalAction} if optional else {"action": "store_true"}
         home.add_argument(*form.names, dest=spec.name, default=default, **given)
         return
-    if get_origin(kind) is tuple:
+    if get_origin(kind) is tuple and (form.parse is None or form.append):
         parts = get_args(kind)
         kind = parts[0]
         if form.append:

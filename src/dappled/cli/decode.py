@@ -2,62 +2,70 @@
 
 from __future__ import annotations
 
-import argparse
-import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.cli import decode_arguments
-from dappled.cli.arguments import add_overwrite
-from dappled.cli.each_frame import each_frame
+from dappled.cli.field_arguments import views_words
+from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, flag, option
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.findings import FRAME, told
 from dappled.products.exports import light_files
-from dappled.shown import printable
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled decode frame.dng --mask reference-5x5 --calibration c.toml -o frame.zarr\n"
-        "  dappled decode FLIGHT -o decoded/    (by the flight's own mask, camera and calibration)\n"
-        "  dappled decode *.png --mask lenslet --white white.png -o decoded/"
+@dataclass(frozen=True, kw_only=True)
+class DecodeFrames(Overwriting, Doubtable, FramesArguments, Verb):
+    """Decode frames to light fields."""
+
+    examples = (
+        "dappled decode frame.dng --mask reference-5x5 --calibration c.toml -o frame.zarr",
+        "dappled decode FLIGHT -o decoded/    (by the flight's own mask, camera and calibration)",
+        "dappled decode *.png --mask lenslet --white white.png -o decoded/",
     )
-    decode_arguments.add_frames(parser, "+")
-    decode_arguments.add_recipe(parser, mask_needed=False, mask_otherwise="that of the flight that the frames are of")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="OUT",
-                        help="light field (.zarr, .npz, .h5); with several frames a folder")  # fmt: skip
-    parser.add_argument("--colour", action="store_true", help="views in red, green and blue (default: grey)")
-    parser.add_argument("--taper", type=float, default=0.0, metavar="SHARE",
-                        help="share of each band with a soft edge, 0 to 1: less ringing, less detail")  # fmt: skip
-    parser.add_argument("--anyway", action="store_true",
-                        help="write the light field although carriers that must be visible are not, and exit with 0\n"
-                        "although what was written is in doubt (otherwise 1)")  # fmt: skip
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
-
-def run(arguments: argparse.Namespace) -> int:
-    darkroom = Darkroom(decode_arguments.recorded(arguments.frames, decode_arguments.recipe(arguments)))
-    darkroom.check()
-    arguments.frames = decode_arguments.frames(arguments.frames)
-    single = len(arguments.frames) == 1 and arguments.output.suffix
-    if not single:
-        decode_arguments.refuse_same_names(arguments.frames, arguments.output, ".zarr")
-        arguments.output.mkdir(parents=True, exist_ok=True)
-
-    def decoded(frame: Path) -> bool:
-        target = arguments.output if single else arguments.output / f"{frame.stem}.zarr"
-        made = darkroom.decode(frame, focal_length_mm=arguments.focal_length, f_number=arguments.f_number)
-        if not arguments.anyway:
-            _refuse_contradicted(frame, made)
-        light_files.save(target, made.light_field, overwrite=arguments.overwrite)
-        print(json.dumps(_facts(target, made)) if arguments.json else printable(f"{target}: {summary(made)}"))
-        return bool(made.doubts)
-
-    return each_frame(
-        "decode", arguments.frames, arguments, decoded, into_folder=not single, failure="could not be decoded"
+    output: Path = option("-o --output", "light field (.zarr, .npz, .h5); with several frames a folder", metavar="OUT")
+    colour: bool = flag("--colour", "views in red, green and blue (default: grey)")
+    taper: float = option(
+        "--taper", "share of each band with a soft edge: less ringing, less detail", 0.0, metavar="SHARE", low=0,
+        high=1,
+    )  # fmt: skip
+    anyway: bool = flag(
+        "--anyway",
+        "write the light field although carriers that must be visible are not, and exit with 0 although what was "
+        "written is in doubt (otherwise 1)",
     )
+    json: bool = flag("--json", "print one JSON object per frame")
+
+    def _darkroom(self) -> Darkroom:
+        return Darkroom(recorded(self.frames, self.recipe(colour=self.colour, taper=self.taper)))
+
+    def check(self) -> None:
+        """See Verb."""
+        self._darkroom().check()
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        darkroom, found = self._darkroom(), frames(self.frames)
+        single = len(found) == 1 and bool(self.output.suffix)
+        if not single:
+            refuse_same_names(found, self.output, ".zarr")
+            self.output.mkdir(parents=True, exist_ok=True)
+
+        def decoded(frame: Path) -> bool:
+            target = self.output if single else self.output / f"{frame.stem}.zarr"
+            made = darkroom.decode(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
+            if not self.anyway:
+                _refuse_contradicted(frame, made)
+            light_files.save(target, made.light_field, overwrite=self.overwrite)
+            output.row(_facts(target, made), f"{target}: {summary(made)}")
+            return bool(made.doubts)
+
+        return each_frame(found, output, decoded, into_folder=not single, failure="could not be decoded")
+
+
+CLASSES = {"decode": DecodeFrames}
 
 
 def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:
@@ -106,7 +114,7 @@ def summary(made: DecodeResult) -> str:
         )
     if made.search is not None and made.search.found is not None:
         whole += f", by the law {field.attributes['law']} ({made.search.sentence})"
-    if words := decode_arguments.views_words(field):
+    if words := views_words(field):
         whole += f"; {words}"
     if others := [one for one in made.doubts if one not in (made.contradiction, made.unsettled)]:
         whole += f"; in doubt: {'; '.join(told(one, FRAME) for one in others)}"

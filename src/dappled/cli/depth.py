@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import secrets
-import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli import decode_arguments, georeference
-from dappled.cli.arguments import add_overwrite, refuse_existing
-from dappled.cli.decode_arguments import FieldCallError
+from dappled.cli.field_arguments import opened_field
+from dappled.cli.placing import FieldOrFlight
+from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.decode import DecodeError
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
@@ -26,7 +24,7 @@ from dappled.findings import to_rows
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs, terrain
-from dappled.products.maps.georeference import Progress, Survey
+from dappled.products.maps.georeference import Survey
 from dappled.products.mounting import Mounting
 from dappled.products.opened import OpenedLightField, OpenError
 from dappled.products.survey import frame_terrain
@@ -36,116 +34,156 @@ _POINTS = (".ply", ".las", ".laz")
 _RASTERS, _PICTURES = (".tif", ".tiff"), (".png", ".jpg", ".jpeg")  # of a flight's heights
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled depth frame.zarr -o depth.png\n"
-        "  dappled depth frame.zarr --focus inf -o depth.npz points.ply\n"
-        "  dappled depth frame.zarr --calibration c.toml --flight FLIGHT --frame 42 -o points.las\n"
-        "  dappled depth --flight FLIGHT --terrain n41_w092_1arc_v3.dt2 -o heights.tif\n"
+@dataclass(frozen=True, kw_only=True)
+class MeasureDepth(Overwriting, FieldOrFlight, Verb):
+    """Measure disparities and distances."""
+
+    examples = (
+        "dappled depth frame.zarr -o depth.png",
+        "dappled depth frame.zarr --focus inf -o depth.npz points.ply",
+        "dappled depth frame.zarr --calibration c.toml --flight FLIGHT --frame 42 -o points.las",
+        "dappled depth --flight FLIGHT --terrain n41_w092_1arc_v3.dt2 -o heights.tif",
+    )
+    notes = (
         "OUT: .png (false colours), .npz (all values), .pfm (disparity), .ply, .las, .laz (points); of a flight .tif."
     )
-    decode_arguments.add_field(parser, needed=False)
-    parser.add_argument("--method", type=_method, metavar="M", default="combined",
-                        help=f"{', '.join(depths.METHODS)} (default: combined)")  # fmt: skip
-    decode_arguments.add_between(parser)
-    parser.add_argument("--window", type=int, metavar="PX",
-                        help="side of the window around a pixel, odd (default: the method's own, 3 to 13)")  # fmt: skip
-    parser.add_argument("--most-sigma", type=float, default=0.1, metavar="SHARE",
-                        help="omit points with a σ above this share of their distance (default: 0.1)")  # fmt: skip
-    parser.add_argument(
-        "--flight",
-        type=Path,
-        metavar="FLIGHT",
-        help="with --frame: place the points on the map, using the pose of that frame; without\n"
-        "LIGHTFIELD: heights of the ground from its frames, each by itself, fused (a GeoTIFF)",
+
+    method: str = option("--method", ", ".join(depths.METHODS), "combined", metavar="M", parse=depths.known_method)
+    between: tuple[float, float] | None = option(
+        "--between", "range of disparities to search, px/view", None, metavar=("LOW", "HIGH"), otherwise="the scene's",
+    )  # fmt: skip
+    window: int | None = option(
+        "--window", "side of the window around a pixel, odd", None, metavar="PX", low=1,
+        otherwise="the method's own, 3 to 13",
+    )  # fmt: skip
+    most_sigma: float = option(
+        "--most-sigma", "omit points with a σ above this share of their distance", 0.1, metavar="SHARE", above=0.0,
+    )  # fmt: skip
+    flight: Path | None = option(
+        "--flight", "with --frame: place the points on the map, using the pose of that frame; without LIGHTFIELD: "
+        "heights of the ground from its frames, each by itself, fused (a GeoTIFF)", None, metavar="FLIGHT", there=True,
+    )  # fmt: skip
+    frame: int | None = option(
+        "--frame", "number of this frame in the flight; without LIGHTFIELD: use only this one", None, low=0,
+    )  # fmt: skip
+    together: bool = flag(
+        "--together",
+        "of a flight: find heights where all frames agree (a plane sweep over the flight), not from each by itself",
     )
-    parser.add_argument("--frame", type=int, metavar="N",
-                        help="number of this frame in the flight; without LIGHTFIELD: use only this one")  # fmt: skip
-    decode_arguments.add_flight(parser)
-    parser.add_argument("--together", action="store_true",
-                        help="of a flight: find heights where all frames agree (a plane sweep over the flight),\n"
-                        "not from each frame by itself")  # fmt: skip
-    parser.add_argument("-o", "--output", nargs="+", type=Path, default=[], metavar="OUT", help="files to write")
-    add_overwrite(parser)
-    parser.add_argument("--json", action="store_true", help="print the summary as JSON")
+    output: tuple[Path, ...] = option("-o --output", "files to write", (), metavar="OUT")
 
+    def check(self) -> None:
+        """See Verb."""
+        self.check_source("together")
+        if self.window is not None and self.window % 2 == 0:
+            raise CallError(f"a window of {self.window} px has no middle: give an odd --window")
+        if self.between is not None and not self.between[0] < self.between[1]:
+            raise CallError("--between: the lower disparity comes first")
+        kinds = [path.suffix.lower() for path in self.output]
+        if self.field is not None and self.flight is not None and self.frame is None:
+            raise CallError("--flight needs --frame N: the number of this frame in the flight")
+        for path, kind in zip(self.output, kinds, strict=True):
+            if self.field is None and kind not in (*_RASTERS, *_PICTURES):
+                raise CallError(f"{path}: heights of a flight are written as .tif (GeoTIFF) or .png, .jpg (a picture)")
+        self.refuse_existing(*self.output)
 
-def _method(text: str) -> str:
-    try:
-        return depths.known_method(text)
-    except DecodeError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        if self.field is None:
+            return self._heights(output)
+        found = opened_field(self.field, output, self)
+        made = found.depth(self.method, between=self.between, window=self.window)
+        distances = found.distances(made) if found.ranging is not None else None
+        report: dict[str, Any] = summary(found, made, distances)
+        for path in self.output:
+            report.setdefault("written", []).append(str(path))
+            report |= self._write(path, found, made, distances)
+        return Report(report, words(report), doubted=bool(found.doubts))
 
+    def _heights(self, output: Output) -> Report:
+        """Heights of a flight."""
+        assert self.flight is not None
+        placing = self.placing(None if self.frame is None else frozenset([self.frame]))
+        written = [str(path) for path in self.output]
+        with ExitStack() as stack:
+            if self.together:
+                return self._together(placing.placed(self.flight, output, stack), output)
+            scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
+            seen = FrameDepths(
+                scratch,
+                lambda found: found.depth(self.method, between=self.between, window=self.window),
+                placing.focus,
+            )
+            made = placing.placed(self.flight, output, stack, watch=seen)
+            for _, why in seen.left:
+                output.remark(why)
+            found = frame_terrain.of(made, seen.found, output.show, cell_m=self.cell)
+            for path in self.output:
+                if path.suffix.lower() in _RASTERS:
+                    frame_terrain.write_raster(made, found, path)
+                else:
+                    prints.save(path, _picture(found.height_m, "m"))
+        lines = frame_terrain.words(made, found)
+        values = frame_terrain.summary(made, found) | {"notes": lines[1:], "written": written}
+        return Report(values, [*lines, *(f"written: {path}" for path in written)], doubted=bool(made.doubts))
 
-def run(arguments: argparse.Namespace) -> int:
-    refuse_existing(arguments, *arguments.output)
-    if arguments.field is None:
-        return _heights(arguments)
-    decode_arguments.refuse_of_flight(arguments, "together")
-    found = decode_arguments.opened_field(arguments)
-    between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
-    made = found.depth(arguments.method, between=between, window=arguments.window)
-    distances = found.distances(made) if found.ranging is not None else None
-    report: dict[str, Any] = summary(found, made, distances)
-    for path in arguments.output:
-        report.setdefault("written", []).append(str(path))
-        report |= _write(path, found, made, distances, arguments)
-    print(json.dumps(report) if arguments.json else words(report))
-    return 0
-
-
-def _heights(arguments: argparse.Namespace) -> int:
-    """Heights of a flight from its single frames."""
-    given = decode_arguments.of_flight(arguments)
-    wrong = [path for path in arguments.output if path.suffix.lower() not in (*_RASTERS, *_PICTURES)]
-    if wrong:
-        raise FieldCallError(f"{wrong[0]}: heights of a flight are written as .tif (GeoTIFF) or .png, .jpg (a picture)")
-    between = None if arguments.between is None else (arguments.between[0], arguments.between[1])
-    given["frames"] = None if arguments.frame is None else str(arguments.frame)
-    with ExitStack() as stack:
-        progress = stack.enter_context(georeference.Bar())
-        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
-        if arguments.together:
-            return _together(arguments, georeference.placed(arguments.flight, given, progress, stack), progress)
-        depths = FrameDepths(
-            scratch,
-            lambda found: found.depth(arguments.method, between=between, window=arguments.window),
-            given["focus"],
-        )
-        made = georeference.placed(arguments.flight, given, progress, stack, watch=depths)
-        for _, why in (*made.left, *depths.left):
-            print(why, file=sys.stderr)
-        found = frame_terrain.of(made, depths.found, progress, cell_m=arguments.cell)
-        for path in arguments.output:
+    def _together(self, made: Survey, output: Output) -> Report:
+        """Heights of a flight where all of its frames agree."""
+        found = terrain.of(made, output.show, cell_m=self.cell)
+        surface = found.surface
+        for path in self.output:
             if path.suffix.lower() in _RASTERS:
-                frame_terrain.write_raster(made, found, path)
+                terrain.write_raster(made, found, path)
             else:
-                prints.save(path, _picture(found.height_m, "m"))
-    written = [str(path) for path in arguments.output]
-    lines = frame_terrain.words(made, found)
-    report = frame_terrain.summary(made, found) | {"notes": lines[1:], "written": written}
-    print(json.dumps(report) if arguments.json else "\n".join([*lines, *(f"written: {path}" for path in written)]))
-    return 0
+                prints.save(path, _picture(surface.height_m, "m"))
+        written = [str(path) for path in self.output]
+        known, sigma = float(surface.known.mean()), _quartiles(surface.sigma_m)
+        values = {"known": known, "height_m": _quartiles(surface.height_m), "sigma_m": sigma, "written": written}
+        told = "" if sigma is None else f", to ±{sigma[1]:.2g} m (median)"
+        line = f"{counted(len(made.photographs), 'frame')} together: {known:.0%} of the map known{told}"
+        return Report(values, [line, *(f"written: {path}" for path in written)], doubted=bool(made.doubts))
 
-
-def _together(arguments: argparse.Namespace, made: Survey, progress: Progress) -> int:
-    """Heights of a flight where all of its frames agree."""
-    for _, why in made.left:
-        print(why, file=sys.stderr)
-    found = terrain.of(made, progress, cell_m=arguments.cell)
-    surface = found.surface
-    for path in arguments.output:
-        if path.suffix.lower() in _RASTERS:
-            terrain.write_raster(made, found, path)
+    def _write(
+        self, path: Path, found: OpenedLightField, made: DepthMap, distances: DistanceMap | None
+    ) -> dict[str, Any]:
+        kind = path.suffix.lower()
+        if kind == ".npz":
+            arrays: dict[str, NDArray[Any]] = {
+                "disparity": made.disparity, "sigma": made.sigma, "confidence": made.confidence,
+            }  # fmt: skip
+            if distances is not None:
+                arrays |= {"distance_m": distances.distance_m, "distance_sigma_m": distances.sigma_m}
+            _whole(path, lambda part: np.savez_compressed(part, allow_pickle=False, **arrays))
+        elif kind == ".pfm":
+            _whole(path, lambda part: exports.write_pfm(part, made.disparity))
+        elif kind in _POINTS:
+            return self._points(path, found, distances)
+        elif distances is not None:
+            prints.save(path, _picture(distances.distance_m, "m"))
         else:
-            prints.save(path, _picture(surface.height_m, "m"))
-    written = [str(path) for path in arguments.output]
-    known, sigma = float(surface.known.mean()), _quartiles(surface.sigma_m)
-    report = {"known": known, "height_m": _quartiles(surface.height_m), "sigma_m": sigma, "written": written}
-    told = "" if sigma is None else f", to ±{sigma[1]:.2g} m (median)"
-    line = f"{counted(len(made.photographs), 'frame')} together: {known:.0%} of the map known{told}"
-    print(json.dumps(report) if arguments.json else "\n".join([line, *(f"written: {path}" for path in written)]))
-    return 0
+            prints.save(path, _picture(made.disparity, "px/view"))
+        return {}
+
+    def _points(self, path: Path, found: OpenedLightField, distances: DistanceMap | None) -> dict[str, Any]:
+        if distances is None:
+            found.metres()  # raises with what is missing
+            raise OpenError("points need distances")
+        station = None
+        if self.flight is not None:
+            frames, tags = photographs.recorded(self.flight)
+            chosen = next((f for f in frames if f.index == self.frame), None)
+            if chosen is None:
+                raise OpenError(f"{self.flight} has no frame {self.frame}")
+            mounting = Mounting.of(layout.read_facts(layout.open_folder(self.flight)))
+            station = photographs.station(chosen, tags.get(chosen.index), mounting)
+        cloud = point_cloud.of(
+            found.field, found.refocus(), distances, most_sigma=self.most_sigma, station=station, crs=self.crs
+        )
+        point_cloud.write(path, cloud)
+        return {"points": len(cloud.points), "withheld": cloud.withheld, "coordinates": cloud.crs or "camera axes"}
+
+
+CLASSES = {"depth": MeasureDepth}
 
 
 def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | None) -> dict[str, Any]:
@@ -179,7 +217,7 @@ def _why_not(found: OpenedLightField) -> str:
     return "distances need --focus, or a calibration with targets (--calibration)"
 
 
-def words(report: dict[str, Any]) -> str:
+def words(report: dict[str, Any]) -> list[str]:
     """The summary as lines."""
 
     def three(values: list[float] | None, unit: str) -> str:
@@ -205,34 +243,7 @@ def words(report: dict[str, Any]) -> str:
         lines.append(
             f"{counted(report['points'], 'point')}, {report['withheld']} omitted for their σ ({report['coordinates']})"
         )
-    lines += [f"written: {path}" for path in report.get("written", [])]
-    return "\n".join(lines)
-
-
-def _write(
-    path: Path,
-    found: OpenedLightField,
-    made: DepthMap,
-    distances: DistanceMap | None,
-    arguments: argparse.Namespace,
-) -> dict[str, Any]:
-    kind = path.suffix.lower()
-    if kind == ".npz":
-        arrays: dict[str, NDArray[Any]] = {
-            "disparity": made.disparity, "sigma": made.sigma, "confidence": made.confidence,
-        }  # fmt: skip
-        if distances is not None:
-            arrays |= {"distance_m": distances.distance_m, "distance_sigma_m": distances.sigma_m}
-        _whole(path, lambda part: np.savez_compressed(part, allow_pickle=False, **arrays))
-    elif kind == ".pfm":
-        _whole(path, lambda part: exports.write_pfm(part, made.disparity))
-    elif kind in _POINTS:
-        return _points(path, found, distances, arguments)
-    elif distances is not None:
-        prints.save(path, _picture(distances.distance_m, "m"))
-    else:
-        prints.save(path, _picture(made.disparity, "px/view"))
-    return {}
+    return lines + [f"written: {path}" for path in report.get("written", [])]
 
 
 def _whole(path: Path, write: Callable[[Path], None]) -> None:
@@ -245,29 +256,6 @@ def _whole(path: Path, write: Callable[[Path], None]) -> None:
         raise OpenError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
     finally:
         part.unlink(missing_ok=True)
-
-
-def _points(
-    path: Path, found: OpenedLightField, distances: DistanceMap | None, arguments: argparse.Namespace
-) -> dict[str, Any]:
-    if distances is None:
-        found.metres()  # raises with what is missing
-        raise OpenError("points need distances")
-    station = None
-    if arguments.flight is not None:
-        if arguments.frame is None:
-            raise OpenError("--flight needs --frame N: the number of this frame in the flight")
-        frames, tags = photographs.recorded(arguments.flight)
-        chosen = next((f for f in frames if f.index == arguments.frame), None)
-        if chosen is None:
-            raise OpenError(f"{arguments.flight} has no frame {arguments.frame}")
-        mounting = Mounting.of(layout.read_facts(layout.open_folder(arguments.flight)))
-        station = photographs.station(chosen, tags.get(chosen.index), mounting)
-    cloud = point_cloud.of(
-        found.field, found.refocus(), distances, most_sigma=arguments.most_sigma, station=station, crs=arguments.crs
-    )
-    point_cloud.write(path, cloud)
-    return {"points": len(cloud.points), "withheld": cloud.withheld, "coordinates": cloud.crs or "camera axes"}
 
 
 def _picture(values: NDArray[np.float32], unit: str) -> prints.Bytes:

@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
-import sys
 import tempfile
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from dappled.cli import status
-from dappled.cli.arguments import whole
 from dappled.cli.status import is_listening, stream_endpoint
+from dappled.cli.verb import Output, Report, SettingsArgument, Verb, flag, option
 from dappled.config import settings as configuration
 from dappled.config.schema import read_toml
 from dappled.config.settings import Settings
@@ -41,28 +37,35 @@ class DaemonRunsError(DappledError):
     """The call needs the camera, but a running daemon holds it."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled doctor\n  dappled doctor --config dappled.toml --test-shot\n"
-        "  dappled doctor --simulate --latency 10\n\nexits 1 if something prevents a flight"
+@dataclass(frozen=True, kw_only=True)
+class ExamineMachine(SettingsArgument, Verb):
+    """Say what is missing on this machine."""
+
+    examples = (
+        "dappled doctor",
+        "dappled doctor --config dappled.toml --test-shot",
+        "dappled doctor --simulate --latency 10",
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the built-in settings)")
-    parser.add_argument("--simulate", action="store_true", help="use a simulated camera and autopilot")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulation (default: 1)")
-    parser.add_argument("--test-shot", action="store_true", help="fire one frame and say go or no-go")
-    parser.add_argument(
-        "--latency", type=whole, nargs="?", const=10, metavar="N", help="measure the latency of N shots (default: 10)"
-    )
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep the test flight here")
-    parser.add_argument(
-        "--watch", action="store_true", help="print which cameras appear and disappear on USB, until Ctrl-C"
-    )
-    parser.add_argument("--json", action="store_true", help="print JSON")
+    notes = "exits 1 if something prevents a flight"
+
+    simulate: bool = flag("--simulate", "use a simulated camera and autopilot")
+    seed: int = option("--seed", "seed of the simulation", 1)
+    test_shot: bool = flag("--test-shot", "fire one frame and say go or no-go")
+    latency: int | None = option(
+        "--latency", "measure the latency of N shots, of 10 without a number", None, const=10, low=1,
+    )  # fmt: skip
+    keep: Path | None = option("--keep", "keep the test flight here", None, metavar="DIR")
+    watch: bool = flag("--watch", "print which cameras appear and disappear on USB, until Ctrl-C")
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        return _watch(output) if self.watch else _examined(self, output)
 
 
-def run(arguments: argparse.Namespace) -> int:
-    if arguments.watch:
-        return _watch()
+CLASSES = {"doctor": ExamineMachine}
+
+
+def _examined(arguments: ExamineMachine, output: Output) -> Report:
     settings = settings_check.checked(configuration.examine_file(arguments.config), by_this_user=False)
     if not arguments.simulate and is_listening(endpoint := stream_endpoint(arguments.config)):
         return _beside(endpoint, settings, arguments)
@@ -77,17 +80,16 @@ def run(arguments: argparse.Namespace) -> int:
         good = not host_checks.next_step(checked)
         lines = _lines(checked)
         if (arguments.test_shot or arguments.latency) and ready:
-            more, shot = _shoot(settings, arguments, folder, truth)
+            more, shot = _shoot(settings, arguments, folder, truth, output)
             lines, report, good = [*lines, *more], {**report, **shot}, good and shot["verdict"] != "no-go"
         elif arguments.test_shot or arguments.latency:
             lines.append("no shot was fired: the camera or the disk is not ready")
     lines.append(_last(checked, report.get("verdict")))
     report["next"] = host_checks.next_step(checked)
-    print(json.dumps(report, indent=2) if arguments.json else "\n".join(lines))
-    return 0 if good else 1
+    return Report(report, lines, failed=not good)
 
 
-def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) -> int:
+def _beside(endpoint: str, settings: Settings, arguments: ExamineMachine) -> Report:
     """Judge go or no-go by the health record of the daemon that runs here, as the console does."""
     if arguments.test_shot or arguments.latency:
         raise DaemonRunsError(
@@ -110,16 +112,12 @@ def _beside(endpoint: str, settings: Settings, arguments: argparse.Namespace) ->
         looked += compared
         verdict = host_checks.verdict([*checks, *compared])
     todo = host_checks.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
-    if arguments.json:
-        facts = _facts([*checks, *looked])
-        found = {"flight": report["flight"], "user": user, "checks": facts, "verdict": verdict, "next": todo}
-        print(json.dumps(found, indent=2))
-    else:
-        whose = "a daemon runs here" if user is None else f"not your own daemon but that of user {user} runs here"
-        print(f"{whose}, flight {report['flight']}; it reports")
-        print("\n".join(_lines([*checks, *looked])))
-        print(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
-    return 1 if verdict == "no-go" else 0
+    whose = "a daemon runs here" if user is None else f"not your own daemon but that of user {user} runs here"
+    lines = [f"{whose}, flight {report['flight']}; it reports", *_lines([*checks, *looked])]
+    lines.append(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
+    facts = _facts([*checks, *looked])
+    found = {"flight": report["flight"], "user": user, "checks": facts, "verdict": verdict, "next": todo}
+    return Report(found, lines, failed=verdict == "no-go")
 
 
 def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoint: str) -> list[Check]:
@@ -180,7 +178,7 @@ def _last(checks: Sequence[Check], verdict: str | None) -> str:
 
 
 def _shoot(
-    settings: Settings, arguments: argparse.Namespace, folder: Path, truth: Path | None
+    settings: Settings, arguments: ExamineMachine, folder: Path, truth: Path | None, output: Output
 ) -> tuple[list[str], dict[str, Any]]:
     """Fire the test shots; the lines and the values of the report."""
     place = folder if arguments.keep is None else arguments.keep
@@ -192,7 +190,7 @@ def _shoot(
     frame: Path | None = None
     problem = ""
     with test_shot.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
-        for _ in tqdm(range(count), unit="shot", disable=None, delay=1.0, file=sys.__stderr__):
+        for _ in output.each(range(count), "shot"):
             pending = daemon.shoot()
             if pending.frame is None:
                 problem = pending.problem or pending.follows
@@ -274,17 +272,18 @@ def _timed(latencies: Sequence[Latency], truth_ms: list[float] | None) -> dict[s
     return {**facts, "lines": lines}
 
 
-def _watch() -> int:
+def _watch(output: Output) -> Report:
     """Print cameras on USB as they appear and disappear."""
     before: list[usb_bus.UsbBody] = []
-    print("watching USB for cameras; press ^C to end", file=sys.stderr)
+    output.remark("watching USB for cameras; press ^C to end")
     while True:
         now = usb_bus.bodies()
         came, went = usb_bus.changes(before, now)
         for word, bodies in (("gone", went), ("here", came)):
             for body in bodies:
                 fires = "can be fired over USB" if body.fires else "USB can't fire it"
-                print(f"{word}  {body.port}  {body.maker} {body.name} ({body.mode}): {fires}", flush=True)
+                facts = {"event": word, **asdict(body)}
+                output.row(facts, f"{word}  {body.port}  {body.maker} {body.name} ({body.mode}): {fires}")
         before = now
         time.sleep(0.5)
 

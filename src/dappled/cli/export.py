@@ -30,15 +30,15 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
     examples = ("dappled export frame.zarr --as hci -o hci/frame",)
     notes = "formats:\n" + "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
 
-    kind: str = option("--as", help="the format", choices=tuple(KINDS))
+    kind: str = option("--as", "the format", choices=tuple(KINDS))
     depth: bool = flag("--depth", "hci, rerun: add a depth map (method combined)")
     lenslet: int = option(
-        "--lenslet", help=f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})", default=0, unit="px", low=0
-    )
+        "--lenslet", f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})", 0, unit="px", low=0,
+    )  # fmt: skip
     disparity: float = option(
-        "--disparity", help="quilt: the disparity that appears in the plane of the screen", default=0.0, metavar="D"
-    )
-    output: Path = option("-o", "--output", help="file or folder to write", metavar="OUT")
+        "--disparity", "quilt: the disparity that appears in the plane of the screen", 0.0, metavar="D",
+    )  # fmt: skip
+    output: Path = option("-o --output", "file or folder to write", metavar="OUT")
 
     def check(self) -> None:
         """See Verb. A quilt's name is known only when it is made."""

@@ -28,12 +28,12 @@ class RangingArguments:
     """What gives distances in metres."""
 
     focus: float | None = option(
-        "--focus", help="distance at which the lens was focused, in metres, or inf", default=None, metavar="M",
-        above=0.0, infinite=True,
+        "--focus", "distance at which the lens was focused, in metres, or inf", None, metavar="M", above=0.0,
+        infinite=True,
     )  # fmt: skip
     calibration: Path | None = option(
-        "--calibration", help="calibration with targets, from dappled calibrate --target", default=None, there=True
-    )
+        "--calibration", "calibration with targets, from dappled calibrate --target", None, there=True,
+    )  # fmt: skip
 
 
 def opened_field(path: Path, output: Output, ranging: RangingArguments | None = None) -> OpenedLightField:

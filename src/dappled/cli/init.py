@@ -52,13 +52,13 @@ class InitSettings(Overwriting, Verb):
     )
 
     file: Path = argument("FILE", "settings file to write (default: dappled.toml)", default=Path("dappled.toml"))
-    camera: str | None = option("--camera", rule=of_setting(CameraSettings, "profile"), default=None)
-    shutter: str | None = option("--shutter", rule=of_setting(CameraSettings, "shutter"), default=None, metavar="LINE")
-    mask: str | None = option("--mask", help="mask profile or TOML file, or none", default=None)
+    camera: str | None = option("--camera", of_setting(CameraSettings, "profile"), None)
+    shutter: str | None = option("--shutter", of_setting(CameraSettings, "shutter"), None, metavar="LINE")
+    mask: str | None = option("--mask", "mask profile or TOML file, or none", None)
     link: str | None = option(
-        "--link", help="the autopilot's link, such as /dev/ttyAMA0,921600, or none", default=None, metavar="URL"
-    )
-    folder: str | None = option("--folder", rule=of_setting(RecordSettings, "directory"), default=None, metavar="DIR")
+        "--link", "the autopilot's link, such as /dev/ttyAMA0,921600, or none", None, metavar="URL",
+    )  # fmt: skip
+    folder: str | None = option("--folder", of_setting(RecordSettings, "directory"), None, metavar="DIR")
 
     def check(self) -> None:
         """See Verb."""

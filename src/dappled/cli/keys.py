@@ -31,7 +31,7 @@ class MakeKeys(Verb):
     )
 
     name: str = argument("NAME", "name of the owner: letters, digits, dot, dash, underscore")
-    folder: Path = option("-o", "--folder", help="folder to write to", default=_HOME, metavar="DIR")
+    folder: Path = option("-o --folder", "folder to write to", _HOME, metavar="DIR")
 
     def run(self, output: Output) -> Report:
         """See Verb."""

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dappled import findings
-from dappled.cli.verb import Report, Verb
+from dappled.cli.verb import Doubtable, Report, Verb
 from dappled.findings import Level
 from dappled.shown import printable
 
@@ -107,11 +107,16 @@ def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
     for one in findings.in_order(report.findings):
         output.remark(f"{'in doubt' if one.level > Level.NOTE else one.level.word}: {findings.told(one)}")
     doubted = report.doubted or findings.worst(report.findings) > Level.NOTE
-    return FAILED if report.failed or (doubted and not getattr(verb, "anyway", False)) else DONE
+    if doubted and not getattr(verb, "anyway", False):
+        if isinstance(verb, Doubtable):
+            extent = f", {report.extent}" if report.extent else ""
+            output.warn(f"written, but in doubt{extent}: see above; --anyway accepts that")
+        return FAILED
+    return FAILED if report.failed else DONE
 
 
 def _with_findings(report: Report) -> Any:
-    if not report.findings or not isinstance(report.values, dict):
+    if not report.findings or not isinstance(report.values, dict) or {"doubts", "findings"} & set(report.values):
         return report.values
     return {**report.values, "findings": [one.to_json() for one in findings.in_order(report.findings)]}
 

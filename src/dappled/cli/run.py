@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import gc
 import signal
 import tempfile
@@ -13,9 +12,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from dappled.cli.arguments import seconds, whole
 from dappled.cli.stop_condition import Asker, StopCondition
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
+from dappled.cli.verb import Output, Report, SettingsArgument, Verb, flag, option
 from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.schema import ConfigError, refuse
@@ -33,68 +32,80 @@ if TYPE_CHECKING:
 _ALL, _CAMERA = "all", "camera"
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n  dappled run --config dappled.toml\n  dappled run --simulate --frames 8\n"
-        "  dappled run --simulate camera --config sitl.toml"
+@dataclass(frozen=True, kw_only=True)
+class RunDaemon(SettingsArgument, Verb):
+    """Run the daemon."""
+
+    examples = (
+        "dappled run --config dappled.toml",
+        "dappled run --simulate --frames 8",
+        "dappled run --simulate camera --config sitl.toml",
     )
-    parser.add_argument("--config", type=Path, metavar="FILE", help="settings file (default: the built-in settings)")
-    parser.add_argument(
-        "--simulate",
-        nargs="?",
-        const=_ALL,
-        choices=(_ALL, _CAMERA),
-        help="use a simulated camera and autopilot (all, the default), no hardware; camera: not the autopilot, which\n"
-        "mavlink.url leads to",
-    )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the simulation (default: 1)")
-    parser.add_argument("--for", dest="seconds", type=seconds, metavar="SECONDS", help="end after this time")
-    parser.add_argument(
-        "--frames", type=whole, metavar="N", help="end after N frames; with --simulate, a ground station asks for them"
-    )
-    parser.add_argument(
-        "--console", metavar="HOST:PORT", help="serve the operator's console here; overrides console.bind"
-    )
-    parser.add_argument("--json", action="store_true", help="print one JSON object per frame")
 
+    simulate: str | None = option(
+        "--simulate", "use a simulated camera and autopilot (all, without another word), no hardware; camera: not "
+        "the autopilot, which mavlink.url leads to", None, const=_ALL, choices=(_ALL, _CAMERA),
+    )  # fmt: skip
+    seed: int = option("--seed", "seed of the simulation", 1)
+    seconds: float | None = option("--for", "end after this time", None, metavar="SECONDS", low=0)
+    frames: int | None = option(
+        "--frames", "end after N frames; with --simulate, a ground station asks for them", None, low=1,
+    )  # fmt: skip
+    console: str | None = option(
+        "--console", "serve the operator's console here; overrides console.bind", None, metavar="HOST:PORT",
+    )  # fmt: skip
+    json: bool = flag("--json", "print one JSON object per frame")
 
-def run(arguments: argparse.Namespace) -> int:
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until there is a daemon that can end in order
-    hung_up = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        return _run(arguments)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-        signal.signal(signal.SIGHUP, hung_up)
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until a daemon can end in order
+        hung_up = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        try:
+            return Report(failed=self._run() != 0)
+        finally:
+            signal.signal(signal.SIGTERM, before)
+            signal.signal(signal.SIGHUP, hung_up)
 
-
-def _run(arguments: argparse.Namespace) -> int:
-    file = configuration.examine_file(arguments.config)
-    settings = file.settings
-    if arguments.console:
-        settings = replace(settings, console=replace(settings.console, bind=arguments.console))
-    if not arguments.simulate:
-        return serve(settings_check.checked(replace(file, settings=settings), starting=True), arguments, None)
-    refuse(file.findings)
-    if arguments.simulate == _CAMERA and not settings.mavlink.url:
-        raise ConfigError(
-            "--simulate camera leaves the autopilot out, and no link leads to another one: "
-            'set [mavlink] url in --config FILE, such as "udpin:127.0.0.1:14550"'
-        )
-    from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
-
-    if arguments.config is None:
-        settings = replace(
-            settings, record=replace(settings.record, directory=str(configuration.SIMULATED_FLIGHTS.absolute()))
-        )
-    with tempfile.TemporaryDirectory(prefix="dappled-") as folder:
-        world = World(seed=arguments.seed, autopilot=arguments.simulate == _ALL, real=True)
-        simulation = Simulation(world, settings, Path(folder))
-        remark(f"simulating {simulation.rig}{', an autopilot' if world.autopilot else ''} and a ground station")
-        with simulation as simulated:
-            return serve(
-                settings_check.checked(replace(file, settings=simulated), starting=True), arguments, simulation
+    def _run(self) -> int:
+        file = configuration.examine_file(self.config)
+        settings = file.settings
+        plan = RunPlan(self.frames, self.seconds, self.config, self.json)
+        if self.console:
+            settings = replace(settings, console=replace(settings.console, bind=self.console))
+        if not self.simulate:
+            return serve(settings_check.checked(replace(file, settings=settings), starting=True), plan, None)
+        refuse(file.findings)
+        if self.simulate == _CAMERA and not settings.mavlink.url:
+            raise ConfigError(
+                "--simulate camera leaves the autopilot out, and no link leads to another one: "
+                'set [mavlink] url in --config FILE, such as "udpin:127.0.0.1:14550"'
             )
+        from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # a real flight doesn't load the mocks
+
+        if self.config is None:
+            settings = replace(
+                settings, record=replace(settings.record, directory=str(configuration.SIMULATED_FLIGHTS.absolute()))
+            )
+        with tempfile.TemporaryDirectory(prefix="dappled-") as folder:
+            world = World(seed=self.seed, autopilot=self.simulate == _ALL, real=True)
+            simulation = Simulation(world, settings, Path(folder))
+            remark(f"simulating {simulation.rig}{', an autopilot' if world.autopilot else ''} and a ground station")
+            with simulation as simulated:
+                checked = settings_check.checked(replace(file, settings=simulated), starting=True)
+                return serve(checked, plan, simulation)
+
+
+CLASSES = {"run": RunDaemon}
+
+
+@dataclass(frozen=True, slots=True)
+class RunPlan:
+    """When a run ends, the settings file that it was started with, and how it prints frames."""
+
+    frames: int | None = None
+    seconds: float | None = None
+    config: Path | None = None
+    as_json: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,13 +125,13 @@ class RunSurroundings:
         return self.simulation.ground_station(self.frames) if self.simulation and self.frames else None
 
 
-def serve(settings: Settings, arguments: argparse.Namespace, simulation: Simulation | None) -> int:
+def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> int:
     """Run the daemon, flight after flight, until a signal, --frames or --for ends it."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
-    frames = FrameLines(as_json=arguments.json)
+    frames = FrameLines(as_json=plan.as_json)
     asked, hung_up = threading.Event(), threading.Event()
-    around = RunSurroundings(camera, simulation, arguments.frames)
-    goal = StopCondition(tally, arguments.frames, arguments.seconds, around=around, clock=SystemClock())
+    around = RunSurroundings(camera, simulation, plan.frames)
+    goal = StopCondition(tally, plan.frames, plan.seconds, around=around, clock=SystemClock())
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """Run one flight. Returns whether another may follow."""
@@ -131,7 +142,7 @@ def serve(settings: Settings, arguments: argparse.Namespace, simulation: Simulat
             """Do what is due after each turn of the working loop. Returns whether to end."""
             if hung_up.is_set():
                 hung_up.clear()
-                _reload(service, arguments, manager)
+                _reload(service, plan, manager)
             if service.healthy():
                 manager.working(time.monotonic_ns())
             problems.look()
@@ -170,11 +181,11 @@ def serve(settings: Settings, arguments: argparse.Namespace, simulation: Simulat
     return 1 if goal.short and not asked.is_set() else 0  # a signal is a regular end
 
 
-def _reload(service: Service, arguments: argparse.Namespace, manager: Notifier) -> None:
+def _reload(service: Service, plan: RunPlan, manager: Notifier) -> None:
     """Answer SIGHUP: read the settings again, apply what can change in flight, and say what can't."""
     manager.reloading(time.monotonic_ns())
     try:
-        changes = service.reload(configuration.load(arguments.config)) if arguments.config else ["there is no --config"]
+        changes = service.reload(configuration.load(plan.config)) if plan.config else ["there is no --config"]
     except DappledError as error:
         changes = [f"the settings stay as they are: {error}"]
     for text in changes or ["nothing has changed"]:

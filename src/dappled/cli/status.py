@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import pwd
 import socket
 import struct
 import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.cli.arguments import seconds
+from dappled.cli.verb import Output, Report, Verb, argument, flag, option
 from dappled.config import settings
 from dappled.daemon.health.go_no_go import state
 from dappled.daemon.health.record import four_numbers
@@ -30,28 +29,24 @@ class NotRunningError(DappledError):
     """No daemon publishes at the endpoint."""
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "example: dappled status --config /etc/dappled/dappled.toml"
-    parser.add_argument(
-        "endpoint", nargs="?", metavar="ENDPOINT", help="ZeroMQ endpoint of the stream (default: from --config)"
-    )
-    parser.add_argument(
-        "--config", type=Path, metavar="FILE", help="the daemon's settings file (default: the built-in settings)"
-    )
-    parser.add_argument(
-        "--timeout", type=seconds, default=3.0, metavar="S", help="how long to wait for a record (default: 3)"
-    )
-    parser.add_argument("--json", action="store_true", help="print the health record as it is published")
+@dataclass(frozen=True, kw_only=True)
+class ShowStatus(Verb):
+    """Show the state of the daemon."""
+
+    examples = ("dappled status --config /etc/dappled/dappled.toml",)
+
+    endpoint: str | None = argument("ENDPOINT", "ZeroMQ endpoint of the stream (default: from --config)", default=None)
+    config: Path | None = option("--config", "the daemon's settings file", None, otherwise="the built-in settings")
+    timeout: float = option("--timeout", "how long to wait for a record", 3.0, unit="s", low=0)
+    json: bool = flag("--json", "print the health record as it is published")
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        record = health(self.endpoint or stream_endpoint(self.config), self.timeout, unit(self.config))
+        return Report(record, screen(record).splitlines())
 
 
-def run(arguments: argparse.Namespace) -> int:
-    endpoint = arguments.endpoint or stream_endpoint(arguments.config)
-    record = health(endpoint, arguments.timeout, unit(arguments.config))
-    if arguments.json:
-        print(json.dumps(record))
-    else:
-        print(screen(record))
-    return 0
+CLASSES = {"status": ShowStatus}
 
 
 def unit(config: Path | None) -> str:

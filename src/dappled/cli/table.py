@@ -7,6 +7,7 @@ GROUPS: dict[str, str] = {
     "keys": "make keys for subscribers on the network, and the console's token",
     "mavlink": "make keys for signed MAVLink links",
     "mask": "the printed mask: make, table, diffraction, design, and plan a flight with it",
+    "flight": "recorded flights: list, show, check, report, coverage, offload, pickup",
     "config": "check or show settings",
 }
 
@@ -42,7 +43,27 @@ VERBS: dict[str, tuple[str, str]] = {
         "write what to print and shoot to settle a camera's carrier law: masks, wedge, target, shot list",
     ),
     "plan": ("mask.plan", "plan a flight: interval, motion blur, frame rate and disk space"),
-    "flight": ("flight", "recorded flights: list, show, check, report, coverage, offload, pickup"),
+    "flight list": ("flight", "list all flights in a folder"),
+    "flight show": ("flight", "show every shot of a flight"),
+    "flight check": ("flight", "check that every byte is intact; exits 1 if not"),
+    "flight report": (
+        "flight",
+        "count which requests became frames; exits 1 if they don't agree, a frame is in doubt, or no shot was",
+    ),
+    "flight seal": ("flight", "check a flight and sign it as it stands; exits 1 if it is not intact"),
+    "flight offload": (
+        "flight",
+        "copy a flight to another disk and prove the copy; remove the frames here on request",
+    ),
+    "flight coverage": (
+        "flight.coverage",
+        "which ground the frames have seen, and the mission that flies the holes again; exits 1 where there are holes",
+    ),
+    "flight gnss": ("flight.gnss", "write the GNSS receiver's stream that a flight recorded (.ubx), for PPK"),
+    "flight pickup": (
+        "flight.pickup",
+        "fetch the files that stayed in the camera; exits 1 if shots still lack files",
+    ),
     "geotag": ("geotag", "write positions and attitudes for other programs: XMP, geo.txt, CSV, GeoJSON"),
     "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
     "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),

@@ -88,7 +88,7 @@ class FrameLines:
         """Print the line of a shot that has ended."""
         fields = {"frame": one.shot.index, "state": "safe" if one.frame else "failed", "problem": one.problem}
         level = logging.WARNING if one.problem else logging.INFO
-        text = frame_json(one) if self._as_json else frame_line(one)
+        text = json.dumps(frame_values(one)) if self._as_json else frame_line(one)
         self._lines.put(_Line(text, level, {name: value for name, value in fields.items() if value != ""}))
 
     def close(self) -> None:
@@ -243,9 +243,9 @@ def frame_line(pending: PendingShot) -> str:
     return "  ".join(words)
 
 
-def frame_json(pending: PendingShot) -> str:
-    """One JSON object: the shot, its frame, tag, carriers and times."""
-    facts = {
+def frame_values(pending: PendingShot) -> dict[str, Any]:
+    """For JSON: the shot, its frame, tag, carriers and times."""
+    return {
         "index": pending.shot.index,
         "cause": asdict(pending.shot.cause),
         "frame": asdict(pending.frame) if pending.frame else None,
@@ -258,4 +258,3 @@ def frame_json(pending: PendingShot) -> str:
         "follows": pending.follows or None,
         "problem": pending.problem or None,
     }
-    return json.dumps(facts)

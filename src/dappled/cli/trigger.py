@@ -53,22 +53,19 @@ class AskForPhotographs(Verb):
     examples = ("dappled trigger --url udpout:127.0.0.1:14550 --count 3 --interval 2",)
 
     url: str | None = option(
-        "--url", help="pymavlink connection string", default=None, metavar="URL", otherwise=DEFAULT_URL, alone="where"
-    )
-    config: Path | None = option(
-        "--config", help="the daemon's settings file, which names its link", default=None, alone="where"
-    )
-    distance: Distance | None = option(
-        "--distance", default=None, parse=_distance, metavar="M",
-        help="have the camera take a photograph every M metres over ground; settings: as its settings say, by distance "
-        "or overlap; off: no more",
+        "--url", "pymavlink connection string", None, metavar="URL", otherwise=DEFAULT_URL, alone="where",
     )  # fmt: skip
-    count: int = option("--count", help="number of photographs", default=1, low=1)
-    interval: float = option("--interval", help="least time between them", default=0.0, unit="s", low=0)
+    config: Path | None = option("--config", "the daemon's settings file, which names its link", None, alone="where")
+    distance: Distance | None = option(
+        "--distance", "have the camera take a photograph every M metres over ground; settings: as its settings say, "
+        "by distance or overlap; off: no more", None, parse=_distance, metavar="M",
+    )  # fmt: skip
+    count: int = option("--count", "number of photographs", 1, low=1)
+    interval: float = option("--interval", "least time between them", 0.0, unit="s", low=0)
     timeout: float = option(
-        "--timeout", help="how long to wait for the camera, and for each photograph", default=60.0, unit="s", low=0
-    )
-    key: Path | None = option("--key", help="the link's signing key (dappled mavlink key)", default=None)
+        "--timeout", "how long to wait for the camera, and for each photograph", 60.0, unit="s", low=0,
+    )  # fmt: skip
+    key: Path | None = option("--key", "the link's signing key (dappled mavlink key)", None)
     json: bool = flag("--json", "print one JSON object per photograph")
 
     def run(self, output: Output) -> Report:

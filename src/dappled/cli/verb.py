@@ -37,6 +37,7 @@ class Argument:
 
     A positional one has no `names`. `above` is an exclusive lower limit. `parse` reads one word, and raises ValueError
     with a sentence. `const` is the value of an option without one. `there`: a file or folder that must exist.
+    `first`: it stands before inherited ones.
     """
 
     rule: Rule
@@ -51,6 +52,7 @@ class Argument:
     group: str = ""
     otherwise: str = ""
     alone: str = ""
+    first: bool = False
 
 
 def argument(metavar: str, help: str, default: Any = MISSING, choices: Sequence[str] = (), **form: Any) -> Any:
@@ -59,28 +61,28 @@ def argument(metavar: str, help: str, default: Any = MISSING, choices: Sequence[
 
 
 def option(
-    *names: str,
-    help: str = "",
+    names: str,
+    meaning: str | Rule,
     default: Any = MISSING,
+    *,
     unit: str = "",
     low: float = -math.inf,
     high: float = math.inf,
     choices: Sequence[Any] = (),
-    rule: Rule | None = None,
     **form: Any,
 ) -> Any:
-    """Declare an option by its names, such as "--output", "-o"; `rule` is that of a setting which is the same thing.
+    """Declare an option by its names, such as "-o --output", and its help, or the rule of a setting that is the same.
 
     `otherwise` says in --help what holds where it isn't given; by default its default value does. Options with one
     `alone` exclude each other.
     """
-    rule = rule or Rule(help, unit, low, high, tuple(choices))
-    return field(default=default, metadata={"argument": Argument(rule, names=names, **form)})
+    rule = meaning if isinstance(meaning, Rule) else Rule(meaning, unit, low, high, tuple(choices))
+    return field(default=default, metadata={"argument": Argument(rule, names=tuple(names.split()), **form)})
 
 
 def flag(name: str, help: str, group: str = "") -> Any:
     """Declare a switch, off unless it is given."""
-    return option(name, help=help, default=False, group=group)
+    return option(name, help, False, group=group)
 
 
 def of_setting(table: type, key: str) -> Rule:
@@ -115,7 +117,8 @@ class Output(Protocol):
 class Report:
     """What a verb did: `values` are printed with --json, `lines` without it.
 
-    The result is in doubt where a finding is above note, or `doubted` says so; `failed` where something was not done.
+    The result is in doubt where a finding is above note, or `doubted` says so, and of what `extent`; `failed` where
+    something was not done.
     """
 
     values: Any = None
@@ -123,6 +126,7 @@ class Report:
     written: Sequence[Path] = ()
     findings: Sequence[Finding] = ()
     doubted: bool = False
+    extent: str = ""
     failed: bool = False
 
 
@@ -167,17 +171,4 @@ class Doubtable:
 class SettingsArgument:
     """--config, for verbs that read the settings."""
 
-    config: Path | None = option("--config", help="settings file", default=None, otherwise="the built-in settings")
-
-
-# Verbs that are functions of a Namespace still are called through this one.
-@dataclass(frozen=True, kw_only=True)
-class OldVerb(Verb):
-    """A verb of before: `configure` and `run` of a module."""
-
-    arguments: Any = None
-    ending: Any = None
-
-    def run(self, output: Output) -> Report:
-        """See Verb."""
-        return Report(failed=bool(self.ending(self.arguments)))
+    config: Path | None = option("--config", "settings file", None, otherwise="the built-in settings")

@@ -31,13 +31,13 @@ class DrawViews(Overwriting, FieldArguments, Verb):
     )
 
     of: str = option(
-        "--of", default="views", choices=("views", "slices", "shifts", "slice-shifts", "epi"),
-        help="views, slices at their carriers, or shifts: how far each view has moved from the middle; slice-shifts: "
-        "the same for slices, as the thesis tried; epi: a row and a column of the picture in each view (Fig 54)",
+        "--of", "views, slices at their carriers, or shifts: how far each view has moved from the middle; "
+        "slice-shifts: the same for slices, as the thesis tried; epi: a row and a column of the picture in each view "
+        "(Fig 54)", "views", choices=("views", "slices", "shifts", "slice-shifts", "epi"),
     )  # fmt: skip
-    row: int | None = option("--row", help="of epi: row of the picture", default=None, otherwise="the middle one")
-    column: int | None = option("--column", help="of epi: column of the picture", default=None)
-    output: Path = option("-o", "--output", help="picture to write")
+    row: int | None = option("--row", "of epi: row of the picture", None, otherwise="the middle one")
+    column: int | None = option("--column", "of epi: column of the picture", None)
+    output: Path = option("-o --output", "picture to write")
 
     def check(self) -> None:
         """See Verb."""

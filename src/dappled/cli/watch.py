@@ -27,21 +27,16 @@ class WatchStream(Verb):
     endpoint: str | None = argument(
         "ENDPOINT", "ZeroMQ endpoint of the stream (default: the daemon's on this machine)", default=None
     )
-    config: Path | None = option("--config", help="the daemon's settings file, which names the endpoint", default=None)
+    config: Path | None = option("--config", "the daemon's settings file, which names the endpoint", None)
     ask: str | None = option(
-        "--ask", help="endpoint that answers requests", default=None, metavar="ENDPOINT",
-        otherwise="the one beside an ipc stream",
+        "--ask", "endpoint that answers requests", None, metavar="ENDPOINT", otherwise="the one beside an ipc stream",
     )  # fmt: skip
-    save: Path | None = option(
-        "--save", help="save each frame's header, slices and mosaic here", default=None, metavar="DIR"
-    )
+    save: Path | None = option("--save", "save each frame's header, slices and mosaic here", None, metavar="DIR")
     from_start: bool = flag("--from-start", "also fetch what the flight has sent already")
-    count: int | None = option("--count", help="end after the slices of N frames", default=None, low=1)
-    timeout: float | None = option(
-        "--timeout", help="give up after this time in silence", default=None, unit="s", low=0
-    )
-    keys: Path | None = option("--keys", help="your NAME.key_secret, for a tcp endpoint", default=None)
-    server_key: Path | None = option("--server-key", help="the vehicle's NAME.key", default=None)
+    count: int | None = option("--count", "end after the slices of N frames", None, low=1)
+    timeout: float | None = option("--timeout", "give up after this time in silence", None, unit="s", low=0)
+    keys: Path | None = option("--keys", "your NAME.key_secret, for a tcp endpoint", None)
+    server_key: Path | None = option("--server-key", "the vehicle's NAME.key", None)
     json: bool = flag("--json", "print one JSON object per line")
 
     def check(self) -> None:

@@ -94,9 +94,10 @@ def test_a_second_card_that_numbers_from_1_again_is_brought_too(
     assert flight.pickup(first) == 1
     assert "3 frames brought, 0 already there, 3 missing" in capfd.readouterr().out
     assert flight.pickup(second, "--pair", "3=DSCF0001.RAF") == 0
-    out = capfd.readouterr().out
+    told = capfd.readouterr()
+    out = told.out
     assert "3 frames brought, 0 already there, 0 missing" in out
-    assert "note:        card: the camera's memory card was changed" in out
+    assert "note: card: the camera's memory card was changed" in told.err
     expected = [(card / name).read_bytes() for card in (first, second) for name in names]
     assert flight.frames() == dict(enumerate(expected))
     (noticed,) = [of_json_text(text) for _, text in flight.events("noticed")]
@@ -145,7 +146,7 @@ def test_a_clock_that_was_set_between_two_cards_is_a_doubt_of_each_frame(
     assert flight.pickup(first) == 1
     assert flight.events("doubt") == []
     assert flight.pickup(second) == 1
-    assert "in doubt:    frame 3: by the body's clock it was taken +3600 s away" in capfd.readouterr().out
+    assert "in doubt: frame 3: by the body's clock it was taken +3600 s away" in capfd.readouterr().err
     assert [index for index, _ in flight.events("doubt")] == [3, 4, 5]
     assert flight.frames() == {
         n: (card / f"DSCF000{k}.RAF").read_bytes()
@@ -175,7 +176,7 @@ def test_by_order_against_the_times_is_told(
     card = flight.card("card", dict(zip(("A.RAF", "B.RAF", "C.RAF", "D.RAF"), taken_s, strict=True)))
     assert flight.pickup(card, "--by-order", "--dry-run", "--anyway") == 0
     assert flight.pickup(card, "--by-order") == 1
-    assert f"in doubt:    {said}" in capfd.readouterr().out
+    assert f"in doubt: {said}" in capfd.readouterr().err
     by_time = sorted(zip(taken_s, "ABCD", strict=True))
     assert flight.frames() == {n: (card / f"{name}.RAF").read_bytes() for n, (_, name) in enumerate(by_time)}
     assert [index for index, _ in flight.events("doubt")] == doubted

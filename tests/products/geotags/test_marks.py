@@ -263,7 +263,7 @@ def test_the_command_writes_marks_and_leaves_the_ledger(tmp_path: Path, capsys: 
     assert [one["properties"].get("pose_source") for one in features] == [None, "interpolated", *["mark"] * 5]
     text = (tmp_path / "out" / "geo.txt").read_text().splitlines()
     assert text[2].split()[7:] == ["0.014", "0.015"]
-    assert main(["geotag", str(flight), "--pos", str(tmp_path / "none.pos"), "-o", str(tmp_path / "other")]) == 1
+    assert main(["geotag", str(flight), "--pos", str(tmp_path / "none.pos"), "-o", str(tmp_path / "other")]) == 2
     assert not (tmp_path / "other").exists()
 
 

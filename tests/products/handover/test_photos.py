@@ -121,7 +121,8 @@ def test_exiv2_reads_exif_and_xmp(photos: Path) -> None:
 
 
 def test_marks_are_of_one_flight(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "another").mkdir()
     two = [str(short_flight.folder), str(tmp_path / "another")]
-    assert main(["batch", *two, "-o", str(tmp_path / "out"), "--as", "photos", "--pos", "x.pos"]) == 1
-    assert "--pos x.pos holds the marks of one flight" in capsys.readouterr().err
+    assert main(["batch", *two, "-o", str(tmp_path / "out"), "--as", "photos", "--pos", str(tmp_path)]) == 2
+    assert f"--pos {tmp_path} holds the marks of one flight" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

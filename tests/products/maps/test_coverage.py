@@ -435,10 +435,9 @@ def test_the_command_writes_what_was_seen_and_the_mission(
     [
         (["--refly", "again.plan"], 2, "--refly needs --area"),
         (["--area", "field.geojson", "--refly", "again.kml"], 2, "opens .plan files only"),
-        (["--area", "field.geojson", "--overlap", "1"], 2, "--overlap 1: give a share from 0 to 0.95"),
         (["--area", "crossed.geojson"], 1, "the area crosses itself"),
-        (["--area", "nowhere.kml"], 1, "nowhere.kml"),
-        (["--terrain", "nowhere.tif"], 1, "nowhere.tif can't be read"),
+        (["--area", "nowhere.kml"], 2, "nowhere.kml: no such file"),
+        (["--terrain", "nowhere.tif"], 2, "nowhere.tif: no such file"),
         (["--area", "field.geojson", "--cell", "9000"], 2, "smaller than a cell"),
         (["--area", "field.geojson", "--cell", "0.001"], 1, "give a --cell of"),
         (["--area", "field.geojson", "--ground", "300"], 1, "below the ground at 300 m"),

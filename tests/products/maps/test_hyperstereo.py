@@ -11,7 +11,8 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
-from dappled.cli import georeference, main
+from dappled.cli import main
+from dappled.cli.placing import Refining
 from dappled.products.maps import terrain
 from dappled.products.maps.hyperstereo import HyperstereoError, Surface
 from tests.products.survey import seen
@@ -92,9 +93,9 @@ def test_a_flight_is_swept_from_the_command_line(
 ) -> None:
     """Frames of the ground by rays stand for a flight's."""
     flight = seen.flown(PLACES)
-    monkeypatch.setattr(georeference, "placed", lambda *_, **__: flight)
+    monkeypatch.setattr(Refining, "placed", lambda *_, **__: flight)
     out = tmp_path / "swept.tif"
-    assert main(["depth", "--flight", "F", "--together", "--cell", "0.2", "-o", str(out), "--json"]) == 0
+    assert main(["depth", "--flight", ".", "--together", "--cell", "0.2", "-o", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     with rasterio.open(out) as read:
         height, sigma = read.read()

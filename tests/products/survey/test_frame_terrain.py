@@ -189,8 +189,8 @@ def test_frames_are_fused_by_their_sigmas() -> None:
     ("more", "said"),
     [
         (["depth"], "name a decoded light field, or a flight with --flight"),
-        (["depth", "--flight", "FLIGHT", "-o", "x.ply"], "written as .tif (GeoTIFF) or .png, .jpg"),
-        (["depth", "field.zarr", "--cell", "1"], "--cell goes with --flight FLIGHT and no light field"),
+        (["depth", "--flight", ".", "-o", "x.ply"], "written as .tif (GeoTIFF) or .png, .jpg"),
+        (["depth", ".", "--cell", "1"], "--cell goes with --flight FLIGHT and no light field"),
     ],
 )
 def test_wrong_calls_get_a_sentence(more: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,8 @@ import rasterio
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled.cli import georeference, main
+from dappled.cli import main
+from dappled.cli.placing import Refining
 from dappled.errors import DappledError
 from dappled.products.maps.ground import Flat
 from dappled.products.survey import synthetic_aperture
@@ -109,13 +110,13 @@ def test_planes_are_cut_to_common_ground() -> None:
 def placed(monkeypatch: pytest.MonkeyPatch) -> None:
     """The command line finds frames of the ground by rays, in place of a flight's."""
     flight = seen.flown(LINE[:3])
-    monkeypatch.setattr(georeference, "placed", lambda *_, **__: flight)
+    monkeypatch.setattr(Refining, "placed", lambda *_, **__: flight)
 
 
 def test_a_flight_is_refocused_from_the_command_line(
     placed: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["refocus", "--flight", "F", "--cell", "0.1"]
+    words = ["refocus", "--flight", ".", "--cell", "0.1"]
     assert main([*words, "--combine", "median", "-o", str(tmp_path / "ground.tif"), "--json"]) == 0
     (plane,) = json.loads(capsys.readouterr().out)["planes"]
     assert plane["aperture_m"] == pytest.approx(1.0, abs=0.01)
@@ -133,11 +134,11 @@ def test_two_frames_are_a_stereo_pair_from_the_command_line(
     placed: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "pair.png"
-    assert main(["refocus", "--flight", "F", "--eyes", "anaglyph", "-o", str(out)]) == 0
+    assert main(["refocus", "--flight", ".", "--eyes", "anaglyph", "-o", str(out)]) == 0
     assert "m apart, 3% of the distance" in capsys.readouterr().out
     with Image.open(out) as picture:
         assert picture.mode == "RGB"
-    assert main(["refocus", "--flight", "F", "--eyes", "anaglyph", "--height", "1", "-o", str(tmp_path / "b.png")]) == 2
+    assert main(["refocus", "--flight", ".", "--eyes", "anaglyph", "--height", "1", "-o", str(tmp_path / "b.png")]) == 2
     assert "leave --height and --combine out" in capsys.readouterr().err
 
 
@@ -145,9 +146,9 @@ def test_two_frames_are_a_stereo_pair_from_the_command_line(
     ("more", "said"),
     [
         (["-o", "x.png"], "name a decoded light field, or a flight with --flight"),
-        (["--flight", "F", "--alpha", "1", "-o", "x.png"], "--alpha is of a light field"),
-        (["--flight", "F", "--height", "0", "1", "-o", "x.tif"], "x.tif holds one height"),
-        (["field.zarr", "--height", "2", "-o", "x.png"], "--height goes with --flight FLIGHT and no light field"),
+        (["--flight", ".", "--alpha", "1", "-o", "x.png"], "--alpha is of a light field"),
+        (["--flight", ".", "--height", "0", "1", "-o", "x.tif"], "x.tif holds one height"),
+        ([".", "--height", "2", "-o", "x.png"], "--height goes with --flight FLIGHT and no light field"),
     ],
 )
 def test_wrong_calls_get_a_sentence(more: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:

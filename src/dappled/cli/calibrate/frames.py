@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-
-from tqdm import tqdm
+from typing import NamedTuple
 
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
@@ -32,20 +30,25 @@ class CalibrationView:
     overridden: tuple[Finding, ...] = ()
 
 
-def view_of(
-    darkroom: Darkroom,
-    path: Path,
-    focal_length_mm: float | None = None,
-    f_number: float | None = None,
-    anyway: bool = False,
-) -> CalibrationView:
-    """What one frame shows, `anyway` also where it is not linear. Raises DappledError where it can't be used."""
+class Given(NamedTuple):
+    """What a call says of all its frames; `anyway` takes also those that are not linear."""
+
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+    anyway: bool = False
+
+
+_NOTHING = Given()
+
+
+def view_of(darkroom: Darkroom, path: Path, given: Given = _NOTHING) -> CalibrationView:
+    """What one frame shows. Raises DappledError where it can't be used."""
     raw = darkroom.read(path)
-    length, stop = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
+    length, stop = given.focal_length_mm or raw.focal_length_mm, given.f_number or raw.f_number
     if length is None or stop is None:
         raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
     bent = not_linear(raw, exposure(raw), of=Subject("calibration frame", path.name))
-    if bent and not anyway:
+    if bent and not given.anyway:
         raise DarkroomError(f"{path}: {'; '.join(told(one, one.subject) for one in bent)}; --anyway calibrates with it")
     camera = darkroom.camera(raw.camera_model or "")
     stops = camera.f_numbers
@@ -53,7 +56,7 @@ def view_of(
         plane = darkroom.plane(raw)
         shape = plane.shape[0], plane.shape[1]
         shown = lattice_of(
-            CalibrationFrame(plane, length, stop, _focal_sigma_mm(raw, focal_length_mm), stops and stops[1]),
+            CalibrationFrame(plane, length, stop, _focal_sigma_mm(raw, given.focal_length_mm), stops and stops[1]),
             _optics(darkroom, camera, shape),
             workers=2,
         )
@@ -61,18 +64,14 @@ def view_of(
 
 
 def views_of(
-    darkroom: Darkroom,
-    paths: Sequence[Path],
-    focal_length_mm: float | None = None,
-    f_number: float | None = None,
-    anyway: bool = False,
+    darkroom: Darkroom, paths: Iterable[Path], given: Given
 ) -> tuple[list[CalibrationView], list[tuple[Path, DappledError]]]:
     """What the good frames show, and why the others can't be used. All are of one camera and size."""
     good: list[CalibrationView] = []
     bad: list[tuple[Path, DappledError]] = []
-    for path in tqdm(paths, unit="frame", disable=len(paths) < 2 or not sys.stderr.isatty(), file=sys.__stderr__):
+    for path in paths:
         try:
-            one = view_of(darkroom, path, focal_length_mm, f_number, anyway)
+            one = view_of(darkroom, path, given)
             if good and (one.shape, one.model) != (good[0].shape, good[0].model):
                 first, this = (f"{s.model} {s.shape[0]} × {s.shape[1]}" for s in (good[0], one))
                 raise DarkroomError(f"{path} is of another camera or size ({this}, the first {first})")

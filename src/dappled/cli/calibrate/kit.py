@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,18 +10,19 @@ from typing import Any
 
 import numpy as np
 
-from dappled.cli import decode_arguments
-from dappled.cli.calibrate.frames import fit_views, view_of, views_of
+from dappled.cli.calibrate.frames import Given, fit_views, view_of, views_of
+from dappled.cli.frame_arguments import frames
 from dappled.cli.mask.kit import KIT
-from dappled.config.schema import ConfigError, read_toml
+from dappled.cli.verb import Output, Report
+from dappled.config.schema import read_toml
 from dappled.decode.calibration import Calibration, report
 from dappled.decode.calibration.law_choice import CALIBRATION, EXPLAINED_BINS, LawFit
 from dappled.decode.errors import NoCarriers
 from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.raw_file import exposure
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, to_rows, told
+from dappled.findings import Code, Finding, Level, Subject, finding, to_rows
 
 BARE = Subject("bare frames")
 _MASKS = ("diagonal", "full")
@@ -54,43 +52,51 @@ class MaskResult:
     shots: tuple[tuple[float, float], ...] = ()
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Add --kit."""
-    group = parser.add_argument_group("test kit")
-    group.add_argument("--kit", type=Path, metavar="FOLDER", help="read the frames that were shot by the list of\n"
-                       "`dappled mask kit`, from its folders bare, diagonal and full: which law, distance and print\n"
-                       "scale; exit 1 if in doubt. -o is optional, and takes the full mask's calibration")  # fmt: skip
+@dataclass(frozen=True, slots=True)
+class KitCall:
+    """What a call says of a kit: its folder, how its frames are read, and what it says of them all."""
+
+    folder: Path
+    recipe: Recipe
+    given: Given
+
+    def darkroom(self, name: str) -> Darkroom:
+        """What reads the frames of one mask. Raises DappledError."""
+        made = Darkroom(replace(self.recipe, mask=str(self.folder / f"{name}.toml")))
+        made.check()
+        return made
+
+    def shows_full(self, path: Path) -> bool:
+        """Whether a frame shows the full mask."""
+        full = self.darkroom("full")
+        try:
+            view_of(full, path, self.given)
+        except DappledError:
+            return False
+        return True
 
 
-def run(arguments: argparse.Namespace) -> int:
-    """Read a kit's frames, print what they say, and write the full mask's calibration where it was asked for."""
-    folder: Path = arguments.kit
-    if arguments.frames or arguments.mask:
-        raise ConfigError("--kit reads the frames and masks of its folder: leave out FRAME and --mask")
-    asked = _asked(folder)
-    if arguments.camera == "auto":
-        arguments.camera = asked["camera"]
+def calibrated(call: KitCall, to: Path | None, output: Output) -> Report:
+    """Read a kit's frames, and write the full mask's calibration where it was asked for."""
+    asked = _asked(call.folder)
+    if call.recipe.camera == "auto":
+        call = replace(call, recipe=replace(call.recipe, camera=asked["camera"]))
     doubts: list[Finding] = []
-    results = {name: _mask_result(arguments, folder, name, asked, doubts) for name in _MASKS}
-    bare = _bare(arguments, folder, results["diagonal"].shots, doubts)
+    results = {name: _mask_result(call, name, asked, doubts) for name in _MASKS}
+    bare = _bare(call, results["diagonal"].shots, doubts)
     agree = _agree(results, doubts)
     full = results["full"].found
-    written = False
-    if arguments.output is not None and full is not None and (arguments.anyway or not doubts):
-        written = True
-        calibration_files.save(arguments.output, replace(full, overridden=tuple(doubts)))
-    if arguments.json:
-        print(json.dumps(_values(arguments.camera, results, bare, agree, doubts), indent=2))
-    else:
-        print("\n".join(_lines(results, bare, agree)))
-        if written:
-            print(f"written to {' and '.join(map(str, calibration_files.pair(arguments.output)))}")
-    for doubt in doubts:
-        print(f"dappled calibrate: in doubt: {told(doubt)}", file=sys.stderr)
-    if arguments.output is not None and full is None:
-        print("dappled calibrate: nothing written: no frame of the full mask shows its carriers", file=sys.stderr)
-    unwritten = arguments.output is not None and not written
-    return 1 if unwritten or (doubts and not arguments.anyway) else 0
+    lines = _lines(results, bare, agree)
+    written = to is not None and full is not None and (call.given.anyway or not doubts)
+    if written:
+        assert to is not None
+        assert full is not None
+        calibration_files.save(to, replace(full, overridden=tuple(doubts)))
+        lines.append(f"written to {' and '.join(map(str, calibration_files.pair(to)))}")
+    if to is not None and full is None:
+        output.warn("nothing written: no frame of the full mask shows its carriers")
+    values = _values(call.recipe.camera, results, bare, agree, doubts)
+    return Report(values, lines, findings=doubts, failed=to is not None and not written)
 
 
 def _asked(folder: Path) -> dict[str, Any]:
@@ -110,24 +116,15 @@ def _asked(folder: Path) -> dict[str, Any]:
     return asked
 
 
-def _darkroom(arguments: argparse.Namespace, folder: Path, name: str) -> Darkroom:
-    arguments.mask = str(folder / f"{name}.toml")
-    darkroom = Darkroom(decode_arguments.recipe(arguments))
-    darkroom.check()
-    return darkroom
-
-
 def _frames(folder: Path) -> list[Path]:
-    return decode_arguments.frames([folder]) if folder.is_dir() and any(folder.iterdir()) else []
+    return frames([folder]) if folder.is_dir() and any(folder.iterdir()) else []
 
 
-def _mask_result(
-    arguments: argparse.Namespace, folder: Path, name: str, asked: dict[str, Any], doubts: list[Finding]
-) -> MaskResult:
+def _mask_result(call: KitCall, name: str, asked: dict[str, Any], doubts: list[Finding]) -> MaskResult:
     """What the frames of one mask show. Appends what speaks against it to `doubts`."""
-    darkroom = _darkroom(arguments, folder, name)
-    paths = _frames(folder / name)
-    seen, bad = views_of(darkroom, paths, arguments.focal_length, arguments.f_number, arguments.anyway)
+    darkroom = call.darkroom(name)
+    paths = _frames(call.folder / name)
+    seen, bad = views_of(darkroom, paths, call.given)
     blank = [none for _, error in bad if (none := _no_carriers(error)) is not None]
     unseen = [none for none in blank if not none.expected]
     doubts += [_refused(path, error) for path, error in bad if (no := _no_carriers(error)) is None or no.expected]
@@ -140,8 +137,8 @@ def _mask_result(
             doubts += [finding(Code.KIT_UNSEEN, mask), replace(unseen[0].finding, subject=mask, level=Level.CAUTION)]
         return MaskResult(0, len(unseen), None, None)
     if name == "diagonal":
-        doubts += _mixed_up(arguments, folder, paths, bad)
-    found = fit_views(darkroom, seen, choose_law=not arguments.law)
+        doubts += _mixed_up(call, paths, bad)
+    found = fit_views(darkroom, seen, choose_law=not call.recipe.law)
     stated = darkroom.camera(seen[0].model).mask_distance_mm
     fits = report.law_fits(found, stated)
     fit = next((one for one in fits if one.law == found.law and one.explains), None)
@@ -187,28 +184,16 @@ def _among(shots: Sequence[tuple[float, float]], length_mm: float, f_number: flo
     )
 
 
-def _mixed_up(
-    arguments: argparse.Namespace, folder: Path, paths: Sequence[Path], bad: Sequence[tuple[Path, DappledError]]
-) -> list[Finding]:
-    """That a frame of the diagonal mask shows the full one: films or folders were exchanged."""
+def _mixed_up(call: KitCall, paths: Sequence[Path], bad: Sequence[tuple[Path, DappledError]]) -> list[Finding]:
+    """A sentence where a frame of the diagonal mask shows the full one: films or folders were exchanged."""
     path = next(one for one in paths if one not in {refused for refused, _ in bad})
-    if not _shows_full(arguments, folder, path):
+    if not call.shows_full(path):
         return []
     return [finding(Code.KIT_MIXED_UP, Subject("calibration frame", path.name))]
 
 
-def _shows_full(arguments: argparse.Namespace, folder: Path, path: Path) -> bool:
-    """Whether a frame shows the full mask."""
-    full = _darkroom(arguments, folder, "full")
-    try:
-        view_of(full, path, arguments.focal_length, arguments.f_number, arguments.anyway)
-    except DappledError:
-        return False
-    return True
-
-
 def _untold(found: Calibration, fits: Sequence[LawFit], fit: LawFit | None) -> list[Finding]:
-    """What the frames of one mask leave open."""
+    """What the frames of one mask leave open, in sentences."""
     if fit is None:
         verdict = [] if found.verdict is None else [replace(found.verdict, level=Level.CAUTION)]
         geometric = next(one for one in fits if one.law == "geometric")
@@ -227,16 +212,14 @@ def _untold(found: Calibration, fits: Sequence[LawFit], fit: LawFit | None) -> l
     return open_
 
 
-def _bare(
-    arguments: argparse.Namespace, folder: Path, shown: Sequence[tuple[float, float]], doubts: list[Finding]
-) -> int:
+def _bare(call: KitCall, shown: Sequence[tuple[float, float]], doubts: list[Finding]) -> int:
     """How many frames without a mask show no carriers where a mask would. Every mask has the diagonal one's lattice.
 
     `shown` are the focal lengths and f-numbers at which the diagonal mask's own frames show them: what the f-number
     alone leaves open, since stops differ in shape.
     """
-    darkroom = _darkroom(arguments, folder, "diagonal")
-    paths = _frames(folder / "bare")
+    darkroom = call.darkroom("diagonal")
+    paths = _frames(call.folder / "bare")
     if not paths:
         doubts.append(finding(Code.KIT_NO_BARE, BARE))
     clean = blind = 0
@@ -246,12 +229,12 @@ def _bare(
             doubts.append(finding(Code.KIT_DARK, frame, share=mean))
             continue
         try:
-            view_of(darkroom, path, arguments.focal_length, arguments.f_number, arguments.anyway)
+            view_of(darkroom, path, call.given)
         except DappledError as error:
             none = _no_carriers(error)
             if none is None:
                 doubts.append(_refused(path, error))
-            elif _shows_full(arguments, folder, path):
+            elif call.shows_full(path):
                 doubts.append(finding(Code.KIT_FULL_FILM_IN, frame))
             elif none.expected or _among(shown, none.focal_length_mm, none.f_number):
                 clean += 1

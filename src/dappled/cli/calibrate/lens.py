@@ -2,41 +2,64 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import tomli_w
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from dappled import durable
+from dappled.cli.verb import Output, Report, flag, option
 from dappled.config import profiles
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
-from dappled.errors import DappledError, counted
+from dappled.errors import counted
 from dappled.products import chessboard
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Add --lens and --board."""
-    group = parser.add_argument_group("lens, for maps")
-    group.add_argument("--lens", action="store_true", help="the frames show a chessboard: calibrate the lens, and\n"
-                       "write a copy of the camera's profile with the result (-o FILE.toml)")  # fmt: skip
-    group.add_argument("--board", default="9x6", metavar="CxR", help="inner corners of the chessboard (default: 9x6)")
+def board_size(text: str) -> tuple[int, int]:
+    """The inner corners of a chessboard, columns and rows, written as 9x6. Raises ValueError."""
+    columns, _, rows = text.lower().partition("x")
+    size = (int(columns), int(rows)) if columns.isdecimal() and rows.isdecimal() else (0, 0)
+    if min(size) < 3:
+        raise ValueError(f"{text}: give its inner corners as 9x6, at least three on each side")
+    return size
 
 
-def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_length_mm: float | None) -> int:
-    """Calibrate from frames, which are decoded if a mask is named. Prints the names of frames without the board."""
-    if output.suffix != ".toml":
-        raise DarkroomError(f"{output}: the name of a camera profile must end in .toml")
-    size = _board(board)
+@dataclass(frozen=True, kw_only=True)
+class LensArguments:
+    """--lens and --board."""
+
+    lens: bool = flag(
+        "--lens",
+        "the frames show a chessboard: calibrate the lens, and write a copy of the camera's profile with the result "
+        "(-o FILE.toml)",
+        group="lens, for maps",
+    )
+    board: tuple[int, int] = option(
+        "--board", "inner corners of the chessboard", (9, 6), metavar="CxR", group="lens, for maps", parse=board_size,
+        otherwise="9x6",
+    )  # fmt: skip
+
+
+def calibrated(
+    recipe: Recipe,
+    frames: list[Path],
+    size: tuple[int, int],
+    to: Path,
+    *,
+    focal_length_mm: float | None,
+    output: Output,
+) -> Report:
+    """Calibrate from frames, which are decoded if a mask is named. Says the names of frames without the board."""
+    if to.suffix != ".toml":
+        raise DarkroomError(f"{to}: the name of a camera profile must end in .toml")
     darkroom = Darkroom(recipe)
     seen: list[NDArray[np.float64]] = []
     grids: list[NDArray[np.float64]] = []
     model, shape = "", (0, 0)
     length = focal_length_mm
-    for path in tqdm(frames, unit="frame", disable=not sys.stderr.isatty(), file=sys.__stderr__):
+    for path in output.each(frames):
         image, grid, raw_shape, raw_model, raw_length = _picture(darkroom, path, focal_length_mm)
         if shape not in ((0, 0), raw_shape):
             raise DarkroomError(
@@ -49,7 +72,7 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
         shape, model, length = raw_shape, raw_model, length or raw_length
         found = chessboard.corners(image, size)
         if found is None:
-            print(f"no whole board in {path}", file=sys.stderr)
+            output.remark(f"no whole board in {path}")
             continue
         seen.append(found)
         grids.append(grid)
@@ -57,13 +80,16 @@ def run(recipe: Recipe, frames: list[Path], board: str, output: Path, focal_leng
         raise DarkroomError("the frames don't say their focal length: give --focal-length")
     profile = darkroom.camera(model)
     fit = chessboard.fit(seen, grids, board=size, sensor=profile.sensor(shape), focal_length_mm=length)
-    write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, output)
+    write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, to)
     y, x = fit.lens.principal_point_mm
-    print(f"{counted(fit.boards, 'board')}, residual {fit.residual_um:.2f} µm on the chip")
-    print(f"v = {fit.lens.v_mm:.3f} ± {fit.v_sigma_mm:.3f} mm at {length:g} mm, principal point {y:+.3f}, {x:+.3f} mm")
-    print("k1, k2, p1, p2, k3 = " + ", ".join(f"{number:.5g}" for number in fit.lens.distortion))
-    print(f"written to {output}")
-    return 0
+    lines = [
+        f"{counted(fit.boards, 'board')}, residual {fit.residual_um:.2f} µm on the chip",
+        f"v = {fit.lens.v_mm:.3f} ± {fit.v_sigma_mm:.3f} mm at {length:g} mm, principal point {y:+.3f}, {x:+.3f} mm",
+        "k1, k2, p1, p2, k3 = " + ", ".join(f"{number:.5g}" for number in fit.lens.distortion),
+        f"written to {to}",
+    ]
+    values = {"boards": fit.boards, "residual_um": fit.residual_um, "v_mm": fit.lens.v_mm, "v_sigma_mm": fit.v_sigma_mm}
+    return Report({**values, "principal_point_mm": [y, x], "distortion": list(fit.lens.distortion)}, lines)
 
 
 def _picture(
@@ -88,7 +114,7 @@ def _size(shape: tuple[int, int]) -> str:
     return f"{shape[0]} × {shape[1]} px"
 
 
-def write(camera: str, lens: profiles.Lens, output: Path) -> None:
+def write(camera: str, lens: profiles.Lens, to: Path) -> None:
     """Write a copy of a camera's profile with this lens."""
     tables = profiles.tables(camera, "cameras")
     others = [one for one in tables.get("lens", []) if abs(one["focal_length_mm"] / lens.focal_length_mm - 1) > 0.01]
@@ -99,15 +125,4 @@ def write(camera: str, lens: profiles.Lens, output: Path) -> None:
         "distortion": list(lens.distortion),
     }
     tables["lens"] = sorted([*others, mine], key=lambda one: float(one["focal_length_mm"]))
-    durable.write_file(output, tomli_w.dumps(tables).encode())
-
-
-def _board(text: str) -> tuple[int, int]:
-    columns, _, rows = text.lower().partition("x")
-    try:
-        size = int(columns), int(rows)
-    except ValueError:
-        size = 0, 0
-    if min(size) < 3:
-        raise DappledError(f"--board {text}: give its inner corners as 9x6, at least three on each side")
-    return size
+    durable.write_file(to, tomli_w.dumps(tables).encode())

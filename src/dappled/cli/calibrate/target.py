@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
-import sys
+from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import tomli_w
-from tqdm import tqdm
 
 from dappled import durable
+from dappled.cli.verb import Output, Report
 from dappled.config import profiles
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.depth.ranging import Target, fit_targets, target_shift
@@ -21,33 +21,39 @@ from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 
 
-def add(parser: argparse.ArgumentParser) -> None:
-    """Add --target."""
-    group = parser.add_argument_group("distances")
-    group.add_argument("--target", nargs="+", type=float, metavar="M",
-                       help="frames at full aperture show a textured target in the middle, at these distances, one\n"
-                       "per frame: fit disparity to distance (Eq 5), on top of --calibration")  # fmt: skip
-
-
-def run(recipe: Recipe, frames: list[Path], metres: list[float], output: Path, focal_length_mm: float | None) -> int:
+def calibrated(
+    recipe: Recipe,
+    frames: list[Path],
+    metres: Sequence[float],
+    to: Path,
+    *,
+    focal_length_mm: float | None,
+    output: Output,
+) -> Report:
     """Fit the ranging, and write it with the calibration that the frames were decoded with."""
-    if output.suffix != ".toml":
-        raise DarkroomError(f"{output}: the name of a calibration with distances must end in .toml")
-    found, targets = from_frames(recipe, frames, metres, focal_length_mm)
-    written = _write(recipe, output, found)
+    if to.suffix != ".toml":
+        raise DarkroomError(f"{to}: the name of a calibration with distances must end in .toml")
+    found, targets = from_frames(recipe, frames, metres, focal_length_mm, output)
+    written = _write(recipe, to, found)
+    lines = []
     for path, target in zip(frames, targets, strict=True):
         clear = target.shift_px - found.offset_px
         says = f"{found.gain_px_m / clear:.3g} m" if clear > 0 else "beyond infinity"
-        print(f"{path.name}: {target.distance_m:g} m, {target.shift_px:.3f} px over the aperture; by the fit {says}")
-    print(f"shift = {found.gain_px_m:.4g} px·m / distance {found.offset_px:+.4g} px, from {found.source}")
+        shift = f"{target.shift_px:.3f} px over the aperture; by the fit {says}"
+        lines.append(f"{path.name}: {target.distance_m:g} m, {shift}")
+    lines.append(f"shift = {found.gain_px_m:.4g} px·m / distance {found.offset_px:+.4g} px, from {found.source}")
     if found.offset_px < 0:
-        print(f"in focus at {-found.gain_px_m / found.offset_px:.4g} m")
-    print(f"written to {', '.join(map(str, written))}")
-    return 0
+        lines.append(f"in focus at {-found.gain_px_m / found.offset_px:.4g} m")
+    lines.append(f"written to {', '.join(map(str, written))}")
+    return Report({"targets": [asdict(one) for one in targets], **found.to_dict()}, lines)
 
 
 def from_frames(
-    recipe: Recipe, frames: list[Path], metres: list[float], focal_length_mm: float | None = None
+    recipe: Recipe,
+    frames: list[Path],
+    metres: Sequence[float],
+    focal_length_mm: float | None = None,
+    output: Output | None = None,
 ) -> tuple[Ranging, list[Target]]:
     """The ranging that frames of targets show, and what each target showed. Raises DappledError."""
     if len(frames) != len(metres):
@@ -58,7 +64,7 @@ def from_frames(
     stops: set[float | None] = set()
     lengths: set[float | None] = set()
     lens: Ranging | None = None
-    bar = tqdm(frames, unit="frame", disable=not sys.stderr.isatty(), file=sys.__stderr__)
+    bar = frames if output is None else output.each(frames)
     for path, distance in zip(bar, metres, strict=True):
         made = darkroom.decode(path, focal_length_mm=focal_length_mm, joint_views=False)  # depth is made from slices
         field = OpenedLightField(made.light_field, path)

@@ -2,59 +2,65 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import durable
-from dappled.cli.arguments import refuse_existing
+from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, option
 from dappled.drivers.gnss import recorded
 from dappled.drivers.gnss.ubx import RXM_RAWX, TIM_TM2, UbxStream
 from dappled.errors import counted
-from dappled.findings import Code, Finding, Subject, finding, to_rows, told
+from dappled.findings import Code, Finding, Subject, finding, to_rows
 from dappled.flight import FlightError, disk_error, layout, log_reading
 
 
-def run(flight: Path, arguments: argparse.Namespace) -> int:
-    folder = layout.open_folder(flight)
-    output: Path = arguments.output or Path(f"{folder.name}.ubx")
-    refuse_existing(arguments, output)
-    doubts: list[Finding] = []
-    stream, kinds = UbxStream(), Counter[tuple[int, int]]()
-    size = 0
+@dataclass(frozen=True, kw_only=True)
+class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
+    """Write the GNSS receiver's stream."""
 
-    def fill(fd: int) -> None:
-        nonlocal size
-        packets = (packet for _, _, packet in log_reading.read_telemetry(folder.telemetry, doubts.append))
-        for data in recorded.stream(packets):
-            size += len(data)
-            view = memoryview(data)
-            while view:
-                view = view[os.write(fd, view) :]
-            kinds.update(message.kind for message in stream.feed(data))
-        if not size:
-            raise FlightError(
-                f"{flight} holds no stream of a GNSS receiver: name its port in gnss.port before the flight"
-            )
+    examples = (f"dappled flight gnss {EXAMPLE} -o rover.ubx",)
 
-    try:
-        durable.fill_file(output, fill)
-    except OSError as error:
-        raise disk_error("write", output, error) from error
-    if not kinds[RXM_RAWX]:
-        doubts.append(finding(Code.GNSS_NO_RAW, Subject("file", str(output))))
-    if stream.bad:
-        doubts.append(finding(Code.GNSS_DAMAGED, Subject("file", str(output)), messages=stream.bad))
-    values = {"bytes": size, "messages": kinds.total(), "raw": kinds[RXM_RAWX], "marks": kinds[TIM_TM2]}
-    if arguments.json:
-        print(json.dumps({"file": str(output), **values, "doubts": to_rows(doubts)}, indent=2))
-        return 0
-    print(
-        f"{output}: {size / 1e6:.2f} MB, {counted(kinds.total(), 'UBX message')}, "
-        f"{kinds[RXM_RAWX]} of raw measurements, {kinds[TIM_TM2]} of time marks"
-    )
-    for doubt in doubts:
-        print(f"in doubt: {told(doubt)}")
-    return 0
+    output: Path | None = option("-o --output", "the file", None, otherwise="the flight's name.ubx")
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        flight = self.chosen(output)
+        folder = layout.open_folder(flight)
+        to = self.output or Path(f"{folder.name}.ubx")
+        self.refuse_existing(to)
+        doubts: list[Finding] = []
+        stream, kinds = UbxStream(), Counter[tuple[int, int]]()
+        size = 0
+
+        def fill(fd: int) -> None:
+            nonlocal size
+            packets = (packet for _, _, packet in log_reading.read_telemetry(folder.telemetry, doubts.append))
+            for data in recorded.stream(packets):
+                size += len(data)
+                view = memoryview(data)
+                while view:
+                    view = view[os.write(fd, view) :]
+                kinds.update(message.kind for message in stream.feed(data))
+            if not size:
+                raise FlightError(
+                    f"{flight} holds no stream of a GNSS receiver: name its port in gnss.port before the flight"
+                )
+
+        try:
+            durable.fill_file(to, fill)
+        except OSError as error:
+            raise disk_error("write", to, error) from error
+        if not kinds[RXM_RAWX]:
+            doubts.append(finding(Code.GNSS_NO_RAW, Subject("file", str(to))))
+        if stream.bad:
+            doubts.append(finding(Code.GNSS_DAMAGED, Subject("file", str(to)), messages=stream.bad))
+        values = {"bytes": size, "messages": kinds.total(), "raw": kinds[RXM_RAWX], "marks": kinds[TIM_TM2]}
+        size_mb = f"{size / 1e6:.2f} MB, {counted(kinds.total(), 'UBX message')}"
+        line = f"{to}: {size_mb}, {kinds[RXM_RAWX]} of raw measurements, {kinds[TIM_TM2]} of time marks"
+        return Report({"file": str(to), **values, "doubts": to_rows(doubts)}, [line], findings=doubts)
+
+
+CLASSES = {"flight gnss": WriteReceiverStream}

@@ -2,85 +2,109 @@
 
 from __future__ import annotations
 
-import argparse
-import json
-import sys
-from pathlib import Path
-
-from tqdm import tqdm
+from dataclasses import dataclass
+from typing import Any
 
 from dappled import findings
 from dappled.cli import sealing
+from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
+from dappled.cli.verb import Doubtable, Output, Report, Verb, flag, option
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.errors import counted
-from dappled.findings import Level
 
 
-def run(flight: Path, arguments: argparse.Namespace) -> int:
-    source = parse_source(arguments.source, PtpSource)
-    choice = Choice(dict(arguments.pair), arguments.offset, arguments.any_clock, arguments.by_order)
-    try:
-        with tqdm(unit="B", unit_scale=True, disable=None, delay=1.0, desc="comparing", file=sys.__stderr__) as bar:
-            proposal = pickup.propose(flight, source, choice, bar.update)
-        picked = None
-        if not arguments.dry_run:
-            total = sum(group.main.size for _, group in proposal.pairs)
-            key = sealing.key_of(arguments.config)
-            with tqdm(total=total, unit="B", unit_scale=True, disable=None, delay=1.0, file=sys.__stderr__) as bar:
-                picked = pickup.bring(flight, source, proposal, clock=TimeOfDayClock(), key=key, progress=bar.update)
-    finally:
-        source.close()
-    (_print_json if arguments.json else _print)(flight, proposal, picked)
-    return 1 if proposal.missing or (proposal.doubts and not arguments.anyway) else 0
+def _pair(text: str) -> tuple[int, str]:
+    index, equals, name = text.partition("=")
+    if not equals or not index.isdecimal() or not name:
+        raise ValueError(f"{text!r} is not INDEX=NAME, as in 17=DSCF0042.RAF")
+    return int(index), name
 
 
-def _print(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
+@dataclass(frozen=True, kw_only=True)
+class PickUpFiles(Doubtable, FlightArgument, Verb):
+    """Fetch the files that stayed in the camera."""
+
+    examples = (
+        "dappled flight pickup --from /media/card/DCIM --dry-run",
+        f"dappled flight pickup {EXAMPLE} --from usb: --pair 17=DSCF0042.RAF",
+    )
+
+    source: str = option("--from", "folder, storage, usb: or a libgphoto2 port", metavar="SOURCE")
+    offset: float | None = option("--offset", "the camera's clock minus UTC, if you know it", None, metavar="S")
+    any_clock: bool = flag("--any-clock", "the camera's clock may be off by more than a day")
+    by_order: bool = flag("--by-order", "pair files and shots in order, if there are as many of both")
+    pair: tuple[tuple[int, str], ...] = option(
+        "--pair", "this file belongs to this shot", (), append=True, parse=_pair, metavar="INDEX=NAME",
+    )  # fmt: skip
+    dry_run: bool = flag("--dry-run", "only say what would be done")
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        flight = self.chosen(output)
+        source = parse_source(self.source, PtpSource)
+        choice = Choice(dict(self.pair), self.offset, self.any_clock, self.by_order)
+        try:
+            with output.bar(None, "B", "comparing") as add:
+                proposal = pickup.propose(flight, source, choice, add)
+            picked = None
+            if not self.dry_run:
+                total = sum(group.main.size for _, group in proposal.pairs)
+                key = sealing.key_of(self.config)
+                with output.bar(total, "B") as add:
+                    picked = pickup.bring(flight, source, proposal, clock=TimeOfDayClock(), key=key, progress=add)
+        finally:
+            source.close()
+        return Report(
+            _values(flight.name, proposal, picked),
+            _lines(flight.name, proposal, picked),
+            findings=proposal.findings,
+            failed=bool(proposal.missing),
+        )
+
+
+CLASSES = {"flight pickup": PickUpFiles}
+
+
+def _lines(flight: str, proposal: Proposal, picked: Picked | None) -> list[str]:
     word = "would be" if picked is None else "is"
+    lines = []
     for index, group in proposal.pairs:
         others = "".join(f" and {other.base}" for other in group.companions)
-        print(f"shot {index:6d}  {word} {group.main.name}{others}  {proposal.reasons[index]}")
-    for one in findings.in_order(proposal.findings):
-        print(f"{'in doubt' if one.level > Level.NOTE else one.level.word}:".ljust(13) + findings.told(one))
-    for index in proposal.missing:
-        print(f"shot {index:6d}  has no file")
+        lines.append(f"shot {index:6d}  {word} {group.main.name}{others}  {proposal.reasons[index]}")
+    lines += [f"shot {index:6d}  has no file" for index in proposal.missing]
     if proposal.strangers:
         count = counted(len(proposal.strangers), "file")
-        print(f"{count} without a shot in this flight, the first {proposal.strangers[0]}")
-    for text in picked.zooms if picked else ():
-        print(f"zoom:        {text}")
+        lines.append(f"{count} without a shot in this flight, the first {proposal.strangers[0]}")
+    lines += [f"zoom:        {text}" for text in (picked.zooms if picked else ())]
     done = f"{counted(len(proposal.pairs), 'frame')} {'to bring' if picked is None else 'brought'}"
-    print(f"{flight.name}: {done}, {proposal.there_already} already there, {len(proposal.missing)} missing")
+    lines.append(f"{flight}: {done}, {proposal.there_already} already there, {len(proposal.missing)} missing")
     if proposal.doubts:
-        print("resolve what is in doubt with --pair INDEX=NAME, --offset S or --by-order; no file was guessed")
+        lines.append("resolve what is in doubt with --pair INDEX=NAME, --offset S or --by-order; no file was guessed")
+    return lines
 
 
-def _print_json(flight: Path, proposal: Proposal, picked: Picked | None) -> None:
-    print(
-        json.dumps(
+def _values(flight: str, proposal: Proposal, picked: Picked | None) -> dict[str, Any]:
+    return {
+        "flight": flight,
+        "dry_run": picked is None,
+        "pairs": [
             {
-                "flight": flight.name,
-                "dry_run": picked is None,
-                "pairs": [
-                    {
-                        "index": index,
-                        "file": group.main.name,
-                        "companions": [other.name for other in group.companions],
-                        "reason": proposal.reasons[index],
-                    }
-                    for index, group in proposal.pairs
-                ],
-                "findings": [one.to_json() for one in findings.in_order(proposal.findings)],
-                "doubts": findings.to_rows(findings.in_order(proposal.doubts)),
-                "missing": list(proposal.missing),
-                "strangers": list(proposal.strangers),
-                "there_already": proposal.there_already,
-                "camera_clock_minus_utc_s": proposal.offset_s,
-                "zooms": list(picked.zooms) if picked else [],
-            },
-            indent=2,
-        )
-    )
+                "index": index,
+                "file": group.main.name,
+                "companions": [other.name for other in group.companions],
+                "reason": proposal.reasons[index],
+            }
+            for index, group in proposal.pairs
+        ],
+        "findings": [one.to_json() for one in findings.in_order(proposal.findings)],
+        "doubts": findings.to_rows(findings.in_order(proposal.doubts)),
+        "missing": list(proposal.missing),
+        "strangers": list(proposal.strangers),
+        "there_already": proposal.there_already,
+        "camera_clock_minus_utc_s": proposal.offset_s,
+        "zooms": list(picked.zooms) if picked else [],
+    }

@@ -2,111 +2,114 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Any
 
 from dappled import durable
-from dappled.cli.arguments import add_overwrite, refuse_existing
-from dappled.cli.georeference import Bar
+from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, option
 from dappled.daemon.stream.curve import read_private
 from dappled.errors import DappledError, counted
 from dappled.flight import disk_error
 from dappled.products.handover import nodeodm
 from dappled.products.handover.nodeodm import NodeOdm, NodeOdmError
-from dappled.products.maps.georeference import Progress
 
 TOKEN_VARIABLE = "DAPPLED_NODEODM_TOKEN"  # noqa: S105  # a name
 
 
-class HandOverCallError(DappledError):
-    """What was asked for does not go together; one sentence."""
+def _option(word: str) -> tuple[str, str]:
+    name, sign, value = word.partition("=")
+    if not sign or not name:
+        raise ValueError(f"{word}: write an option as name=value, such as dsm=true")
+    return name, value
 
-    exit_code: ClassVar[int] = 2
 
+@dataclass(frozen=True, kw_only=True)
+class HandOver(Overwriting, Verb):
+    """Give pictures to another program."""
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n"
-        "  dappled batch FLIGHT --as photos -o products\n"
-        "  dappled hand-over odm http://127.0.0.1:3000 products/FLIGHT/photos/jpeg\n"
-        "  dappled hand-over odm http://10.0.0.9:3000 products/FLIGHT/photos/jpeg --option dsm=true -o model.zip\n"
-        "  dappled hand-over odm http://10.0.0.9:3000 --task UUID -o model.zip"
+    examples = (
+        "dappled hand-over odm http://127.0.0.1:3000 products/FLIGHT/photos/jpeg    (of dappled batch --as photos)",
+        "dappled hand-over odm http://10.0.0.9:3000 products/FLIGHT/photos/jpeg --option dsm=true -o model.zip",
+        "dappled hand-over odm http://10.0.0.9:3000 --task UUID -o model.zip",
     )
-    parser.add_argument("program", choices=("odm",), help="odm: OpenDroneMap, by its NodeODM server")
-    parser.add_argument("url", metavar="URL", help="the server, such as http://127.0.0.1:3000")
-    parser.add_argument("pictures", type=Path, nargs="?", metavar="DIR",
-                        help="folder of pictures with positions, and geo.txt if it is there")  # fmt: skip
-    parser.add_argument("--task", metavar="UUID", help="go on with a task that was sent earlier, in place of DIR")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE.zip",
-                        help="wait for the task's end, and put its results here (default: only start it)")  # fmt: skip
-    add_overwrite(parser)
-    parser.add_argument("--name", metavar="WORDS", help="the task's name (default: the folder's)")
-    parser.add_argument("--option", action="append", default=[], metavar="NAME=VALUE",
-                        help="an option of OpenDroneMap, such as dsm=true; may be repeated")  # fmt: skip
-    parser.add_argument("--token-file", type=Path, metavar="FILE",
-                        help=f"file with the server's token, where it wants one, for no other user to read (or set "
-                             f"{TOKEN_VARIABLE}); the command line is for every user to read")  # fmt: skip
-    parser.add_argument("--json", action="store_true", help="print the task as JSON")
+
+    program: str = argument("PROGRAM", "odm: OpenDroneMap, by its NodeODM server", choices=("odm",))
+    url: str = argument("URL", "the server, such as http://127.0.0.1:3000")
+    pictures: Path | None = argument(
+        "DIR", "folder of pictures with positions, and geo.txt if it is there", default=None, there=True
+    )
+    task: str | None = option(
+        "--task", "go on with a task that was sent earlier, in place of DIR", None, metavar="UUID",
+    )  # fmt: skip
+    output: Path | None = option(
+        "-o --output", "wait for the task's end, and put its results here", None, metavar="FILE.zip",
+        otherwise="only start it",
+    )  # fmt: skip
+    name: str | None = option("--name", "the task's name", None, metavar="WORDS", otherwise="the folder's")
+    options: tuple[tuple[str, str], ...] = option(
+        "--option", "an option of OpenDroneMap, such as dsm=true; may be repeated", (), append=True, parse=_option,
+        metavar="NAME=VALUE",
+    )  # fmt: skip
+    token_file: Path | None = option(
+        "--token-file", "file with the server's token, where it wants one, for no other user to read (or set "
+        f"{TOKEN_VARIABLE}); the command line is for every user to read", None, there=True,
+    )  # fmt: skip
+
+    def check(self) -> None:
+        """See Verb."""
+        if (self.pictures is None) == (self.task is None):
+            raise CallError("name the folder of the pictures, or with --task one that was sent earlier, not both")
+        if self.task is not None and (self.options or self.name):
+            raise CallError(f"--name and --option are those of a new task: leave them out with --task {self.task}")
+        if self.output is not None:
+            self.refuse_existing(self.output)
+            _check_writable(self.output)
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        return self.hand_over(output, time.sleep, time.monotonic)
+
+    def hand_over(self, output: Output, wait: Callable[[float], None], now_s: Callable[[], float]) -> Report:
+        """Do the work by a clock. Raises DappledError."""
+        server = NodeOdm(self.url, _token(self.token_file), wait=wait, now_s=now_s)
+        files = [] if self.pictures is None else nodeodm.pictures(self.pictures)
+        version = server.version()
+        task = self.task
+        if task is None:
+            assert self.pictures is not None
+            task = server.begin(self.name or self.pictures.absolute().name, dict(self.options))
+            output.remark(f"task {task} at {self.url}")
+            server.send(task, files, output.show)
+        if self.output is not None:
+            self._results(server, task, self.output, output)
+        facts: dict[str, Any] = {"task": task, "url": self.url, "pictures": len(files), "version": version}
+        facts["file"] = None if self.output is None else str(self.output)
+        said = f"task {task}: {counted(len(files), 'file')} sent to {self.url} (NodeODM {version})"
+        if self.pictures is None:
+            now = server.task(task)
+            facts |= {"progress": now.progress, "completed": now.completed}
+            said = f"task {task} at {self.url} (NodeODM {version}): {now.words}"
+        return Report(facts, [said + ("" if self.output is None else f", results in {self.output}")])
+
+    def _results(self, server: NodeOdm, task: str, to: Path, output: Output) -> None:
+        """Raises NodeOdmError and DappledError, which say how to go on; an interruption says it, too."""
+        again = f"dappled hand-over odm {self.url} --task {task} -o {to}"
+        try:
+            server.results(task, to, output.show)
+        except nodeodm.NoAnswerError as error:
+            raise NodeOdmError(f"{error}; the task goes on there. Fetch it later: {again}") from None
+        except OSError as error:
+            raise DappledError(f"{disk_error('write', to, error)}; then fetch the results: {again}") from None
+        except KeyboardInterrupt:
+            output.remark(f"the task goes on there. Fetch it later: {again}")
+            raise
 
 
-def run(
-    arguments: argparse.Namespace,
-    *,
-    wait: Callable[[float], None] = time.sleep,
-    now_s: Callable[[], float] = time.monotonic,
-) -> int:
-    if (arguments.pictures is None) == (arguments.task is None):
-        raise HandOverCallError("name the folder of the pictures, or with --task one that was sent earlier, not both")
-    if arguments.task is not None and (arguments.option or arguments.name):
-        raise HandOverCallError(
-            f"--name and --option are those of a new task: leave them out with --task {arguments.task}"
-        )
-    options = dict(_option(word) for word in arguments.option)
-    if arguments.output is not None:
-        refuse_existing(arguments, arguments.output)
-        _check_writable(arguments.output)
-    server = NodeOdm(arguments.url, _token(arguments.token_file), wait=wait, now_s=now_s)
-    files = [] if arguments.pictures is None else nodeodm.pictures(arguments.pictures)
-    version = server.version()
-    with Bar() as progress:
-        if arguments.pictures is None:
-            task = arguments.task
-        else:
-            task = server.begin(arguments.name or arguments.pictures.absolute().name, options)
-            print(f"task {task} at {arguments.url}", file=sys.stderr)
-            server.send(task, files, progress)
-        if arguments.output is not None:
-            _results(server, task, arguments, progress)
-    facts = {"task": task, "url": arguments.url, "pictures": len(files), "version": version}
-    facts["file"] = None if arguments.output is None else str(arguments.output)
-    said = f"task {task}: {counted(len(files), 'file')} sent to {arguments.url} (NodeODM {version})"
-    if arguments.pictures is None:
-        now = server.task(task)
-        facts |= {"progress": now.progress, "completed": now.completed}
-        said = f"task {task} at {arguments.url} (NodeODM {version}): {now.words}"
-    said += "" if arguments.output is None else f", results in {arguments.output}"
-    print(json.dumps(facts) if arguments.json else said)
-    return 0
-
-
-def _results(server: NodeOdm, task: str, arguments: argparse.Namespace, progress: Progress) -> None:
-    """Raises NodeOdmError and DappledError, which say how to go on; an interruption says it, too."""
-    again = f"dappled hand-over odm {arguments.url} --task {task} -o {arguments.output}"
-    try:
-        server.results(task, arguments.output, progress)
-    except nodeodm.NoAnswerError as error:
-        raise NodeOdmError(f"{error}; the task goes on there. Fetch it later: {again}") from None
-    except OSError as error:
-        raise DappledError(f"{disk_error('write', arguments.output, error)}; then fetch the results: {again}") from None
-    except KeyboardInterrupt:
-        print(f"the task goes on there. Fetch it later: {again}", file=sys.stderr)
-        raise
+CLASSES = {"hand-over": HandOver}
 
 
 def _check_writable(path: Path) -> None:
@@ -127,10 +130,3 @@ def _token(file: Path | None) -> str:
     if file is None:
         return os.environ.get(TOKEN_VARIABLE, "")
     return read_private(file.expanduser(), "the server's token").strip()
-
-
-def _option(word: str) -> tuple[str, str]:
-    name, sign, value = word.partition("=")
-    if not sign or not name:
-        raise DappledError(f"--option {word}: write an option as name=value, such as dsm=true")
-    return name, value

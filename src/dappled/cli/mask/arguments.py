@@ -15,10 +15,10 @@ from dappled.decode.optics import LAWS, MaskedOptics, Sensor, lenses
 class SensorArguments:
     """--camera and --shape."""
 
-    camera: str = option("--camera", help="camera profile or TOML file")
+    camera: str = option("--camera", "camera profile or TOML file")
     shape: tuple[int, int] | None = option(
-        "--shape", help="raw shape", default=None, low=1, metavar=("H", "W"), otherwise="the camera's first"
-    )
+        "--shape", "raw shape", None, low=1, metavar=("H", "W"), otherwise="the camera's first",
+    )  # fmt: skip
 
     def sensor(self) -> Sensor:
         """The camera's sensor for --shape, or for its first raw shape. Raises ConfigError for a shape it hasn't."""
@@ -30,10 +30,10 @@ class SensorArguments:
 class InstallationArguments(SensorArguments):
     """--law and --mask-distance."""
 
-    law: str = option("--law", help="carrier law", default="", choices=tuple(LAWS), otherwise="the camera's")
+    law: str = option("--law", "carrier law", "", choices=tuple(LAWS), otherwise="the camera's")
     mask_distance: float | None = option(
-        "--mask-distance", help="distance from mask to sensor", default=None, metavar="MM", otherwise="the camera's"
-    )
+        "--mask-distance", "distance from mask to sensor", None, metavar="MM", otherwise="the camera's",
+    )  # fmt: skip
 
     def installed(self, mask: str) -> tuple[CameraProfile, MaskedOptics]:
         """The camera, and what these arguments name with a mask. Raises ConfigError."""
@@ -46,10 +46,9 @@ class InstallationArguments(SensorArguments):
 class AltitudeArguments(SensorArguments):
     """--altitude, and the camera that is flown there."""
 
-    altitude: float = option("--altitude", help="height above ground", unit="m")
+    altitude: float = option("--altitude", "height above ground", unit="m")
     focal_length: float | None = option(
-        "--focal-length", help="focal length of the lens", default=None, metavar="MM",
-        otherwise="the camera's, if it has only one",
+        "--focal-length", "focal length of the lens", None, metavar="MM", otherwise="the camera's, if it has only one",
     )  # fmt: skip
 
     def camera_set(self) -> tuple[CameraProfile, Sensor, float]:

@@ -26,22 +26,20 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         "dappled mask design --altitude 40 --camera fujifilm-s5200 --focal-length 13 --f-number 3.5 --film 16k",
     )
 
-    f_number: float = option("--f-number", help="f-number of the lens", default=5.6, above=0.0)
-    views: int = option("--views", help="views per axis, odd", default=5, low=1)
-    film: str = option("--film", help="film to print it on", default="4k", choices=tuple(FILMS))
+    f_number: float = option("--f-number", "f-number of the lens", 5.6, above=0.0)
+    views: int = option("--views", "views per axis, odd", 5, low=1)
+    film: str = option("--film", "film to print it on", "4k", choices=tuple(FILMS))
     mask_distance: float | None = option(
-        "--mask-distance", help="distance from mask to sensor", default=None, metavar="MM",
+        "--mask-distance", "distance from mask to sensor", None, metavar="MM",
         otherwise="free; with --mask the camera's",
     )  # fmt: skip
     room: float | None = option(
-        "--room", help="largest distance of the mask from the sensor", default=None, metavar="MM", otherwise="10"
-    )
-    wavelength: float = option("--wavelength", help="wavelength of the light", default=550.0, unit="nm")
-    shift_error: float = option("--shift-error", help="σ of a measured shift between views", default=0.02, unit="px")
-    mask: str | None = option("--mask", help="print the best focal length of this installed mask instead", default=None)
-    picture: Path | None = option(
-        "--picture", help="draw the carriers on the spectrum", default=None, metavar="FILE.png"
-    )
+        "--room", "largest distance of the mask from the sensor", None, metavar="MM", otherwise="10",
+    )  # fmt: skip
+    wavelength: float = option("--wavelength", "wavelength of the light", 550.0, unit="nm")
+    shift_error: float = option("--shift-error", "σ of a measured shift between views", 0.02, unit="px")
+    mask: str | None = option("--mask", "print the best focal length of this installed mask instead", None)
+    picture: Path | None = option("--picture", "draw the carriers on the spectrum", None, metavar="FILE.png")
 
     def check(self) -> None:
         """See Verb."""

@@ -23,22 +23,16 @@ class PredictDiffraction(Overwriting, Verb):
 
     examples = ("dappled mask diffraction --mask mask-1 --measured bench.csv",)
 
-    mask: str = option("--mask", help="mask profile or TOML file")
-    wavelength: float = option(
-        "--wavelength", help="wavelength of the laser", default=laser_bench.THESIS_WAVELENGTH_NM, unit="nm"
-    )
-    distance: float = option(
-        "--distance", help="distance from mask to wall", default=laser_bench.THESIS_DISTANCE_M, unit="m"
-    )
-    measured: Path | None = option(
-        "--measured", help="x_mm,y_mm of the measured spots", default=None, metavar="CSV", there=True
-    )
-    tolerance: float = option("--tolerance", help="tolerance of the measurement", default=0.5, unit="mm")
-    picture: Path | None = option("--picture", help="draw what the wall should show", default=None, metavar="FILE.png")
+    mask: str = option("--mask", "mask profile or TOML file")
+    wavelength: float = option("--wavelength", "wavelength of the laser", laser_bench.THESIS_WAVELENGTH_NM, unit="nm")
+    distance: float = option("--distance", "distance from mask to wall", laser_bench.THESIS_DISTANCE_M, unit="m")
+    measured: Path | None = option("--measured", "x_mm,y_mm of the measured spots", None, metavar="CSV", there=True)
+    tolerance: float = option("--tolerance", "tolerance of the measurement", 0.5, unit="mm")
+    picture: Path | None = option("--picture", "draw what the wall should show", None, metavar="FILE.png")
     image: Path | None = option(
-        "--image", help="draw it for this mask image (a positive) instead of the design", default=None, there=True
-    )
-    beam: float = option("--beam", help="diameter of the laser's beam", default=2.0, unit="mm", low=0.01, high=20)
+        "--image", "draw it for this mask image (a positive) instead of the design", None, there=True,
+    )  # fmt: skip
+    beam: float = option("--beam", "diameter of the laser's beam", 2.0, unit="mm", low=0.01, high=20)
 
     def check(self) -> None:
         """See Verb."""

@@ -35,10 +35,10 @@ class WriteTestKit(Overwriting, Verb):
     examples = ("dappled mask kit kit --camera canon-eos-450d --film 8k",)
 
     folder: Path = argument("FOLDER", "folder to write, made where it is missing")
-    camera: str = option("--camera", help="camera profile or TOML file")
-    film: str = option("--film", help="film of the mask", default="8k", choices=tuple(FILMS))
+    camera: str = option("--camera", "camera profile or TOML file")
+    film: str = option("--film", "film of the mask", "8k", choices=tuple(FILMS))
     frequency: float = option(
-        "--frequency", help="fundamental frequency of both masks", default=11.38, metavar="1/MM", above=0.0,
+        "--frequency", "fundamental frequency of both masks", 11.38, metavar="1/MM", above=0.0,
         otherwise="Mask 2's 11.38",
     )  # fmt: skip
     negative: bool = flag("--negative", "write negatives (Eq 13), for negative film")

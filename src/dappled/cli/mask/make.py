@@ -26,47 +26,38 @@ class MakeMask(Overwriting, Verb):
     examples = ("dappled mask make mask-2 --negative -o mask-2.png",)
 
     mask: str | None = argument("P", "mask profile or TOML file (or --period/--frequency)", default=None)
-    output: Path = option("-o", "--output", help="image to write, .png or .tif")
-    film: str = option("--film", help="4k, 8k, 16k, or WIDTHxHEIGHT in pixels", default="4k", metavar="F")
-    density: float | None = option(
-        "--density", help="pixel density of a film given as WIDTHxHEIGHT", default=None, unit="px/mm"
-    )
+    output: Path = option("-o --output", "image to write, .png or .tif")
+    film: str = option("--film", "4k, 8k, 16k, or WIDTHxHEIGHT in pixels", "4k", metavar="F")
+    density: float | None = option("--density", "pixel density of a film given as WIDTHxHEIGHT", None, unit="px/mm")
     size_mm: tuple[float, float] | None = option(
-        "--size-mm", help="size of the mask, in the middle of the film", default=None, metavar=("H", "W"),
+        "--size-mm", "size of the mask, in the middle of the film", None, metavar=("H", "W"),
         otherwise="the whole film",
     )  # fmt: skip
     period: float | None = option(
-        "--period", help="longest period, in pixels of the film", default=None, metavar="PX", low=1e-2, high=1e6
-    )
+        "--period", "longest period, in pixels of the film", None, metavar="PX", low=1e-2, high=1e6,
+    )  # fmt: skip
     frequency: float | None = option(
-        "--frequency",
-        help="fundamental frequency, instead of --period",
-        default=None,
-        metavar="1/MM",
-        low=1e-3,
-        high=1e5,
-    )
-    p: int | None = option(
-        "--p", help="number of harmonics", default=None, low=1, high=20, otherwise="the profile's, else 2"
-    )
+        "--frequency", "fundamental frequency, instead of --period", None, metavar="1/MM", low=1e-3, high=1e5,
+    )  # fmt: skip
+    p: int | None = option("--p", "number of harmonics", None, low=1, high=20, otherwise="the profile's, else 2")
     pattern: Pattern | None = option(
-        "--pattern", help="Eq 11's product, or Fig 14's diagonals", default=None, choices=("full", "diagonal"),
+        "--pattern", "Eq 11's product, or Fig 14's diagonals", None, choices=("full", "diagonal"),
         otherwise="the profile's, else full",
     )  # fmt: skip
     harmonics: Harmonics | None = option(
-        "--harmonics", help="1, 2, 3 … or 1, 2, 4 …", default=None, choices=("linear", "octave"),
+        "--harmonics", "1, 2, 3 … or 1, 2, 4 …", None, choices=("linear", "octave"),
         otherwise="the profile's, else linear",
     )  # fmt: skip
     negative: bool = flag("--negative", "write the negative (Eq 13), for black-and-white negative film")
-    bits: int = option("--bits", help="bits per pixel", default=8, choices=(8, 16))
+    bits: int = option("--bits", "bits per pixel", 8, choices=(8, 16))
     curve: Path | None = option(
-        "--curve", help="level,density measured on this film's wedge; the image compensates for it", default=None,
-        metavar="CSV", there=True,
+        "--curve", "level,density measured on this film's wedge; the image compensates for it", None, metavar="CSV",
+        there=True,
     )  # fmt: skip
     drawable_only: bool = flag("--drawable-only", "leave out harmonics finer than two pixels")
     wedge: int | None = option(
-        "--wedge", help="write a step wedge instead, of 21 steps or so many", default=None, const=21, metavar="STEPS"
-    )
+        "--wedge", "write a step wedge instead, of 21 steps or so many", None, const=21, metavar="STEPS",
+    )  # fmt: skip
 
     def check(self) -> None:
         """See Verb."""

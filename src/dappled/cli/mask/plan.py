@@ -22,13 +22,13 @@ class PlanFlight(AltitudeArguments, Verb):
         "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --focal-length 13   (the same)",
     )
 
-    speed: float = option("--speed", help="speed over ground", unit="m/s")
-    overlap: float = option("--overlap", help="overlap along the line", default=0.8, metavar="SHARE")
-    sidelap: float = option("--sidelap", help="overlap between lines", default=0.6, metavar="SHARE")
-    exposure: float = option("--exposure", help="exposure time", default=0.001, unit="s")
-    hours: float = option("--hours", help="flight time", default=1.0, unit="h")
-    frame_mb: float = option("--frame-mb", help="size of a raw file", default=18.0, unit="MB", low=1e-3, high=10_000)
-    mask: str | None = option("--mask", help="mask profile, for the ground sample distance of the views", default=None)
+    speed: float = option("--speed", "speed over ground", unit="m/s")
+    overlap: float = option("--overlap", "overlap along the line", 0.8, metavar="SHARE")
+    sidelap: float = option("--sidelap", "overlap between lines", 0.6, metavar="SHARE")
+    exposure: float = option("--exposure", "exposure time", 0.001, unit="s")
+    hours: float = option("--hours", "flight time", 1.0, unit="h")
+    frame_mb: float = option("--frame-mb", "size of a raw file", 18.0, unit="MB", low=1e-3, high=10_000)
+    mask: str | None = option("--mask", "mask profile, for the ground sample distance of the views", None)
     sideways: bool = flag("--sideways", "the width of the frame, not its height, lies along the flight line")
 
     def check(self) -> None:

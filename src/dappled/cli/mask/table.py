@@ -21,16 +21,16 @@ class TabulateCarriers(InstallationArguments, Verb):
 
     examples = ("dappled mask table --mask mask-2 --camera fujifilm-s5200",)
 
-    mask: str = option("--mask", help="mask profile or TOML file")
+    mask: str = option("--mask", "mask profile or TOML file")
     focal_length: tuple[float, ...] = option(
-        "--focal-length", help="focal lengths of the lens", default=(), metavar="MM", otherwise="those of Table 11"
-    )
-    rotation: float = option("--rotation", help="rotation of the mask", default=0.0, metavar="DEGREES")
+        "--focal-length", "focal lengths of the lens", (), metavar="MM", otherwise="those of Table 11",
+    )  # fmt: skip
+    rotation: float = option("--rotation", "rotation of the mask", 0.0, metavar="DEGREES")
     carriers: bool = flag("--carriers", "list every carrier with its row and column, including crossed ones")
     visibility: bool = flag("--visibility", "predicted strength of each order on the sensor, and what takes it")
     f_number: tuple[float, ...] = option(
-        "--f-number", help="stops for --visibility", default=(8.0, 11.0, 16.0, 22.0, 32.0), low=0.5, high=256
-    )
+        "--f-number", "stops for --visibility", (8.0, 11.0, 16.0, 22.0, 32.0), low=0.5, high=256,
+    )  # fmt: skip
 
     def check(self) -> None:
         """See Verb."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import webbrowser
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dappled.cli.open import example
+from dappled.cli.verb import Output, Report, Verb, argument, flag, option
 from dappled.config.settings import ConsoleSettings
 from dappled.daemon.console import offline, process
 from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFieldFrames
 from dappled.daemon.pipeline.decode_process import DecodeProcess
+from dappled.decode.optics import LAWS
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, counted
 from dappled.flight import layout
@@ -23,53 +24,65 @@ from dappled.products.mounting import Mounting
 from dappled.workers import Loop
 
 _GIVEN = ("camera", "mask", "law", "calibration", "white", "dark")
+_OWN = "the flight's"
 
 
-def configure(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = (
-        "examples:\n"
-        "  dappled open\n"
-        "  dappled open ~/flights/20261121T101503Z-0a1b2c3d\n"
-        "  dappled open frame.zarr\n"
-        "  dappled open frame.cr2 --mask mask-2 --calibration calibration.toml\n"
-        "Without a name it opens a simulated flight, made once (in ~/.cache/dappled, with its truth)."
+@dataclass(frozen=True, kw_only=True)
+class OpenInBrowser(Verb):
+    """Look at a flight or a light field."""
+
+    examples = (
+        "dappled open",
+        "dappled open ~/flights/20261121T101503Z-0a1b2c3d",
+        "dappled open frame.zarr",
+        "dappled open frame.cr2 --mask mask-2 --calibration calibration.toml",
     )
-    parser.add_argument("path", nargs="?", type=Path, metavar="FLIGHT|FILE",
-                        help="recorded flight, light field (.zarr, .npz, .h5, folder of views), raw frame")  # fmt: skip
-    parser.add_argument("--bind", default="127.0.0.1:0", metavar="HOST:PORT",
-                        help="serve the page here, on this machine only (default: a free port)")  # fmt: skip
-    parser.add_argument("--no-browser", action="store_true", help="only print the address")
-    parser.add_argument("--json", action="store_true", help="print path, number of frames and address as JSON")
-    for name, what in (
-        ("camera", "camera profile"), ("mask", "mask profile, or lenslet"), ("law", "carrier law"),
-        ("calibration", "calibration file"), ("white", "white frame"), ("dark", "dark frame"),
-    ):  # fmt: skip
-        parser.add_argument(f"--{name}", metavar="P", help=f"{what} of raw frames (default: the flight's)")
+    notes = "Without a name it opens a simulated flight, made once (in ~/.cache/dappled, with its truth)."
+
+    path: Path | None = argument(
+        "FLIGHT|FILE", "recorded flight, light field (.zarr, .npz, .h5, folder of views), raw frame", default=None,
+        there=True,
+    )  # fmt: skip
+    bind: str = option(
+        "--bind", "serve the page here, on this machine only", "127.0.0.1:0", metavar="HOST:PORT",
+        otherwise="a free port",
+    )  # fmt: skip
+    no_browser: bool = flag("--no-browser", "only print the address")
+    camera: str | None = option("--camera", "camera profile of raw frames", None, otherwise=_OWN)
+    mask: str | None = option("--mask", "mask profile, or lenslet, of raw frames", None, otherwise=_OWN)
+    law: str | None = option("--law", "carrier law of raw frames", None, choices=tuple(LAWS), otherwise=_OWN)
+    calibration: str | None = option(
+        "--calibration", "calibration of raw frames", None, metavar="FILE", there=True, otherwise=_OWN,
+    )  # fmt: skip
+    white: str | None = option("--white", "white frame of raw frames", None, metavar="FILE", there=True, otherwise=_OWN)
+    dark: str | None = option("--dark", "dark frame of raw frames", None, metavar="FILE", there=True, otherwise=_OWN)
+
+    def run(self, output: Output) -> Report:
+        """See Verb."""
+        path = example.flight() if self.path is None else self.path
+        given = {name: value for name in _GIVEN if (value := getattr(self, name)) is not None}
+        with ExitStack() as stack:
+            source, recipe, mount = _source(path, given, stack)
+            listener, _ = process.listen(ConsoleSettings(bind=self.bind))
+            stack.callback(listener.close)
+            address = process.url(listener)
+            count = len(source.frames())
+            left = f" (the last {offline.MOST_FRAMES} of them)" if count > offline.MOST_FRAMES else ""
+            said = f"{path}: {counted(count, 'frame')}{left} at {address}  (end with Ctrl-C)"
+            output.row({"path": str(path), "frames": count, "url": address}, said)
+
+            def show() -> None:
+                webbrowser.open(address)  # one in the terminal (w3m, over SSH) returns when it is left
+
+            def begun() -> None:
+                if not self.no_browser:
+                    Loop("browser", show).start()
+
+            offline.serve(listener, source, recipe, mount, begun)
+        return Report()
 
 
-def run(arguments: argparse.Namespace) -> int:
-    path = example.flight() if arguments.path is None else arguments.path
-    given = {name: value for name in _GIVEN if (value := getattr(arguments, name)) is not None}
-    with ExitStack() as stack:
-        source, recipe, mount = _source(path, given, stack)
-        listener, _ = process.listen(ConsoleSettings(bind=arguments.bind))
-        stack.callback(listener.close)
-        address = process.url(listener)
-        count = len(source.frames())
-        left = f" (the last {offline.MOST_FRAMES} of them)" if count > offline.MOST_FRAMES else ""
-        said = f"{path}: {counted(count, 'frame')}{left} at {address}  (end with Ctrl-C)"
-        facts = {"path": str(path), "frames": count, "url": address}
-        print(json.dumps(facts) if arguments.json else said, flush=True)
-
-        def show() -> None:
-            webbrowser.open(address)  # one in the terminal (w3m, over SSH) returns when it is left
-
-        def begun() -> None:
-            if not arguments.no_browser:
-                Loop("browser", show).start()
-
-        offline.serve(listener, source, recipe, mount, begun)
-    return 0
+CLASSES = {"open": OpenInBrowser}
 
 
 def _source(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import os
 import sys
@@ -47,8 +46,7 @@ def flight() -> Path:
             with simulation as simulated, contextlib.redirect_stdout(sys.stderr):
                 file = replace(configuration.examine_file(None), settings=simulated)
                 flown = settings_check.checked(file, starting=True)
-                words = argparse.Namespace(frames=_FRAMES, seconds=_PATIENCE_S, json=False, config=None)
-                if flying.serve(flown, words, simulation) != 0:
+                if flying.serve(flown, flying.RunPlan(_FRAMES, _PATIENCE_S), simulation) != 0:
                     raise DappledError("the example flight could not be made: try `dappled run --simulate --frames 3`")
             flown_there = layout.flights(made)
             if not flown_there or len(list((flown_there[-1].path / "frames").iterdir())) < _FRAMES:  # interrupted

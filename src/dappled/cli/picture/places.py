@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import cache
 from pathlib import Path
 
-from dappled.cli import decode_arguments
+from dappled.cli.frame_arguments import flight_of
 from dappled.flight import layout
 from dappled.products.geotags import exif_gps, geotags
 from dappled.products.handover import picture_files
@@ -14,7 +14,7 @@ from dappled.products.mounting import Mounting
 
 def place_of(frame: Path) -> exif_gps.Place | None:
     """Where a frame was taken: as its flight has it, else as its own EXIF does."""
-    flight = decode_arguments.flight_of(frame.resolve())
+    flight = flight_of(frame.resolve())
     placed = {} if flight is None else _placed(flight)
     return placed.get(frame.name) or picture_files.place_in(frame)
 

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from dappled.cli import VERBS, decode_arguments, main
-from dappled.cli.arguments import refuse_existing
+from dappled.cli import VERBS, frame_arguments, main
 from dappled.cli.command_line import options, parser
-from dappled.cli.verb import OutputExistsError
+from dappled.cli.verb import OutputExistsError, Overwriting
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 
@@ -36,11 +34,11 @@ def test_a_folder_stands_for_the_frames_in_it(tmp_path: Path) -> None:
     for name in ("B.RAF", "A.dng", "notes.txt", "._B.RAF"):
         (folder / name).touch()
     alone = tmp_path / "one.dng"
-    found = decode_arguments.frames([alone, flight, folder])
+    found = frame_arguments.frames([alone, flight, folder])
     assert [path.name for path in found] == ["one.dng", "000000.cr2", "000001.cr2", "A.dng", "B.RAF"]
     (tmp_path / "empty").mkdir()
     with pytest.raises(DappledError, match="empty holds no frame"):
-        decode_arguments.frames([tmp_path / "empty"])
+        frame_arguments.frames([tmp_path / "empty"])
 
 
 @pytest.mark.parametrize("verb", WRITERS)
@@ -54,12 +52,11 @@ def test_what_is_there_is_refused_by_name_and_with_the_remedy(tmp_path: Path) ->
     there, dangling = tmp_path / "there.png", tmp_path / "link.png"
     there.touch()
     dangling.symlink_to(tmp_path / "nowhere")
-    kept = argparse.Namespace(overwrite=False)
     for path in (there, dangling):
         with pytest.raises(OutputExistsError, match=rf"{path.name} exists already: .*--overwrite"):
-            refuse_existing(kept, tmp_path / "new.png", path)
-    refuse_existing(kept, tmp_path / "new.png")
-    refuse_existing(argparse.Namespace(overwrite=True), there)
+            Overwriting().refuse_existing(tmp_path / "new.png", path)
+    Overwriting().refuse_existing(tmp_path / "new.png", None)
+    Overwriting(overwrite=True).refuse_existing(there)
 
 
 @pytest.mark.parametrize("given", ["c", "c.toml", "c.npz"])
@@ -68,7 +65,8 @@ def test_a_calibration_replaces_neither_of_its_files_unasked(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], given: str, there: str
 ) -> None:
     (tmp_path / there).write_bytes(b"of before")
-    assert main(["calibrate", "x.dng", "--mask", "mask-2", "-o", str(tmp_path / given)]) == 1
+    (tmp_path / "x.dng").touch()
+    assert main(["calibrate", str(tmp_path / "x.dng"), "--mask", "mask-2", "-o", str(tmp_path / given)]) == 1
     assert f"{there} exists already: " in capsys.readouterr().err
     assert (tmp_path / there).read_bytes() == b"of before"
 
@@ -96,19 +94,19 @@ def test_a_flights_frames_are_decoded_by_its_own_recipe(tmp_path: Path) -> None:
     )
     asked = Recipe(camera="auto", mask="", workers=2, colour=True, try_laws=True)
     for given in (flight, flight / "frames", flight / "frames" / "000000.dng"):
-        made = decode_arguments.recorded([given], asked)
+        made = frame_arguments.recorded([given], asked)
         assert made.mask == str(flight / "inputs" / "masks" / "mask-2.toml")
         assert made.calibration == str(flight / "inputs" / "calibration.toml")
         assert (made.workers, made.colour, made.try_laws) == (2, True, True)
-    assert decode_arguments.recorded([flight], replace(asked, calibration="c")).calibration == "c"
-    assert decode_arguments.recorded([flight], replace(asked, mask="mask-1")).calibration == ""
+    assert frame_arguments.recorded([flight], replace(asked, calibration="c")).calibration == "c"
+    assert frame_arguments.recorded([flight], replace(asked, mask="mask-1")).calibration == ""
     with pytest.raises(DappledError, match=r"no mask is named: give --mask P"):
-        decode_arguments.recorded([tmp_path / "x.dng"], asked)
+        frame_arguments.recorded([tmp_path / "x.dng"], asked)
     with pytest.raises(DappledError, match="not the frames of one flight"):
-        decode_arguments.recorded([flight, tmp_path / "x.dng"], asked)
+        frame_arguments.recorded([flight, tmp_path / "x.dng"], asked)
     (flight / "flight.toml").write_text("[settings]\n")
     with pytest.raises(DappledError, match="recorded without a mask"):
-        decode_arguments.recorded([flight], asked)
+        frame_arguments.recorded([flight], asked)
 
 
 @pytest.mark.slow  # it loads every verb

@@ -1,0 +1,158 @@
+"""Arguments of verbs that decode frames: which frames, by which camera, mask and files; and going over them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from dappled import picture_order
+from dappled.cli.verb import CallError, Output, Report, argument, option
+from dappled.decode.optics import LAWS
+from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
+from dappled.errors import DappledError, counted
+from dappled.flight import layout
+
+# No JPEG: beside a raw file it is the same picture again. One that is named is taken.
+FRAME_SUFFIXES = (".arw", ".cr2", ".dng", ".lfp", ".lfr", ".nef", ".npy", ".png", ".raf", ".tif", ".tiff")
+FRAME_HELP = "frame: RAF, CR2, DNG, LFP, TIFF, PNG or NPY; or a folder of frames, or a flight"
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecipeArguments:
+    """How frames are decoded: camera, mask and law, and the files and numbers that go with a frame."""
+
+    camera: str = option("--camera", "camera profile or TOML file", "auto", otherwise="the one that fits the frame")
+    mask: str | None = option("--mask", "mask profile or TOML file, or lenslet", None)
+    law: str = option("--law", "carrier law", "", choices=tuple(LAWS), otherwise="the camera's")
+    calibration: str = option("--calibration", "file written by dappled calibrate", "", metavar="FILE", there=True)
+    white: str = option("--white", "white frame", "", metavar="FILE", there=True)
+    dark: str = option("--dark", "dark frame", "", metavar="FILE", there=True)
+    cfa: str = option("--cfa", "colour pattern, row by row, if the file has none", "", metavar="BGGR")
+    black: float | None = option("--black", "black level, if the file doesn't say", None)
+    white_level: float | None = option("--white-level", "level of a full pixel (a 12-bit PNG: 4095)", None, above=0.0)
+    focal_length: float | None = option(
+        "--focal-length", "focal length, if the file doesn't say", None, metavar="MM", above=0.0,
+    )  # fmt: skip
+    f_number: float | None = option("--f-number", "f-number of the exposure, if the file doesn't say", None, above=0.0)
+
+    def recipe(self, *, colour: bool = False, taper: float = 0.0) -> Recipe:
+        """The recipe that these arguments name."""
+        return Recipe(
+            camera=self.camera,
+            mask=self.mask or "",
+            law=self.law,
+            calibration=self.calibration,
+            white=self.white,
+            dark=self.dark,
+            workers=2,
+            cfa=self.cfa,
+            black=self.black,
+            white_level=self.white_level,
+            colour=colour,
+            taper=taper,
+            try_laws=not self.law,
+            keep_law=bool(self.law),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class FramesArguments(RecipeArguments):
+    """Frames, of which those of a flight bring its recipe along."""
+
+    frames: tuple[Path, ...] = argument("FRAME", FRAME_HELP, there=True)
+    mask: str | None = option(
+        "--mask", "mask profile or TOML file, or lenslet", None, otherwise="that of the flight that the frames are of",
+    )  # fmt: skip
+
+
+def frames(given: Sequence[Path]) -> list[Path]:
+    """The frames that were named, and those in the folders that were: of a flight, those in its folder of frames.
+
+    Raises DappledError for a folder without frames.
+    """
+    found: list[Path] = []
+    for path in given:
+        if not path.is_dir():
+            found.append(path)
+            continue
+        flight = (path / "flight.toml").is_file()
+        folder = path / "frames" if flight else path
+        inside = picture_order.by_name(
+            (one for one in folder.iterdir() if _is_frame(one) and (not flight or one.stem.isdigit())), Path.as_posix
+        )
+        if not inside:
+            kinds = ", ".join(FRAME_SUFFIXES)
+            raise DappledError(f"{folder} holds no frame ({kinds}): name frames, a folder of frames, or a flight")
+        found += inside
+    return found
+
+
+def recorded(given: Sequence[Path], asked: Recipe) -> Recipe:
+    """The recipe by which the flight that these frames belong to was decoded, with what was asked for in its place.
+
+    Frames belong to a flight if they, their folder or the flight itself is named. Where a mask is asked for, the recipe
+    is the one that was asked for. Raises CallError for frames of two flights, or of none, if no mask is named.
+    """
+    if asked.mask:
+        return asked
+    flights = {flight_of(path.resolve()) for path in given}
+    if len(flights) > 1:
+        raise CallError("these are not the frames of one flight: give --mask, or decode each flight by itself")
+    (flight,) = flights
+    if flight is None:
+        raise CallError("no mask is named: give --mask P (only frames in the folder of a flight bring one along)")
+    facts = layout.read_facts(layout.open_folder(flight))
+    untouched = Recipe(camera="auto", mask="")
+    changed = {one.name for one in fields(Recipe) if getattr(asked, one.name) != getattr(untouched, one.name)}
+    made = recorded_recipe(flight, facts, {name: getattr(asked, name) for name in changed})
+    if made is None:
+        raise CallError(f"{flight} was recorded without a mask: give --mask P")
+    return made
+
+
+def flight_of(path: Path) -> Path | None:
+    """The flight that a folder is, or that a file or a folder of frames lies in."""
+    return next((one for one in (path, *path.parents[:2]) if (one / "flight.toml").is_file()), None)
+
+
+def refuse_same_names(frames: Sequence[Path], folder: Path, suffix: str) -> None:
+    """Two frames of one name would overwrite each other's results. Raises CallError."""
+    first: dict[str, Path] = {}
+    for frame in frames:
+        other = first.setdefault(frame.stem, frame)
+        if other is not frame:
+            raise CallError(
+                f"{other} and {frame} would both be written as {folder / frame.stem}{suffix}: "
+                "decode them into two folders"
+            )
+
+
+def _is_frame(path: Path) -> bool:
+    """Whether a name is a frame's. Hidden ones are what other systems leave on cards, or half-written."""
+    return path.suffix.lower() in FRAME_SUFFIXES and not path.name.startswith(".") and path.is_file()
+
+
+def each_frame(
+    frames: Sequence[Path], output: Output, make: Callable[[Path], bool], *, into_folder: bool, failure: str
+) -> Report:
+    """Make something of each frame: one that fails is told, and the others go on.
+
+    `make` says whether its result is in doubt; `failure` says what became of the frames that failed. Raises the
+    DappledError of a frame that goes to no folder.
+    """
+    bad = doubted = 0
+    for frame in output.each(frames):
+        try:
+            doubted += make(frame)
+        except DappledError as error:
+            if not into_folder:
+                raise
+            bad += 1
+            output.warn(str(error))
+            output.row({"frame": str(frame), "error": str(error)})
+    of_all = counted(len(frames), "frame")
+    if bad:
+        output.remark(f"{bad} of {of_all} {failure}")
+    return Report(doubted=bool(doubted), extent=f"{doubted} of {of_all}" if into_folder else "", failed=bool(bad))
