@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 
+_SWITCHES, _SWITCHED_S = 0.05, 0.01  # of the places where threads may change; and for how long at most
 _TURNS = 100_000  # of threads at one moment: some thread asks without end whether something has come
 
 
@@ -79,8 +80,13 @@ class VirtualClock:
             changed.acquire()
         return bool(holds())
 
-    def until(self, holds: Callable[[], object], timeout_s: float) -> bool:
-        """Let the others run until this holds (True) or so much time has gone on (False)."""
+    def switch(self) -> None:
+        """Now and then, let others run for a while. A thread that the clock does not know goes on."""
+        if threading.get_ident() in self._threads and self._random.random() < _SWITCHES:
+            self._pause(bool, self._random.uniform(0.0, _SWITCHED_S))
+
+    def until(self, holds: Callable[[], object], timeout_s: float | None) -> bool:
+        """Let the others run until this holds (True) or so much time has gone on (False; None: without end)."""
         self._pause(holds, timeout_s)
         return bool(holds())
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import random
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ from dappled.mocks.scene.dng import Exif
 from dappled.workers import Loop, Worker
 from tests.simulated.bad_link import LinkFaults
 from tests.simulated.memory_links import MemoryNetwork
+from tests.simulated.switching import switching
 from tests.simulated.virtual_clock import VirtualClock
 
 AUTOPILOT, GROUND = 14550, 14551
@@ -193,7 +194,7 @@ class VirtualFlight:
 class Plan:
     """What is flown: `frames` requests, `interval_s` apart, with telemetry at `hz`. `by_files`: the camera is composed
     of a shutter line and a folder, in place of one that hands over its files itself. `ground_m`: it has a rangefinder,
-    over ground so high above the take-off place."""
+    over ground so high above the take-off place. `switches`: threads change at locks and writes, too."""
 
     seed: int
     frames: int
@@ -204,6 +205,7 @@ class Plan:
     boot: BootTime = field(default_factory=BootTime)
     by_files: bool = False
     ground_m: float | None = None
+    switches: bool = False
 
 
 def camera(plan: Plan, clock: VirtualClock, card: Path) -> Camera:
@@ -266,7 +268,7 @@ def airborne(
 ) -> Iterator[Airborne]:
     """Fly, 5 s after the daemon's start until its end. `watch` is shown each datagram of the daemon before it is on its
     way; `tables` of the settings come on top."""
-    with VirtualClock(plan.seed) as clock, memory_disk(plan.seed):
+    with VirtualClock(plan.seed) as clock, memory_disk(plan.seed), switching(clock) if plan.switches else nullcontext():
         network, stream = MemoryNetwork(clock, plan.seed, plan.faults, plan.cuts), MemoryStream()
         if watch is not None:
             network.watch = lambda source, data: watch(data) if source in (AUTOPILOT, GROUND) else None

@@ -121,3 +121,10 @@ def test_an_hour_with_600_requests_is_lawful_and_the_same_by_seed(tmp_path: Path
     flown = by_seed(HOUR, tmp_path / "one")
     assert flown.seconds > 3500
     assert time.process_time() - began_s < 2 * 150  # of a core that other programs use too: 65 s an hour alone
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_threads_that_change_at_locks_and_writes_leave_a_flight_whole(seed: int, tmp_path: Path) -> None:
+    """Each lock, write, fsync and statement of the ledger may hold its thread for some milliseconds, while others run.
+    Without the locks around the telemetry log, no flight of these is whole."""
+    lawful(Plan(seed, 6, 1.0, hz=5.0, switches=True), tmp_path)
