@@ -27,7 +27,9 @@ peers: ## MAVSDK, MAVProxy and pycolmap, which long tests talk to, in .venv-peer
 demo: setup ## fly eight simulated frames through the whole daemon, and draw the last one
 	@tools/demo
 
-CHECKS = $(BIN)/ruff check -q . && $(BIN)/ruff format -q --check . && $(BIN)/mypy && $(BIN)/lint-imports
+LINT = $(BIN)/ruff check -q . && $(BIN)/ruff format -q --check . && $(BIN)/lint-imports
+# Types of the tests take as long again as those of the source: `make check` and test-slow look at both.
+CHECKS = $(LINT) && $(BIN)/mypy src
 TESTS = $(BIN)/pytest -q --no-header $(BESIDE) -m "not slow" --durations=25
 # Prints what was taken of so many seconds and CPU-seconds (docs/tests.md).
 BUDGET = $(BIN)/python tools/budget.py
@@ -44,8 +46,8 @@ checked-tests:
 	wait $$checks || { echo "the checks failed: see what they say above, or run make check" >&2; failed=checks; }; \
 	[ -z "$$failed" ]
 
-check: setup ## lint, format, types, import contracts
-	@$(CHECKS)
+check: setup ## lint, format, types (of tests and tools too), import contracts
+	@$(LINT) && $(BIN)/mypy
 
 test-fast: setup
 	@$(TESTS)
@@ -62,6 +64,7 @@ test-long: everything peers ## soaks, sweeps, matrices and benchmarks
 
 both:
 	@failed=0; \
+	$(BIN)/mypy || failed=1; \
 	$(BIN)/pytest -q --no-header -m "$(TIER) and not alone" --durations=25 $(BESIDE) || failed=1; \
 	$(BIN)/pytest -q --no-header -m "$(TIER) and alone" --durations=15 || failed=1; \
 	exit $$failed
