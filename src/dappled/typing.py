@@ -5,14 +5,18 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.geometry import Gnss, GroundHeight, Pose
 from dappled.decode.lightfield.refocus import StereoPair
-from dappled.flight import Tag
+from dappled.findings import Code, Finding, Level, Subject, Value
+from dappled.flight import Tag, TimeSource
 from dappled.products.opened import Opened, OpenedFlight, OpenedFrame, OpenedLightField
 
 __all__ = [
+    "Code",
     "DepthMap",
     "DistanceMap",
+    "Finding",
     "Gnss",
     "GroundHeight",
+    "Level",
     "Message",
     "Opened",
     "OpenedFlight",
@@ -20,6 +24,9 @@ __all__ = [
     "OpenedLightField",
     "Pose",
     "StereoPair",
+    "Subject",
     "Subscription",
     "Tag",
+    "TimeSource",
+    "Value",
 ]
