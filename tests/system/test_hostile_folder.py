@@ -27,6 +27,7 @@ COMMAND = Path(sys.executable).parent / "dappled"
 TAKEN = """
 dappled numpy scipy PIL zmq json argparse logging socket signal subprocess multiprocessing asyncio uvicorn h5py
 starlette pymavlink gphoto2 rawpy tifffile tomllib dataclasses random tempfile runpy sqlite3 sitecustomize
+usercustomize site encodings codecs os io gpiod zarr pyulog
 """
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import subprocess
@@ -9,6 +10,9 @@ import sys
 from pathlib import Path
 
 import pytest
+
+from dappled.cli import VERBS
+from tests.system.test_hostile_folder import HostileFolder
 
 TOOL = Path(__file__).parents[2] / "tools" / "deb.py"
 SUITES = {(3, 11): "bookworm", (3, 13): "trixie"}
@@ -22,8 +26,24 @@ def ask(*words: str | Path, **environment: str) -> str:
     return done.stdout
 
 
+def ran_in_a_hostile_folder(tmp_path: Path, home: Path) -> str:
+    """What of a folder that somebody else filled was run by the package's command, and by each verb of it."""
+    wrapper = tmp_path / "root" / "usr" / "bin" / "dappled"
+    text = wrapper.read_text(encoding="utf-8")
+    assert "PYTHONPATH=/usr/lib/dappled exec /usr/bin/python3 -P " in text
+    python = getattr(sys, "_base_executable", sys.executable)
+    wrapper.write_text(text.replace("/usr/lib/dappled", str(home)).replace("/usr/bin/python3", python))
+    (tmp_path / "hostile").mkdir()
+    hostile = HostileFolder(tmp_path / "hostile")
+    assert hostile.call(wrapper, "--version", PYTHONPATH=":").returncode == 0
+    for words in (*([verb] for verb in VERBS), ["run", "--simulate", "--frames", "1"]):
+        with contextlib.suppress(subprocess.TimeoutExpired):  # `run` and `open` go on
+            hostile.call(wrapper, *words, timeout_s=6)
+    return hostile.ran
+
+
 @pytest.mark.long
-@pytest.mark.timeout(600)
+@pytest.mark.timeout(900)
 def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path: Path) -> None:
     if shutil.which("dpkg-deb") is None:
         pytest.skip("dpkg-deb is missing: no Debian package can be built here")
@@ -61,6 +81,7 @@ def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path:
     ask("dpkg-deb", "--extract", debs[machine], tmp_path / "root")
     home = tmp_path / "root" / "usr" / "lib" / "dappled"
     run = (getattr(sys, "_base_executable", sys.executable), "-I", "-c")
+    assert ran_in_a_hostile_folder(tmp_path, home) == ""
     code = f"import sys; sys.path[:0] = [{str(home)!r}]; import dappled, gphoto2, rawpy, zmq; print(dappled.__file__)"
     assert ask(*run, code).strip() == str(home / "dappled" / "__init__.py")
     code = (
