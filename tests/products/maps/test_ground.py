@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 
 import numpy as np
@@ -162,3 +163,18 @@ def test_bad_terrain_is_a_sentence(tmp_path: Path) -> None:
         pytest.raises(DappledError, match="has no coordinates"),
     ):
         grounds.load(tmp_path / "nowhere.tif", PROJECTION, bounds)
+
+
+def test_a_raster_that_names_a_server_asks_it_nothing(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0)
+        address = f"/vsicurl/http://127.0.0.1:{server.getsockname()[1]}/a.tif"
+        (tmp_path / "terrain.tif").write_text(
+            '<VRTDataset rasterXSize="4" rasterYSize="4"><SRS>EPSG:32615</SRS><GeoTransform>0,1,0,0,0,-1</GeoTransform>'
+            f'<VRTRasterBand dataType="Byte" band="1"><SimpleSource><SourceFilename>{address}</SourceFilename>'
+            "<SourceBand>1</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"
+        )
+        with pytest.raises(DappledError, match=r"terrain\.tif can't be read"):
+            grounds.load(tmp_path / "terrain.tif", Projection("EPSG:32615"), (0.0, -4.0, 4.0, 0.0))
+        with pytest.raises(BlockingIOError):
+            server.accept()
