@@ -239,6 +239,7 @@ class Code(StrEnum):
     STAGE_BEHIND = "stage.behind"
     TASK_FAILING = "task.failing"
     THREAD_ENDED = "thread.ended"
+    TIME_IMPOSSIBLE = "time.impossible"
     TIME_MACHINE_DIFFERS = "time.machine_differs"
     TIME_TRIGGER_UNUSABLE = "time.trigger_unusable"
     TIME_WEEK_MENDED = "time.week_mended"

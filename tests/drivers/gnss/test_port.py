@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.clock import SystemClock
+from dappled.clock import RecordedClock, SystemClock
 from dappled.drivers.gnss import recorded
 from dappled.drivers.gnss.port import GnssPort, address
 from dappled.drivers.gnss.ubx import Edge
 from dappled.drivers.mavlink import LinkError, MavlinkMessage, mavlink, pack
 from dappled.errors import DappledError
-from dappled.findings import text
+from dappled.findings import text, told
 from tests.drivers.gnss.test_ubx import GPS_MS, NEW_FALLING, SATURDAY_S, VALID, WEEK, mark, message
 from tests.needs import without
 from tests.system.flying import eventually
@@ -84,6 +84,40 @@ def test_every_byte_is_logged_and_each_mark(terminal: tuple[int, str]) -> None:
     assert (found.time_usec, found.seq) == (SATURDAY_S * 10**6 + 500, 7)
     port.stop()
     assert port.dead_threads() == []
+
+
+@pytest.mark.parametrize(
+    ("early", "known", "off_weeks", "said"),
+    [
+        (1024, True, 0, None),
+        (2048, True, 0, None),
+        (1024, False, 1024, "which 1024 weeks later would be 2026-11-21 10:15"),
+        (2048, False, 2048, "which 2048 weeks later would be 2026-11-21 10:15"),
+        (-1100, True, None, "its date is 2047-12-21 10:15, which can't be true"),
+    ],
+)
+def test_a_date_that_rolled_over_is_mended_by_this_machine_s_clock_or_told(
+    terminal: tuple[int, str], early: int, known: bool, off_weeks: int | None, said: str | None
+) -> None:
+    near, device = terminal
+    book = Book()
+    clock = RecordedClock(SATURDAY_S * 10**9 if known else 3600 * 10**9, 0)
+    port = GnssPort(address(device), "falling", book, clock)
+    port.start()
+    at = (WEEK - early, GPS_MS, 500_000)
+    os.write(near, message((0x0D, 0x03), mark(NEW_FALLING | VALID | 0x08, rising=(0, 0, 0), falling=at)))
+    eventually(lambda: book.packets, "the mark's bytes")
+    port.stop()
+    if said is None:
+        assert port.problem() is None
+    else:
+        problem = port.problem()
+        assert problem is not None
+        assert said in told(problem)
+    offs_us = [SATURDAY_S * 10**6 + 500 - found.time_usec for found in book.marks]
+    week_us = 7 * 86400 * 10**6
+    assert [round(off_us / week_us) for off_us in offs_us] == ([] if off_weeks is None else [off_weeks])
+    assert off_weeks != 0 or offs_us == [0]
 
 
 def test_the_other_edge_s_marks_are_left_alone(terminal: tuple[int, str]) -> None:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import errno
 import logging
 import select
+from datetime import UTC, datetime
 from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.config.settings import GnssSettings
 from dappled.drivers.gnss import recorded
-from dappled.drivers.gnss.ubx import Edge, UbxStream, time_mark
+from dappled.drivers.gnss.ubx import Edge, TimeMark, UbxMessage, UbxStream, time_mark
 from dappled.drivers.mavlink import LinkError, MavlinkMessage
 from dappled.drivers.mavlink.channels import Address, ByteChannel, over_serial, serial_address
+from dappled.drivers.utc_choice import RELEASED_NS, Date, UtcBounds, rolled_over, rollovers
 from dappled.errors import DappledError, report
-from dappled.findings import Code, Finding, Subject, finding
+from dappled.findings import Code, Finding, Level, Subject, finding, told
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -53,6 +55,7 @@ class GnssPort:
         self._began_ns = clock.monotonic_ns()
         self._heard_ns: int | None = None
         self._message_ns: int | None = None
+        self._doubt: Finding | None = None  # of the last mark's date
         self.marks = 0
 
     def start(self) -> None:
@@ -77,6 +80,8 @@ class GnssPort:
             return finding(Code.GNSS_SILENT, receiver, baud=self._at.port)
         if now_ns - (self._message_ns or self._began_ns) > _SILENT_NS:
             return finding(Code.GNSS_NO_UBX, receiver)
+        if self._doubt is not None and self._doubt.level > Level.NOTE:
+            return self._doubt
         return None
 
     def _run(self) -> None:
@@ -127,10 +132,32 @@ class GnssPort:
         self._heard_ns = self._clock.monotonic_ns()
         for message in stream.feed(data):
             self._message_ns = self._heard_ns
-            mark = time_mark(message, self._edge)
+            mark = self._dated(message)
             if mark is not None:
                 self.marks += 1
                 self._note(recorded.mark_message(mark))
+
+    def _dated(self, message: UbxMessage) -> TimeMark | None:
+        """A time mark whose date can be true, or would be without a roll-over of the weeks: mended where this machine's
+        clock agrees, else in doubt."""
+        mark = time_mark(message, self._edge)
+        if mark is None:
+            return None
+        date = UtcBounds.live((self._clock.utc_ns(),)).judge(mark.utc_ns)
+        missing, subject = rollovers(mark.utc_ns, RELEASED_NS), Subject("GNSS receiver", self._at.host)
+        later = time_mark(message, self._edge, missing)
+        if date is Date.TRUE or later is None:
+            self._doubt = None
+            return mark
+        if date is Date.IMPOSSIBLE:
+            said = datetime.fromtimestamp(mark.utc_ns // 10**9, UTC)
+            self._doubt = finding(Code.TIME_IMPOSSIBLE, subject, utc=f"{said:%Y-%m-%d %H:%M}")
+            return None
+        mended = date is Date.MENDED
+        before, self._doubt = self._doubt, rolled_over(subject, mark.utc_ns, later.utc_ns, mended=mended)
+        if mended and before is None:
+            log.info("%s", told(self._doubt))
+        return later if mended else mark
 
     def _note(self, message: MavlinkMessage) -> None:
         try:

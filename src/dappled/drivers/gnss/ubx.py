@@ -91,9 +91,9 @@ def checksum(data: bytes) -> bytes:
     return bytes((first, second))
 
 
-def time_mark(message: UbxMessage, edge: Edge) -> TimeMark | None:
+def time_mark(message: UbxMessage, edge: Edge, rollovers: int = 0) -> TimeMark | None:
     """The mark of a UBX-TIM-TM2; None for another message, one without a new edge of this kind, and one whose time is
-    not valid or only the receiver's own.
+    not valid or only the receiver's own. `rollovers`: how often the receiver's count of weeks began anew unseen.
 
     Payload: channel, flags, count of rising edges; week of the rising and of the falling edge; time of week in ms and
     its part in ns of the rising edge, then of the falling one; accuracy in ns.
@@ -107,7 +107,7 @@ def time_mark(message: UbxMessage, edge: Edge) -> TimeMark | None:
         return None
     if ms >= _WEEK_MS or ns >= 10**6:
         return None
-    at = GPS_EPOCH + timedelta(weeks=week, seconds=ms // 1000)
+    at = GPS_EPOCH + timedelta(weeks=week + 1024 * rollovers, seconds=ms // 1000)
     at = gps_to_utc(at) if base == _GNSS_TIME else at
     seconds = (at - GPS_EPOCH) // timedelta(seconds=1) + round(GPS_EPOCH.timestamp())
     return TimeMark(count, seconds * 10**9 + ms % 1000 * 10**6 + ns, accuracy_ns)
