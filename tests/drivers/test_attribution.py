@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, true_name
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, rivals, true_name
 from dappled.findings import Code, Subject, finding
 
 SECOND = 10**9
@@ -39,6 +39,31 @@ def test_a_time_at_which_no_unknown_picture_can_have_been_made_shows_that_the_cl
     assert (again.shot, again.doubt) == (5, None)
     third = attribute(clue(5014, 205.0, 150.0), [], [claim(6, 204)], again.clock)
     assert (third.shot, third.doubt) == (6, None)
+
+
+@pytest.mark.parametrize(("since_s", "doubt"), [(100.0, None), (141.0, Code.FRAME_RIVAL_SHOTS)])
+def test_a_clock_that_was_set_back_to_the_time_of_a_shot_that_was_given_up_is_no_proof(
+    since_s: float, doubt: Code | None
+) -> None:
+    """All pictures made before `since_s` are known: the late shot's would be."""
+    found = attribute(clue(5030, 168.0, since_s), [claim(5, 130)], [claim(9, 167)], KNOWN)
+    assert found.shot == 5
+    assert (found.doubt.code if found.doubt else None) == doubt
+    assert found.doubt is None or found.doubt.facts["rival"] == 9
+    alone = attribute(clue(5030, 168.0, since_s), [claim(5, 130)], [], KNOWN)
+    assert (alone.doubt is None) == (doubt is None)
+
+
+def test_the_first_frame_is_in_doubt_where_another_picture_comes_soon_after_its_shot() -> None:
+    """A picture by hand just before the first shot has no rival clock: its own picture is the stray then."""
+    framed = [claim(1, 200)]
+    first = attribute(clue(5000, 200.6), [], framed, BodyClock())
+    assert (first.shot, first.doubt) == (1, None)
+    (doubt,) = rivals("2.RAF", clue(5002, 202.5), framed, first.clock)
+    assert doubt.kind == (Code.FRAME_RIVAL_PICTURE, Subject("frame", 1))
+    assert rivals("2.RAF", clue(5020, 220.5), framed, first.clock) == []  # the shot's own would have come sooner
+    second = attribute(clue(5010, 210.5), [], [claim(2, 210)], first.clock)
+    assert rivals("3.RAF", clue(5012, 212.5), [claim(2, 210)], second.clock) == []  # now the clock tells
 
 
 def test_a_body_that_took_its_time_to_focus_keeps_its_frame_in_doubt() -> None:

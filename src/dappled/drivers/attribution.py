@@ -130,7 +130,8 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     between shots no file of an older one is expected.
 
     By names, a file is of no shot before `clue.after` or behind `clue.before`. By the body's clock it is of a shot that
-    it fits. Of several that fit, and where there is no clock, files come in order; a shot given up is a rival. A file
+    it fits. Of several that fit, and where there is no clock, files come in order; a shot given up is a rival, and in
+    doubt where its picture would be known already. A file
     that fits none is a picture of another moment, a stray, where it can have been made then: not before `since_ns` and
     not after the awaited shot was fired. Else the body was slow or its clock was set, and it is the awaited shot's, in
     doubt; so is the second such file in a row. From then on the new time counts.
@@ -141,7 +142,11 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     if not claims or taken_s is None or not clock.offsets_s:
         return _by_order(claims, awaited, late, clue, clock)
     if fitting := [one for one in claims if clock.fits(one, taken_s)]:
-        return _by_order(fitting, awaited, late, clue, clock)
+        found = _by_order(fitting, awaited, late, clue, clock)
+        unseen = next((one for one in late if one.shot == found.shot and _would_be_known(one, clue)), None)
+        return (
+            found if unseen is None or found.doubt else Attribution(unseen.shot, clock, _unconfirmed(unseen, awaited))
+        )
     nearest = min(claims, key=lambda one: abs(clock.off_s(one, taken_s)))
     if abs(clock.off_s(nearest, taken_s)) <= TOLERANCE_S:
         return Attribution(nearest.shot, clock.learnt(nearest, taken_s), _disagrees(nearest, taken_s, clock))
@@ -157,6 +162,23 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     doubt = _disagrees(chosen, taken_s, clock) if agreeing else None
     told = replace(clock, rivals=(*(one for one, _ in rivalling), *clock.rivals)[:_KEPT])
     return Attribution(chosen.shot if doubt else None, told, doubt)
+
+
+def rivals(stray: str, clue: FileClue, framed: Sequence[Claim], clock: BodyClock) -> list[Finding]:
+    """The doubts of frames that have come, which a stray of this name may be instead: it was made as their shot was.
+
+    A frame by which alone the body's clock is known agrees with it in any case: what comes soon after its shot may be
+    its picture.
+    """
+    taken_s = clue.taken_s
+    if taken_s is None or not clock.offsets_s:
+        return []
+    soon_ns = _SLOW_S * 1e9 if len(clock.offsets_s) == 1 else 0
+    return [
+        finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", one.shot), picture=stray)
+        for one in framed
+        if abs(clock.off_s(one, taken_s)) <= _LEAST_S or 0 <= clue.arrived_ns - one.fired_ns <= soon_ns
+    ]
 
 
 def _possible(claim: Claim, clue: FileClue) -> bool:
@@ -189,8 +211,21 @@ def _by_order(
     if not clock.offsets_s and chosen == awaited and _is_rather_of(last, chosen, clue.arrived_ns):
         return Attribution(chosen.shot, clock, finding(Code.FRAME_RIVAL_SHOTS, subject, rival=last.shot))
     if rivals and dated_s is None:
-        return Attribution(chosen.shot, clock, finding(Code.FRAME_UNCONFIRMED, subject, shot=chosen.shot))
+        return Attribution(chosen.shot, clock, _unconfirmed(chosen, None))
     return Attribution(chosen.shot, clock if taken_s is None else clock.learnt(chosen, taken_s))
+
+
+def _would_be_known(claim: Claim, clue: FileClue) -> bool:
+    """Whether this shot's picture was made before a time whose pictures are all known: the body's clock may have been
+    set back to the time of this shot."""
+    return clue.since_ns is not None and claim.fired_ns + TOLERANCE_S * 1e9 < clue.since_ns
+
+
+def _unconfirmed(chosen: Claim, awaited: Claim | None) -> Finding:
+    subject = Subject("frame", chosen.shot)
+    if awaited is not None:
+        return finding(Code.FRAME_RIVAL_SHOTS, subject, rival=awaited.shot)
+    return finding(Code.FRAME_UNCONFIRMED, subject, shot=chosen.shot)
 
 
 def _is_rather_of(other: Claim, chosen: Claim, arrived_ns: int) -> bool:

@@ -124,6 +124,20 @@ def test_a_card_changed_in_flight_brings_its_files_and_is_told(volumes: tuple[st
     assert list(watched.watch.left()) == []
 
 
+def test_a_picture_by_hand_before_the_first_shot_leaves_its_frame_in_doubt() -> None:
+    card = Card(removable=False)
+    watched = Watched(card, in_flight=True)
+    hand, own = Picture(0, None, 9.9, T0_S + 3609.9), Picture(1, 0, 10.4, T0_S + 3612.4)
+    watched.fire(0, 10.0)
+    on_card(card, 1, hand)
+    watched.clock.advance(0.5)
+    assert watched.look(3) == [(0, hand.data, "")]
+    watched.clock.advance(2.0)
+    on_card(card, 2, own)
+    assert watched.look(3) == [(None, own.data, "")]
+    assert watched.codes == [Code.FRAME_RIVAL_PICTURE]
+
+
 def test_the_card_that_was_read_last_and_comes_back_brings_nothing_again() -> None:
     card = Card()
     watched = Watched(card, in_flight=False)

@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dappled import picture_order
-from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, rivals
 from dappled.drivers.camera import (
     Arrival,
     CameraEvent,
@@ -33,9 +33,6 @@ _TRIES = 3
 _SETTINGS_S = 1.0
 """How long after a file the settings are read: by then the body has updated what the shot changed (battery, free
 shots)."""
-
-_SAME_TIME_S = 1.5
-"""Times of two pictures in whole seconds that are no farther apart may be one time."""
 
 Stem = tuple[str, str]
 
@@ -375,20 +372,10 @@ class CameraState:
         frame = self._attributed(file, arrival, taken_s, announced)
         self._last_frame = None if frame.shot is None else (_stem(file), _is_jpeg(file.name), frame.shot)
         held = self._held.pop(_stem(file), None)
-        told = self._rivals(arrival, taken_s) if frame.shot is None else []
+        clue = FileClue(taken_s, announced.seen_ns)
+        doubts = rivals(arrival.name, clue, self._framed, self._clock) if frame.shot is None else []
+        told = [Noticed(doubt, arrival.monotonic_ns) for doubt in doubts]
         return [frame, *told, *([] if held is None else self._deliver(*held))]
-
-    def _rivals(self, stray: Arrival, taken_s: int | None) -> list[CameraEvent]:
-        """A stray that was made as a shot was may be that shot's picture, which then has another one."""
-        if taken_s is None or not self._clock.offsets_s:
-            return []
-        return [
-            Noticed(
-                finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", claim.shot), picture=stray.name), stray.monotonic_ns
-            )
-            for claim in self._framed
-            if abs(self._clock.off_s(claim, taken_s)) <= _SAME_TIME_S
-        ]
 
     def _attributed(self, file: CameraFile, arrival: Arrival, taken_s: int | None, announced: _Announced) -> Arrival:
         """Say which shot made a frame. The current shot ends with its frame."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import threading
+from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from dataclasses import dataclass
 from statistics import median
@@ -16,7 +17,7 @@ from typing import Any
 
 from dappled import durable, picture_order
 from dappled.clock import Clock
-from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, rivals
 from dappled.drivers.camera import Arrival, Blob, CameraError, Companion, Noticed, ShotFailed
 from dappled.drivers.wired import matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
@@ -57,6 +58,7 @@ class FileWatch:
         self._lock = threading.Lock()
         self._claims: list[Claim] = []
         self._late: list[Claim] = []
+        self._framed: deque[Claim] = deque(maxlen=_LATE)  # the last shots whose frames have come
         self._past_ns = -1
         self._body_clock = BodyClock()
         self._done: set[FoundFile] = set()
@@ -247,6 +249,10 @@ class FileWatch:
         facts = {"doubt": made.doubt.to_json()} if made.doubt else {}
         if (yield from self._bring(made.shot, group, facts)):
             self._body_clock = made.clock
+            self._framed.extend(one for one in (*self._late, *waiting) if one.shot == made.shot)
+            doubts = rivals(group.main.name, clue, self._framed, made.clock) if made.shot is None else []
+            for doubt in doubts:
+                yield Noticed(doubt, self._clock.monotonic_ns())
             self._late = [] if made.doubt else [one for one in self._late if one.shot != made.shot]
             if made.doubt:  # files come in order: no file of an older shot is expected any more
                 self._past_ns = max((one.fired_ns for one in waiting if one.shot == made.shot), default=self._past_ns)
