@@ -84,7 +84,7 @@ class Code(StrEnum):
     DECODE_BEHIND = "decode.behind"
     DECODE_FAILED = "decode.failed"
     DECODE_FAILING = "decode.failing"
-    DECODE_IN_DOUBT = "decode.in_doubt"
+    DECODE_LAW_DECIDED = "decode.law_decided"
     DECODE_MISFIT = "decode.misfit"
     DECODE_NO_MASK = "decode.no_mask"
     DECODE_OFF = "decode.off"

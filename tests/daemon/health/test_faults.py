@@ -28,6 +28,7 @@ from tests.daemon.health.test_record import HERE, LINK, WELL, S, record
 BODY = BodyReport(True, True, (), (), None, 250, "100%", 100, battery_low=False, temperature_c=24.0)
 DARK = finding(Code.FRAME_DARK, FRAME, share=0.001)
 STEPPED = finding(Code.CLOCK_STEPPED, Subject("autopilot"), steps=1, by_s=0.3)
+ELSEWHERE = finding(Code.CARRIERS_HALF_WAY, FRAME)
 CABLE = "no file came within 30 s: a cable or a card that is too slow"
 FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
     "lens cap": (
@@ -42,8 +43,8 @@ FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
     ),
     "stepped clock": (Code.CLOCK_STEPPED, {"found": [STEPPED]}),
     "wrong mask": (
-        Code.DECODE_FAILING,
-        {"decoding": DecodingState(True, DecodeFailures(3, 3, "none of its carriers is seen"))},
+        Code.CARRIERS_HALF_WAY,
+        {"decoding": DecodingState(True, DecodeFailures(found=(ELSEWHERE,)))},
     ),
     "hot battery": (Code.BODY_HOT, {"body": replace(BODY, temperature_c=55.0)}),
     "low disk": (

@@ -12,7 +12,7 @@ from dappled.findings import Code, Subject, above_note, finding, told
 
 VEHICLE = {"latitude_deg": 41.0, "longitude_deg": 1.0, "yaw_deg": 3.0, "position_sigma_m": 1.24, "age_ms": 40.0}
 DECODE = {"mask": "mask-2", "calibration": "c.toml", "running": True, "failed": 0, "failed_in_a_row": 0, "failure": "",
-          "misfit": "", "doubt": ""}  # fmt: skip
+          "misfit": ""}  # fmt: skip
 WELL: dict[str, Any] = {
     "utc_ns": 1_800_000_000 * 10**9,
     "link": {"urls": 2, "silent": 0, "packets": 500, "positions": 50},
@@ -65,7 +65,6 @@ def test_all_is_well() -> None:
         ("caution", "4 frames kept", {"decode": DECODE | {"failed": 4, "failed_in_a_row": 0, "failure": "dark"}}),
         ("no-go", "the last 3 frames are kept, not decoded: dark",
          {"decode": DECODE | {"failed": 4, "failed_in_a_row": 3, "failure": "dark"}}),
-        ("caution", "in doubt: another lattice", {"decode": DECODE | {"doubt": "another lattice"}}),
         ("caution", "low, volts: 21.6, per cent left: 25", {"vehicle_battery": battery(21.6, 25, low=True)}),
         ("caution", "the vehicle's battery is low: land", {"vehicle_battery": battery(None, None, low=True)}),
         ("caution", "UTC is not known yet", {"utc_known": False}),

@@ -476,7 +476,7 @@ def judged(one: Rig) -> list[str]:
         folder=one.flight.folder.path,
         decoding=DecodingState(True, one.pipeline.decode_failures),
     )
-    return [told(one) for one in in_record(record) if one.code.startswith("decode.")]
+    return [told(one) for one in in_record(record) if one.code.startswith(("decode.", "carriers."))]
 
 
 def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_path: Path) -> None:

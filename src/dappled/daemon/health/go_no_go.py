@@ -98,5 +98,3 @@ def _decoding(decode: Mapping[str, Any]) -> Iterator[Finding]:
         yield finding(Code.DECODE_FAILING, about, in_a_row=decode["failed_in_a_row"], why=decode["failure"])
     elif decode["failed"]:
         yield finding(Code.DECODE_FAILED, about, frames=decode["failed"], why=decode["failure"])
-    elif decode["doubt"]:
-        yield finding(Code.DECODE_IN_DOUBT, about, why=decode["doubt"])

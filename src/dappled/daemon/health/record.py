@@ -122,7 +122,6 @@ def record(
             "failed_in_a_row": decoding.failures.in_a_row,
             "failure": decoding.failures.reason,
             "misfit": decoding.misfit,
-            "doubt": decoding.failures.doubt,
             "judged": decoding.judged(),
         },
         "min_free_bytes": settings.record.min_free_mb * 1_000_000,
@@ -141,6 +140,7 @@ def record(
         *([finding(Code.GIMBAL_UNHEARD, Subject("vehicle"))] if deaf else []),
         *shortages,
         *go_no_go.judge(facts),
+        *decoding.failures.found,
         *decoding.verdicts.findings(monotonic_ns),
     ]
     opened = (standing or StandingFindings()).refresh(now, monotonic_ns)

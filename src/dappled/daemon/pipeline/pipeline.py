@@ -25,6 +25,7 @@ from dappled.daemon.stream.publisher import Stream
 from dappled.drivers.camera import Camera
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import report, sentence
+from dappled.findings import FRAME, Code, Finding
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
 
@@ -34,12 +35,12 @@ log = logging.getLogger(__name__)
 @dataclass(frozen=True, slots=True)
 class DecodeFailures:
     """The frames that could not be decoded: all, those since the last one that could, and why the last could not; and
-    what the last decoded one is in doubt about ("" where it is not)."""
+    what was found of the last decoded one."""
 
     count: int = 0
     in_a_row: int = 0
     reason: str = ""
-    doubt: str = ""
+    found: tuple[Finding, ...] = ()
 
 
 class Pipeline:
@@ -160,8 +161,9 @@ class Decoding:
         decoded = self._decoder.decode(
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
-        doubts = [*map(findings.told, decoded.doubts), *([decoded.decision.sentence] if decoded.decision else [])]
-        self.failures = replace(self.failures, in_a_row=0, doubt=doubts[0] if doubts else "")
+        law = decoded.decision
+        decided = () if law is None else (findings.finding(Code.DECODE_LAW_DECIDED, FRAME, why=law.sentence),)
+        self.failures = replace(self.failures, in_a_row=0, found=(*decoded.doubts, *decided))
         pending.decoded = decoded
         self._unrecorded = decoded.decision or self._unrecorded
         if self._unrecorded is not None:  # tried again with the next frame where the disk refuses
