@@ -107,8 +107,8 @@ MUTATIONS = (
     Mutation(
         "a doubt of a log is dropped on its way to the exit code",
         "cli/replay.py",
-        "return 1 if progress.bad or doubted else 0",
-        "return 1 if progress.bad else 0",
+        "return Report(findings=told, failed=bool(progress.bad))",
+        "return Report(failed=bool(progress.bad))",
         ("drivers/mavlink/test_log_evidence.py",),
     ),
     Mutation(

@@ -18,6 +18,7 @@ from dappled.errors import DappledError
 INTERNAL = {  # caught where they arise, and told as another error or as an event
     "dappled.bounds.claims.ClaimError",
     "dappled.drivers.child_process.ChannelError",
+    "dappled.durable.NoPlainFileError",
     "dappled.drivers.gphoto2.protocol.SessionError",
     "dappled.drivers.mavlink.ulog_reader.FieldsError",
     "dappled.mocks.body.ptp.MalformedPacketError",

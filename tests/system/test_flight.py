@@ -150,7 +150,7 @@ def test_a_changed_slices_hash_is_found(copied: Path) -> None:
 
 
 def test_verify_needs_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", str(tmp_path), "--verify"]) == 1
+    assert main(["replay", str(tmp_path), "--verify"]) == 2
     assert "is not a recorded flight" in capsys.readouterr().err
 
 

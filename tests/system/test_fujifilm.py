@@ -103,8 +103,9 @@ def test_a_missing_file_leaves_doubt_that_a_person_settles(
         shoot(daemon, body, 3)  # within a second or so: times alone can't tell
     pickup = ["flight", "pickup", str(flight), "--from", str(body.card)]
     assert main(pickup) == 1
-    out = capfd.readouterr().out
-    assert "in doubt:" in out
+    told = capfd.readouterr()
+    out = told.out
+    assert "in doubt:" in told.err
     assert "--pair" in out
     truth = {0: "DSCF0001.RAF", 2: "DSCF0002.RAF"}
     with LedgerReader.open(flight / "flight.sqlite") as ledger:
