@@ -67,7 +67,7 @@ ELSEWHERE = {
     "--gcp points.csv": "tests/products/maps/test_georeference.py",  # control points of the place
     "--refine neighbours": "tests/products/maps/test_georeference.py",  # frames that overlap
     "--as terrain --gsd": "tests/products/maps/test_georeference.py",  # as above
-    "--together": "tests/products/maps/test_hyperstereo.py",  # frames that overlap
+    "--together": "tests/products/survey/test_flight_sweep.py",  # frames that overlap
     "maps/ground.tif": "tests/products/maps/test_georeference.py",  # what comes of them
     "dappled open": "tests/cli/test_open.py",  # serves pages until Ctrl-C
     "--scheduler tcp:": "tests/products/batch/test_batch.py",  # a Dask cluster

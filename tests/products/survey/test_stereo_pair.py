@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from dappled.errors import DappledError
 from dappled.products.survey import stereo_pair
-from tests.products.maps.test_hyperstereo import BOX_M, box
 from tests.products.survey import seen
+from tests.products.survey.test_flight_sweep import BOX_M, box
 
 
 def shift(a: NDArray[np.float32], b: NDArray[np.float32]) -> tuple[int, int]:

@@ -1,16 +1,15 @@
-"""Find heights from overlapping frames of one flight, whose baselines are far longer than a single frame's aperture.
+"""Find heights from overlapping frames of one flight, whose baseline is far longer than a single frame's aperture.
 
-A plane sweep over the map. At each height the frames that see a cell are projected on the map, and normalised in a
-window around it. Where the height is right they agree: the mean of all pairs' correlations is at its maximum. Pictures
-need not be rectified, two frames or more may take part, and the eyes handle tilted cameras and lens distortion.
+This is a plane sweep over the map. Each cell is tried at a series of heights; at the right one the frames that see it
+agree, by normalised correlation over a window of the map. Pictures need not be rectified, any number of frames may take
+part, and tilted cameras and lens distortion are handled by the eyes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +18,14 @@ from scipy import ndimage
 from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
 from dappled.products.maps.earth import Projection
-from dappled.products.maps.eye import Eye
-from dappled.products.maps.map_grid import MapGrid, sample, smoothed_to
-from dappled.products.maps.photographs import Photograph, pose_blur_m
+from dappled.products.maps.map_grid import MapGrid, sample
+from dappled.products.maps.photographs import Photograph
 
+LEAST_OVERLAP = 0.2  # of a frame, for a pair
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
-_STEP_PX = 0.7  # of parallax between heights, over the whole aperture
-_MOST_LEVELS = 400
-_LEAST_SCORE = 0.7  # the mean correlation of a cell's frames: lower ones are wrong more often than not
-_LEAST_TEXTURE = 1e-3  # standard deviation in a window, of its mean
-_TILE = 256  # cells a side that are swept at a time: the scores of all heights are in memory
+_STEP_PX = 0.7  # of parallax between heights
+_LEAST_SCORE = 0.88  # lower scores come from edges and false matches: wrong more often than not
+_MOST_PARTNERS = 3
 
 
 class HyperstereoError(DappledError):
@@ -52,30 +49,6 @@ class Surface:
         return np.isfinite(self.height_m)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Frame:
-    """A photograph in grey, smoothed for the map's cells: the rows and columns that it may see, and σ of a match and of
-    its pose on the ground, m."""
-
-    eye: Eye
-    grey: Singles
-    reach: tuple[slice, slice]
-    match_m: float
-    pose_m: float
-
-    @classmethod
-    def of(cls, one: Photograph, grid: MapGrid, levels: tuple[float, ...], facts: Mapping[str, Any] | None) -> _Frame:
-        middle, gsd_m = levels[1], one.eye.gsd_m(levels[1])
-        image = np.asarray(one.image, dtype=np.float32)
-        grey = np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]
-        reach = _under(one.eye, grid, levels)
-        blur_m = pose_blur_m(one, middle, facts)
-        return cls(one.eye, smoothed_to(grey, grid.step_y / gsd_m), reach, _PIXEL_SIGMA * gsd_m, blur_m)
-
-    def reaches(self, tile: tuple[slice, slice]) -> bool:
-        return all(a.start < b.stop and b.start < a.stop for a, b in zip(self.reach, tile, strict=True))
-
-
 def surface(
     photographs: Sequence[Photograph],
     grid: MapGrid,
@@ -84,133 +57,158 @@ def surface(
     lowest_m: float,
     highest_m: float,
     window: int = 9,
-    facts: Mapping[str, Mapping[str, Any]] | None = None,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Surface:
-    """Find the ground between two heights, where all frames that see it agree.
+    """Find the ground between two heights, from every frame against those that overlap it.
 
-    `facts` of the survey, by the frames' names, may say what a frame's refinement left. Raises HyperstereoError where
-    no cell is seen from two places.
+    Where several pairs give a cell a height, the one with the best score is kept. Raises HyperstereoError where no two
+    frames overlap.
     """
     middle = (lowest_m + highest_m) / 2
-    known = facts or {}
-    frames = [_Frame.of(one, grid, (lowest_m, middle, highest_m), known.get(one.name)) for one in photographs]
-    height, sigma, score, pose = (np.full(grid.shape, np.nan, dtype=np.float32) for _ in range(4))
-    tiles = list(_tiles(grid.shape))
-    for number, cells in enumerate(tiles):
-        progress("hyperstereo", number, len(tiles))
-        rows, columns = (slice(k.start - window, k.stop + window) for k in cells)
-        some = [one for one in frames if one.reaches((rows, columns))]
-        if len(some) < 2:
+    height = np.full(grid.shape, np.nan, dtype=np.float32)
+    sigma = np.full(grid.shape, np.nan, dtype=np.float32)
+    best = np.full(grid.shape, -1.0, dtype=np.float32)
+    levels: list[float] = []
+    for number, one in enumerate(photographs):
+        progress("hyperstereo", number, len(photographs))
+        partners = _partners(number, photographs, middle)
+        if not partners:
             continue
-        east, north = grid.part(rows, columns).places(projection)
-        found = _swept(some, east, north, heights=(lowest_m, middle, highest_m), window=window)
-        inner = slice(window, -window)
-        for whole, part in zip((height, sigma, score, pose), found, strict=True):
-            whole[cells] = part[inner, inner]
-    progress("hyperstereo", len(tiles), len(tiles))
-    if not np.isfinite(pose).any():
-        raise HyperstereoError("no two frames of the flight show the same ground from two places")
-    return Surface(grid, height, sigma, score, float(np.nanmedian(pose)))
+        levels.append(_level_sigma(one, partners[0], middle))
+        cells = _under(one, grid, (lowest_m, middle, highest_m))
+        if cells is None:
+            continue
+        part = grid.part(*cells)
+        found = _sweep(one, partners, part, projection=projection, heights=(lowest_m, highest_m), window=window)
+        better = found.known & (found.score > best[cells])
+        for mine, theirs in ((height, found.height_m), (sigma, found.sigma_m), (best, found.score)):
+            mine[cells][better] = theirs[better]
+    if not levels:
+        raise HyperstereoError(
+            "no two frames of the flight overlap by a fifth: heights need ground that was seen twice"
+        )
+    score = np.where(np.isfinite(height), best, np.nan).astype(np.float32)
+    return Surface(grid, height, sigma, score, float(np.median(levels)))
 
 
-def _tiles(shape: tuple[int, int]) -> Iterator[tuple[slice, slice]]:
-    for top in range(0, shape[0], _TILE):
-        for left in range(0, shape[1], _TILE):
-            yield slice(top, min(top + _TILE, shape[0])), slice(left, min(left + _TILE, shape[1]))
+def _level_sigma(one: Photograph, two: Photograph, level_m: float) -> float:
+    """σ of height from σ of position and attitude at both ends of the baseline: (Z/b)·√2·hypot(σ_p, Z·σ_a)."""
+    above = float(one.eye.centre[2]) - level_m
+    baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2])) / one.eye.scale
+    return above / max(baseline, 1e-6) * math.sqrt(2) * math.hypot(one.position_sigma_m, above * one.attitude_sigma_rad)
 
 
-def _under(eye: Eye, grid: MapGrid, levels: tuple[float, ...]) -> tuple[slice, slice]:
+def _partners(number: int, photographs: Sequence[Photograph], level_m: float) -> list[Photograph]:
+    """The frames with the longest baselines that still share enough ground with this one."""
+    one = photographs[number]
+    ring = one.eye.on_plane(one.eye.border(4), level_m)
+    low, high = ring.min(axis=0), ring.max(axis=0)
+    axis = np.linspace(0.02, 0.98, 12)
+    east, north = np.meshgrid(low[0] + axis * (high[0] - low[0]), low[1] + axis * (high[1] - low[1]))
+    places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level_m)], axis=1)
+    mine = _inside(one, places)
+    shared = []
+    for other, two in enumerate(photographs):
+        if other == number:
+            continue
+        share = float(np.sum(mine & _inside(two, places))) / max(1, int(mine.sum()))
+        if share >= LEAST_OVERLAP:
+            baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2]))
+            shared.append((baseline * math.sqrt(share), other))
+    return [photographs[other] for _, other in sorted(shared, reverse=True)[:_MOST_PARTNERS]]
+
+
+def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:
+    pixels = one.eye.project(places)
+    rows, columns = one.eye.shape
+    return np.asarray(((pixels >= 0) & (pixels <= [columns - 1, rows - 1])).all(axis=1))
+
+
+def _under(one: Photograph, grid: MapGrid, levels: tuple[float, ...]) -> tuple[slice, slice] | None:
     """The grid's rows and columns that a frame may see at some of these levels."""
-    met = np.concatenate([eye.on_plane(eye.border(4), level) for level in levels])
-    lines = (grid.north - met[:, 1]) / grid.step_y, (met[:, 0] - grid.west) / grid.step_x
-    rows, columns = (slice(max(0, math.floor(line.min())), math.ceil(line.max())) for line in lines)
-    return rows, columns
+    met = np.concatenate([one.eye.on_plane(one.eye.border(4), level) for level in levels])
+    columns = (met[:, 0] - grid.west) / grid.step_x
+    rows = (grid.north - met[:, 1]) / grid.step_y
+    found = []
+    for line, side in ((rows, grid.shape[0]), (columns, grid.shape[1])):
+        first, last = max(0, math.floor(line.min())), min(side, math.ceil(line.max()))
+        if first >= last:
+            return None
+        found.append(slice(first, last))
+    return found[0], found[1]
 
 
-def _swept(
-    frames: Sequence[_Frame], east: Floats, north: Floats, *, heights: tuple[float, float, float], window: int
-) -> tuple[Singles, Singles, Singles, Singles]:
-    """(height, σ of a match, score, σ by poses) of a part of the map; NaN where unknown."""
-    match, pose = _height_sigmas(frames, east, north, heights[1])
-    unknown = np.full(east.shape, np.nan, dtype=np.float32)
-    if not np.isfinite(match).any():
-        return unknown, unknown, unknown, unknown
-    slope = _PIXEL_SIGMA / float(np.nanmin(match))  # px a metre
-    count = int(np.clip(math.ceil((heights[2] - heights[0]) * slope / _STEP_PX), 4, _MOST_LEVELS)) + 1
-    levels = np.linspace(heights[0], heights[2], count)
-    scores = np.stack([_agreement(frames, _places(east, north, level), east.shape, window) for level in levels])
-    height, score = _peaks(scores, levels)
-    known = (score >= _LEAST_SCORE) & np.isfinite(match) & np.isfinite(height)
-    sigma = match * np.maximum((1 - score) / 0.1, 1)  # larger for a lower score
-    made = [np.where(known, one, np.nan).astype(np.float32) for one in (height, sigma, score)]
-    return made[0], made[1], made[2], pose.astype(np.float32)
-
-
-def _places(east: Floats, north: Floats, level: float) -> Floats:
-    return np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
-
-
-def _agreement(frames: Sequence[_Frame], places: Floats, shape: tuple[int, int], window: int) -> Singles:
-    """(rows, columns): the mean correlation of all pairs of frames that see a place (n, 3); −1 where fewer than two
-    do."""
-    total = np.zeros(shape, dtype=np.float32)
-    squares, count = np.zeros_like(total), np.zeros_like(total)
-    for one in frames:
-        normal = _normalised(sample(one.grey, one.eye.shown_at(places).reshape(*shape, 2))[..., 0], window)
-        known = np.isfinite(normal)
-        normal = np.where(known, normal, 0)
-        total += normal
-        squares += normal**2
-        count += known
-    pairs = count * (count - 1)
-    agreed = ndimage.uniform_filter(total**2 - squares, window, mode="constant")
-    power = ndimage.uniform_filter(squares * np.maximum(count - 1, 0), window, mode="constant")  # what it is at most
-    return np.where((pairs > 0) & (power > 0), agreed / np.where(power > 0, power, 1), -1).astype(np.float32)
-
-
-def _normalised(image: Singles, window: int) -> Singles:
-    """Less its mean and over its standard deviation in a window around each cell; NaN where a part is unknown, or
-    nothing is to be seen."""
-    known = np.isfinite(image)
-    values = np.where(known, image, 0)
-    whole = ndimage.uniform_filter(known.astype(np.float32), window, mode="constant") > 1 - 1e-4
-    mean = ndimage.uniform_filter(values, window, mode="constant")
-    spread = np.sqrt(np.maximum(ndimage.uniform_filter(values**2, window, mode="constant") - mean**2, 0))
-    textured = whole & (spread > _LEAST_TEXTURE * np.abs(mean))
-    return np.where(textured, (values - mean) / np.where(textured, spread, 1), np.nan).astype(np.float32)
-
-
-def _peaks(scores: Singles, levels: Floats) -> tuple[Floats, Singles]:
-    """(height, score) of each cell's best level, between levels by a parabola; NaN at the ends of the search."""
+def _sweep(
+    one: Photograph,
+    partners: Sequence[Photograph],
+    part: MapGrid,
+    *,
+    projection: Projection,
+    heights: tuple[float, float],
+    window: int,
+) -> Surface:
+    east, north = part.places(projection)
+    slope = max(_parallax(one, two, east, north, sum(heights) / 2) for two in partners)  # px a metre
+    count = int(np.clip(math.ceil((heights[1] - heights[0]) * slope / _STEP_PX), 3, 400)) + 1
+    levels = np.linspace(*heights, count)
+    grey = [_grey(photo) for photo in (one, *partners)]
+    scores = np.full((count, *part.shape), -1.0, dtype=np.float32)
+    for number, level in enumerate(levels):
+        mine = _seen(one, grey[0], east, north, level)
+        total = np.zeros(part.shape, dtype=np.float32)
+        votes = np.zeros(part.shape, dtype=np.float32)
+        for two, theirs in zip(partners, grey[1:], strict=True):
+            alike = _correlation(mine, _seen(two, theirs, east, north, level), window)
+            seen = np.isfinite(alike)
+            total += np.where(seen, alike, 0)
+            votes += seen
+        scores[number] = np.where(votes > 0, total / np.maximum(votes, 1), -1.0)
     top = scores.argmax(axis=0)
-    inner = np.clip(top, 1, len(levels) - 2)
+    inner = np.clip(top, 1, count - 2)
     before, here, after = (np.take_along_axis(scores, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
     bend = before - 2 * here + after
     aside = np.where(bend < 0, np.clip(0.5 * (before - after) / np.where(bend < 0, bend, -1), -0.5, 0.5), 0)
-    height = np.where(top == inner, levels[0] + (inner + aside) * (levels[1] - levels[0]), np.nan)
-    return height, np.take_along_axis(scores, top[None], axis=0)[0]
+    score = np.take_along_axis(scores, top[None], axis=0)[0]
+    known = (score >= _LEAST_SCORE) & (top == inner)
+    step = levels[1] - levels[0]
+    height = np.where(known, levels[0] + (inner + aside) * step, np.nan)
+    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # larger for a lower score
+    return Surface(part, height.astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32), score)
 
 
-def _height_sigmas(frames: Sequence[_Frame], east: Floats, north: Floats, level: float) -> tuple[Floats, Floats]:
-    """σ (rows, columns) of a height from a match and from the poses, m; NaN where fewer than two frames see a cell.
+def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, level: float) -> float:
+    """Parallax in the second frame, in pixels per metre of height, in the middle of the part."""
+    place = np.array([[float(east.mean()), float(north.mean()), level]])
+    moved = one.eye.on_plane(one.eye.project(place), level + 1.0)
+    raised = two.eye.project(np.concatenate([moved, [[level + 1.0]]], axis=1))
+    return max(float(np.linalg.norm(raised - two.eye.project(place))), 1e-3)
 
-    A height error dh moves a cell by dh·a/Z on the ground, a being the camera's place aside of the cell. Least squares
-    over k frames, whose common shift is free: σ² = Σ (a − ā)²/Z² s² / (Σ (a − ā)²/Z²)² for errors s on the ground.
-    """
-    places = _places(east, north, level)
-    leans = []
-    for one in frames:
-        lean = (one.eye.centre[:2] - places[:, :2]) / one.eye.scale / max(float(one.eye.centre[2]) - level, 1e-3)
-        leans.append(np.where(np.isfinite(one.eye.shown_at(places)), lean, np.nan))
-    lean, known = np.stack(leans), np.isfinite(np.stack(leans)[..., 0])
-    mean = np.nansum(lean, axis=0) / np.maximum(known.sum(axis=0), 1)[:, None]
-    square = np.where(known, ((np.nan_to_num(lean) - mean) ** 2).sum(axis=-1), 0)
-    power = square.sum(axis=0)
-    seen = (known.sum(axis=0) >= 2) & (power > 0)
 
-    def of(errors_m: list[float]) -> Floats:
-        spread = np.sqrt((square * np.array(errors_m)[:, None] ** 2).sum(axis=0))
-        return np.where(seen, spread / np.where(seen, power, 1), np.nan).reshape(east.shape)
+def _seen(one: Photograph, grey: Singles, east: Floats, north: Floats, level: float) -> Singles:
+    """The frame projected on a plane at a level; NaN outside of it."""
+    points = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
+    at = one.eye.project(points)
+    rows, columns = one.eye.shape
+    inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
+    return sample(grey, np.where(inside[:, None], at, np.nan).reshape(*east.shape, 2))[..., 0]
 
-    return of([one.match_m for one in frames]), of([one.pose_m for one in frames])
+
+def _correlation(a: Singles, b: Singles, window: int) -> Singles:
+    """Normalised correlation in a window around each cell; NaN where either is unknown in a part of it."""
+    known = np.isfinite(a) & np.isfinite(b)
+    a, b = np.where(known, a, 0), np.where(known, b, 0)
+
+    def mean(values: Singles) -> Singles:
+        return np.asarray(ndimage.uniform_filter(values, window, mode="constant"), np.float32)
+
+    whole = mean(known.astype(np.float32)) > 1 - 1e-4
+    mean_a, mean_b = mean(a), mean(b)
+    var_a, var_b = mean(a * a) - mean_a**2, mean(b * b) - mean_b**2
+    floor = 1e-6 * np.maximum(mean_a * mean_b, 1e-12)
+    score = (mean(a * b) - mean_a * mean_b) / np.sqrt(np.maximum(var_a, floor) * np.maximum(var_b, floor))
+    return np.where(whole, np.clip(score, -1, 1), np.nan).astype(np.float32)
+
+
+def _grey(one: Photograph) -> Singles:
+    image = np.asarray(one.image, dtype=np.float32)
+    return np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]

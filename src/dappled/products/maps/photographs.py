@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -263,12 +261,3 @@ def _sigmas(pose: Pose) -> tuple[float, float]:
         DEFAULT_POSITION_SIGMA_M if position is None else position,
         DEFAULT_ATTITUDE_SIGMA_RAD if attitude is None else attitude,
     )
-
-
-def pose_blur_m(one: Photograph, level_m: float, facts: Mapping[str, Any] | None = None) -> float:
-    """σ of the place at which a frame shows a point at a level: its position's, and its attitude's over the distance;
-    of a refined frame (`facts` of the survey) what is left of its differences to the others."""
-    left = (facts or {}).get("residual_px")
-    if left is not None and facts and facts.get("refined"):
-        return float(left) * one.eye.gsd_m(level_m)
-    return math.hypot(one.position_sigma_m, (float(one.eye.centre[2]) - level_m) * one.attitude_sigma_rad)

@@ -49,16 +49,10 @@ class TerrainModel:
 
 
 def of(
-    made: Survey,
-    progress: Progress,
-    *,
-    lowest_m: float | None = None,
-    highest_m: float | None = None,
-    cell_m: float | None = None,
+    made: Survey, progress: Progress, *, lowest_m: float | None = None, highest_m: float | None = None
 ) -> TerrainModel:
-    """Find a survey's terrain by hyperstereo, between two heights above sea level (None: around the given ground), on
-    cells of `cell_m`. Raises HyperstereoError."""
-    grid = map_grid.grid_of(made.photographs, made.ground, made.projection, cell_m or CELL * made.gsd_m)
+    """Find a survey's terrain by hyperstereo, between two heights above sea level. Raises HyperstereoError."""
+    grid = map_grid.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
     east, north = grid.places(made.projection)
     given = made.ground.heights(east, north)
     low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
@@ -66,7 +60,7 @@ def of(
     lowest_eye = min(float(one.eye.centre[2]) for one in made.photographs)
     high = min(high, low + 0.8 * (lowest_eye - low))  # nothing nearer to the lowest camera than a fifth of its height
     surface = hyperstereo.surface(
-        made.photographs, grid, made.projection, lowest_m=low, highest_m=high, facts=made.facts, progress=progress
+        made.photographs, grid, made.projection, lowest_m=low, highest_m=high, progress=progress
     )
     flat = isinstance(made.ground, Flat)
     return TerrainModel(surface, None if flat else (surface.height_m - given).astype(np.float32))

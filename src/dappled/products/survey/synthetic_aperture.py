@@ -7,7 +7,8 @@ what hides a cell in fewer than half of the frames.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from dappled.products.maps import cog, map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground, Raster
 from dappled.products.maps.map_grid import MapGrid
-from dappled.products.maps.photographs import Photograph, pose_blur_m
+from dappled.products.maps.photographs import Photograph
 
 WAYS = ("mean", "median")
 _TILE = 6_000_000  # values of all frames that are in memory at a time
@@ -101,6 +102,15 @@ def raised(ground: Ground, above_m: float) -> Ground:
         return Raster(ground.values + above_m, ground.west, ground.north, ground.step_m, ground.sigma_m, name)
     assert isinstance(ground, Flat)
     return Flat(ground.height_m + above_m, ground.sigma_m)
+
+
+def pose_blur_m(one: Photograph, level_m: float, facts: Mapping[str, Any] | None = None) -> float:
+    """σ of the place at which a frame shows a point at a level: its position's, and its attitude's over the distance;
+    of a refined frame (`facts` of the survey) what is left of its differences to the others."""
+    left = (facts or {}).get("residual_px")
+    if left is not None and facts and facts.get("refined"):
+        return float(left) * one.eye.gsd_m(level_m)
+    return math.hypot(one.position_sigma_m, (float(one.eye.centre[2]) - level_m) * one.attitude_sigma_rad)
 
 
 def write_raster(made: Survey, found: RefocusedGround, path: Path) -> Path:

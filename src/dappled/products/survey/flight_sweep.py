@@ -1,0 +1,166 @@
+"""Find heights from all frames of a flight at once: a plane sweep over one wide aperture, by the frames' poses and σ.
+
+At each height every frame is projected on the map, and normalised in a window around each cell. Where the height is
+right the frames agree: the mean of all pairs' correlations is at its maximum. Pairs of frames (`maps.hyperstereo`) need
+fewer frames; here all of them count, and each frame's pose σ is part of a height's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from dappled.decode.array_types import Floats, Singles
+from dappled.products.maps import map_grid
+from dappled.products.maps.georeference import Progress, Survey
+from dappled.products.maps.ground import Flat
+from dappled.products.maps.hyperstereo import HyperstereoError, Surface
+from dappled.products.maps.map_grid import sample
+from dappled.products.maps.photographs import Photograph
+from dappled.products.maps.terrain import CELL
+from dappled.products.survey.synthetic_aperture import pose_blur_m
+
+_STEP_PX = 0.7  # of parallax between heights, over the whole aperture
+_MOST_LEVELS = 200
+_PIXEL_SIGMA = 0.12  # of a match, in pixels
+_LEAST_SCORE = 0.7  # the mean correlation of a cell's frames: lower ones are wrong more often than not
+_LEAST_TEXTURE = 1e-3  # standard deviation in a window, of its mean
+_SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
+
+
+def surface(
+    made: Survey,
+    progress: Progress,
+    *,
+    between: tuple[float, float] | None = None,
+    cell_m: float | None = None,
+    window: int = 9,
+) -> Surface:
+    """The heights above sea level where all frames agree, searched `between` two (None: around the given ground).
+
+    σ of a height is that of a match and of each frame's pose, over the frames' baselines. Raises HyperstereoError
+    where no cell is seen twice.
+    """
+    photos = made.photographs
+    grid = map_grid.grid_of(photos, made.ground, made.projection, cell_m or CELL * made.gsd_m)
+    east, north = grid.places(made.projection)
+    given = made.ground.heights(east, north)
+    low, high = between or (float(np.nanmin(given)) - _SEARCH_M[0], float(np.nanmax(given)) + _SEARCH_M[1])
+    high = min(high, low + 0.8 * (min(float(one.eye.centre[2]) for one in photos) - low))
+    middle = (low + high) / 2
+    sigmas = _height_sigmas(made, east, north, middle)
+    if not np.isfinite(sigmas).any():
+        raise HyperstereoError("no two frames of the flight show the same ground from two places")
+    px_per_m = _PIXEL_SIGMA / np.nanmin(sigmas[0]) if np.isfinite(sigmas[0]).any() else 1.0
+    levels = np.linspace(low, high, int(np.clip(math.ceil((high - low) * px_per_m / _STEP_PX), 4, _MOST_LEVELS)) + 1)
+    seen_by = [(one, _grey(one, grid.step_y, middle)) for one in photos]
+    scores = np.full((len(levels), *grid.shape), -1.0, dtype=np.float32)
+    for number, level in enumerate(levels):
+        progress("sweep", number, len(levels))
+        places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
+        scores[number] = _agreement(seen_by, places, grid.shape, window)
+    progress("sweep", len(levels), len(levels))
+    height, score = _peaks(scores, levels)
+    known = (score >= _LEAST_SCORE) & np.isfinite(sigmas[0]) & np.isfinite(height)
+    match = sigmas[0] * np.maximum((1 - score) / 0.1, 1)  # larger for a lower score
+    sigma = np.where(known, np.hypot(match, sigmas[1]), np.nan)
+    return Surface(
+        grid, np.where(known, height, np.nan).astype(np.float32), sigma.astype(np.float32),
+        np.where(known, score, np.nan).astype(np.float32),
+        float(np.median([one.position_sigma_m for one in photos])),
+    )  # fmt: skip
+
+
+def difference(made: Survey, found: Surface) -> Singles | None:
+    """Heights above the given terrain; None without one."""
+    if isinstance(made.ground, Flat):
+        return None
+    return (found.height_m - made.ground.heights(*found.grid.places(made.projection))).astype(np.float32)
+
+
+def _agreement(
+    seen_by: Sequence[tuple[Photograph, Singles]], places: Floats, shape: tuple[int, int], window: int
+) -> Singles:
+    """(rows, columns): the mean correlation of all pairs of frames that see a place (n, 3); −1 where fewer than two
+    do."""
+    total = np.zeros(shape, dtype=np.float32)
+    squares, count = np.zeros_like(total), np.zeros_like(total)
+    for one, image in seen_by:
+        at = one.eye.project(places)
+        rows, columns = one.eye.shape
+        inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
+        if not inside.any():
+            continue
+        seen = sample(image, np.where(inside[:, None], at, np.nan).reshape(*shape, 2))[..., 0]
+        normal = _normalised(seen, window)
+        known = np.isfinite(normal)
+        normal = np.where(known, normal, 0)
+        total += normal
+        squares += normal**2
+        count += known
+    pairs = count * (count - 1)
+    agreed = ndimage.uniform_filter(total**2 - squares, window, mode="constant")
+    power = ndimage.uniform_filter(squares * np.maximum(count - 1, 0), window, mode="constant")  # what it is at most
+    return np.where((pairs > 0) & (power > 0), agreed / np.where(power > 0, power, 1), -1).astype(np.float32)
+
+
+def _normalised(image: Singles, window: int) -> Singles:
+    """Less its mean and over its standard deviation in a window around each cell; NaN where a part is unknown, or
+    nothing is to be seen."""
+    known = np.isfinite(image)
+    values = np.where(known, image, 0)
+    whole = ndimage.uniform_filter(known.astype(np.float32), window, mode="constant") > 1 - 1e-4
+    mean = ndimage.uniform_filter(values, window, mode="constant")
+    spread = np.sqrt(np.maximum(ndimage.uniform_filter(values**2, window, mode="constant") - mean**2, 0))
+    textured = whole & (spread > _LEAST_TEXTURE * np.abs(mean))
+    return np.where(textured, (values - mean) / np.where(textured, spread, 1), np.nan).astype(np.float32)
+
+
+def _peaks(scores: Singles, levels: Floats) -> tuple[Floats, Singles]:
+    """(height, score) of each cell's best level, between levels by a parabola; NaN at the ends of the search."""
+    top = scores.argmax(axis=0)
+    inner = np.clip(top, 1, len(levels) - 2)
+    before, here, after = (np.take_along_axis(scores, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
+    bend = before - 2 * here + after
+    aside = np.where(bend < 0, np.clip(0.5 * (before - after) / np.where(bend < 0, bend, -1), -0.5, 0.5), 0)
+    height = np.where(top == inner, levels[0] + (inner + aside) * (levels[1] - levels[0]), np.nan)
+    return height, np.take_along_axis(scores, top[None], axis=0)[0]
+
+
+def _height_sigmas(made: Survey, east: Floats, north: Floats, level: float) -> Floats:
+    """(2, rows, columns) σ of a height from a match and from the poses, m; NaN where fewer than two frames see a cell.
+
+    A height error dh moves a cell by dh·a/Z on the ground, a being the camera's place aside of the cell. Least squares
+    over k frames, whose common shift is free: σ² = Σ (a − ā)²/Z² s² / (Σ (a − ā)²/Z²)² for errors s on the ground.
+    """
+    places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
+    leans, errors, poses = [], [], []
+    for one in made.photographs:
+        at = one.eye.project(places)
+        rows, columns = one.eye.shape
+        inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
+        away = float(one.eye.centre[2]) - level
+        lean = (one.eye.centre[:2] - places[:, :2]) / one.eye.scale / max(away, 1e-3)
+        leans.append(np.where(inside[:, None], lean, np.nan))
+        errors.append(_PIXEL_SIGMA * one.eye.gsd_m(level))
+        poses.append(pose_blur_m(one, level, made.facts.get(one.name)))
+    lean, known = np.stack(leans), np.isfinite(np.stack(leans)[..., 0])
+    count = np.maximum(known.sum(axis=0), 1)
+    mean = np.nansum(lean, axis=0) / count[:, None]
+    square = np.where(known, ((np.nan_to_num(lean) - mean) ** 2).sum(axis=-1), 0)
+    power = square.sum(axis=0)
+    seen = (known.sum(axis=0) >= 2) & (power > 0)
+    found = [
+        np.sqrt((square * np.array(of)[:, None] ** 2).sum(axis=0)) / np.where(seen, power, 1) for of in (errors, poses)
+    ]
+    return np.stack([np.where(seen, sigma, np.nan).reshape(east.shape) for sigma in found])
+
+
+def _grey(one: Photograph, cell_m: float, level: float) -> Singles:
+    """The frame in grey, smoothed for the map's cells."""
+    image = np.asarray(one.image, dtype=np.float32)
+    grey = np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]
+    return map_grid.smoothed_to(grey, cell_m / one.eye.gsd_m(level))
