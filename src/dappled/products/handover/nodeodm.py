@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from dappled import durable, picture_order
-from dappled.bounds.parsing import parse_json
+from dappled.bounds.parsing import parse_json, read_bytes
 from dappled.errors import DappledError
 from dappled.products.maps.georeference import Progress
 from dappled.shown import printable
@@ -80,7 +80,7 @@ class OdmTask:
 def _refusal(answer: Path) -> str:
     """What a server says instead of results."""
     try:
-        said = parse_json(answer.read_bytes()[:_ANSWER_BYTES], _ANSWER_BYTES)
+        said = parse_json(read_bytes(answer, _ANSWER_BYTES), _ANSWER_BYTES)  # it may have sent any number
         return str(said["error"])[:_SAID]
     except (ValueError, TypeError, KeyError, DappledError):
         return "what came is no archive"
