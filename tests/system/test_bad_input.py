@@ -163,7 +163,7 @@ def test_without_a_camera_run_ends_0_when_its_time_is_over(here: Path, tmp_path:
     done = dappled_run(file, "--for", "1.5")
     assert done.returncode == 0
     assert "camera absent: " in done.stderr
-    assert "problem: no MAVLink link is configured" in done.stderr
+    assert "caution: no MAVLink link is configured" in done.stderr
     assert "Traceback" not in done.stderr
     (flight,) = flights(here)
     assert_whole(flight)

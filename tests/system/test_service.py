@@ -159,11 +159,11 @@ def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: 
         assert any(one.get_type() == "HEARTBEAT" and one.system_status == critical for one in heard)
         until(manager, lambda told: told.startswith("STATUS=") and text in told)
         asked = dappled("status", f"ipc://{tmp_path}/r/slices", "--timeout", "30")
-        assert f"problem   {text}" in asked.stdout, asked.stderr
+        assert f"stop      {text}" in asked.stdout, asked.stderr
         with httpx.Client(base_url=f"http://127.0.0.1:{pages}", timeout=30) as page:
             state = page.get("/api/state").json()
             assert any(text in problem for problem in problems(state["health"]))
-            assert re.search(r"^dappled_problems [1-9]", page.get("/metrics").text, re.MULTILINE)
+            assert re.search(r'^dappled_finding{code="disk.nearly_full"} 2', page.get("/metrics").text, re.MULTILINE)
         with closing(mavutil.mavlink_connection(f"udpout:127.0.0.1:{links}", source_system=254)) as late:
             heard = listening(late, time.monotonic() + 60)  # it missed what was said before
             assert any(one.get_type() == "STATUSTEXT" and text in one.text for one in heard)
