@@ -82,6 +82,15 @@ def test_a_vehicle_can_t_be_chosen_without_telemetry(frames: Path, capsys: pytes
     assert "there is no telemetry; leave it out" in capsys.readouterr().err
 
 
+def test_an_antenna_tracker_is_no_vehicle(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def tracker(step: int) -> list[tuple[int, int, MavlinkMessage]]:
+        return [(1, 1, mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_ANTENNA_TRACKER, 3, 0, 0, 4, 3))]
+
+    log = logged(frames.parent, extra=tracker, moving=(1, 2))
+    assert main(["replay", str(frames), "--telemetry", str(log), "--json"]) == 0
+    assert north_deg(capsys) == 20.0
+
+
 def test_two_moving_vehicles_are_not_told_apart(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     log = logged(frames.parent, moving=(1, 2))
     assert main(["replay", str(frames), "--telemetry", str(log)]) == 1

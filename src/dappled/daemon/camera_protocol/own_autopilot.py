@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dappled.clock import Clock
-from dappled.daemon.navigation.samples import EPOCH_US, WRAP_US
+from dappled.daemon.navigation.samples import EPOCH_US, NO_VEHICLES, WRAP_US
 from dappled.daemon.pipeline.repeats import AutopilotCommands
 from dappled.daemon.vehicle_battery import BATTERY_STREAM, BatteryReports, VehicleBattery
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
@@ -49,13 +49,6 @@ class Links(Protocol):
     def send(self, message: MavlinkMessage, link: int | None = None, *, without: int | None = None) -> bool: ...
 
 
-_NO_VEHICLES = frozenset(
-    getattr(mavlink, f"MAV_TYPE_{name}")
-    for name in ("ANTENNA_TRACKER", "GCS", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION",
-                 "FLARM", "SERVO", "ODID", "BATTERY", "PARACHUTE", "LOG", "OSD", "IMU", "GPS", "WINCH")
-)  # fmt: skip
-
-
 class SystemIdentity:
     """Which system this camera belongs to.
 
@@ -82,7 +75,7 @@ class SystemIdentity:
 
     def heard(self, message: MavlinkMessage, link: int, now_ns: int) -> None:
         """Take a HEARTBEAT. Times are monotonic."""
-        of_vehicle = message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and message.type not in _NO_VEHICLES
+        of_vehicle = message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and message.type not in NO_VEHICLES
         if not of_vehicle or message.get_srcComponent() != mavlink.MAV_COMP_ID_AUTOPILOT1:
             return
         if len(self.autopilots) < 32 or message.get_srcSystem() in self.autopilots:

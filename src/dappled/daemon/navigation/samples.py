@@ -29,6 +29,12 @@ _ONE_JUMP_NS = 10**9
 _ARRIVED_NS, _ARRIVED_FEW, _ARRIVED_MOST = 5 * 10**9, 10, 1024
 _SOONER_NS, _SOONER_SHARE = 60_000_000, 5.0
 _UTC_STEP_NS = 50_000_000
+NO_VEHICLES = frozenset(
+    getattr(mavlink, f"MAV_TYPE_{name}")
+    for name in ("ANTENNA_TRACKER", "GCS", "ONBOARD_CONTROLLER", "GIMBAL", "ADSB", "CAMERA", "CHARGING_STATION",
+                 "FLARM", "SERVO", "ODID", "BATTERY", "PARACHUTE", "LOG", "OSD", "IMU", "GPS", "WINCH")
+)  # fmt: skip
+"""What may name an autopilot in its heartbeat, and is none of a vehicle: MAV_TYPE."""
 MOST_SAMPLES = 2**16  # of one kind: three minutes at 360 Hz, more than any autopilot sends
 
 

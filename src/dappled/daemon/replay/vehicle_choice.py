@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.daemon.navigation.samples import is_impossible
+from dappled.daemon.navigation.samples import NO_VEHICLES, is_impossible
 from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Subject, finding
@@ -66,7 +66,7 @@ def vehicle_of(log: Path, wanted: int | None) -> tuple[int | None, list[Finding]
 def _evidence(log: Path) -> dict[int, _Evidence]:
     """What is known of each vehicle whose autopilot sent a position."""
     found: dict[int, _Evidence] = {}
-    cameras: set[int] = set()
+    cameras, others = set[int](), set[int]()
     parse = PacketParser()
     several = len({system for system, _, number, _ in _headers(log) if number == _POSITION}) > 1
     for system, component, number, raw in _headers(log):
@@ -83,6 +83,10 @@ def _evidence(log: Path) -> dict[int, _Evidence]:
             number == mavlink.MAVLINK_MSG_ID_HEARTBEAT and message.type == mavlink.MAV_TYPE_CAMERA
         ):
             cameras.add(system)
+        elif number == mavlink.MAVLINK_MSG_ID_HEARTBEAT and component == 1 and message.type in NO_VEHICLES:
+            others.add(system)
+    if len(found.keys() - others) > 0:  # an antenna tracker has a position too
+        found = {system: one for system, one in found.items() if system not in others}
     for system, one in found.items():
         one.camera = system in cameras
     return found
