@@ -47,6 +47,12 @@ class Eye:
         """(n, 2) pixels of map points (n, 3); NaN behind the camera."""
         return self.pixels((points - self.centre) / (self.scale, self.scale, 1.0) @ self.rotation)
 
+    def shown_at(self, points: Floats) -> Floats:
+        """(n, 2) pixels of map points (n, 3); NaN outside of the picture."""
+        at = self.project(points)
+        rows, columns = self.shape
+        return np.where(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1, keepdims=True), at, np.nan)
+
     def pixels(self, seen: Floats) -> Floats:
         """(n, 2) pixels of points (n, 3) in camera axes; NaN behind the camera."""
         ahead = np.where(seen[:, 2] > 1e-9, seen[:, 2], np.nan)

@@ -119,9 +119,7 @@ def _partners(number: int, photographs: Sequence[Photograph], level_m: float) ->
 
 
 def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:
-    pixels = one.eye.project(places)
-    rows, columns = one.eye.shape
-    return np.asarray(((pixels >= 0) & (pixels <= [columns - 1, rows - 1])).all(axis=1))
+    return np.isfinite(one.eye.shown_at(places)[:, 0])
 
 
 def _under(one: Photograph, grid: MapGrid, levels: tuple[float, ...]) -> tuple[slice, slice] | None:
@@ -163,17 +161,22 @@ def _sweep(
             total += np.where(seen, alike, 0)
             votes += seen
         scores[number] = np.where(votes > 0, total / np.maximum(votes, 1), -1.0)
+    height, score = peaks(scores, levels)
+    known = (score >= _LEAST_SCORE) & np.isfinite(height)
+    height = np.where(known, height, np.nan)
+    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # larger for a lower score
+    return Surface(part, height.astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32), score)
+
+
+def peaks(scores: Singles, levels: Floats) -> tuple[Floats, Singles]:
+    """(height, score) of each cell's best level, between levels by a parabola; NaN at the ends of the search."""
     top = scores.argmax(axis=0)
-    inner = np.clip(top, 1, count - 2)
+    inner = np.clip(top, 1, len(levels) - 2)
     before, here, after = (np.take_along_axis(scores, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
     bend = before - 2 * here + after
     aside = np.where(bend < 0, np.clip(0.5 * (before - after) / np.where(bend < 0, bend, -1), -0.5, 0.5), 0)
-    score = np.take_along_axis(scores, top[None], axis=0)[0]
-    known = (score >= _LEAST_SCORE) & (top == inner)
-    step = levels[1] - levels[0]
-    height = np.where(known, levels[0] + (inner + aside) * step, np.nan)
-    sigma = _PIXEL_SIGMA / slope * np.maximum((1 - score) / 0.02, 1)  # larger for a lower score
-    return Surface(part, height.astype(np.float32), np.where(known, sigma, np.nan).astype(np.float32), score)
+    height = np.where(top == inner, levels[0] + (inner + aside) * (levels[1] - levels[0]), np.nan)
+    return height, np.take_along_axis(scores, top[None], axis=0)[0]
 
 
 def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, level: float) -> float:
@@ -187,10 +190,7 @@ def _parallax(one: Photograph, two: Photograph, east: Floats, north: Floats, lev
 def _seen(one: Photograph, grey: Singles, east: Floats, north: Floats, level: float) -> Singles:
     """The frame projected on a plane at a level; NaN outside of it."""
     points = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
-    at = one.eye.project(points)
-    rows, columns = one.eye.shape
-    inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
-    return sample(grey, np.where(inside[:, None], at, np.nan).reshape(*east.shape, 2))[..., 0]
+    return sample(grey, one.eye.shown_at(points).reshape(*east.shape, 2))[..., 0]
 
 
 def _correlation(a: Singles, b: Singles, window: int) -> Singles:

@@ -17,7 +17,7 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.products.maps import map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat
-from dappled.products.maps.hyperstereo import HyperstereoError, Surface
+from dappled.products.maps.hyperstereo import HyperstereoError, Surface, peaks
 from dappled.products.maps.map_grid import sample
 from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.terrain import CELL
@@ -63,7 +63,7 @@ def surface(
         places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
         scores[number] = _agreement(seen_by, places, grid.shape, window)
     progress("sweep", len(levels), len(levels))
-    height, score = _peaks(scores, levels)
+    height, score = peaks(scores, levels)
     known = (score >= _LEAST_SCORE) & np.isfinite(sigmas[0]) & np.isfinite(height)
     match = sigmas[0] * np.maximum((1 - score) / 0.1, 1)  # larger for a lower score
     sigma = np.where(known, np.hypot(match, sigmas[1]), np.nan)
@@ -89,12 +89,10 @@ def _agreement(
     total = np.zeros(shape, dtype=np.float32)
     squares, count = np.zeros_like(total), np.zeros_like(total)
     for one, image in seen_by:
-        at = one.eye.project(places)
-        rows, columns = one.eye.shape
-        inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
-        if not inside.any():
+        at = one.eye.shown_at(places)
+        if not np.isfinite(at).any():
             continue
-        seen = sample(image, np.where(inside[:, None], at, np.nan).reshape(*shape, 2))[..., 0]
+        seen = sample(image, at.reshape(*shape, 2))[..., 0]
         normal = _normalised(seen, window)
         known = np.isfinite(normal)
         normal = np.where(known, normal, 0)
@@ -119,17 +117,6 @@ def _normalised(image: Singles, window: int) -> Singles:
     return np.where(textured, (values - mean) / np.where(textured, spread, 1), np.nan).astype(np.float32)
 
 
-def _peaks(scores: Singles, levels: Floats) -> tuple[Floats, Singles]:
-    """(height, score) of each cell's best level, between levels by a parabola; NaN at the ends of the search."""
-    top = scores.argmax(axis=0)
-    inner = np.clip(top, 1, len(levels) - 2)
-    before, here, after = (np.take_along_axis(scores, (inner + k)[None], axis=0)[0] for k in (-1, 0, 1))
-    bend = before - 2 * here + after
-    aside = np.where(bend < 0, np.clip(0.5 * (before - after) / np.where(bend < 0, bend, -1), -0.5, 0.5), 0)
-    height = np.where(top == inner, levels[0] + (inner + aside) * (levels[1] - levels[0]), np.nan)
-    return height, np.take_along_axis(scores, top[None], axis=0)[0]
-
-
 def _height_sigmas(made: Survey, east: Floats, north: Floats, level: float) -> Floats:
     """(2, rows, columns) σ of a height from a match and from the poses, m; NaN where fewer than two frames see a cell.
 
@@ -139,12 +126,9 @@ def _height_sigmas(made: Survey, east: Floats, north: Floats, level: float) -> F
     places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level)], axis=1)
     leans, errors, poses = [], [], []
     for one in made.photographs:
-        at = one.eye.project(places)
-        rows, columns = one.eye.shape
-        inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
         away = float(one.eye.centre[2]) - level
         lean = (one.eye.centre[:2] - places[:, :2]) / one.eye.scale / max(away, 1e-3)
-        leans.append(np.where(inside[:, None], lean, np.nan))
+        leans.append(np.where(np.isfinite(one.eye.shown_at(places)), lean, np.nan))
         errors.append(_PIXEL_SIGMA * one.eye.gsd_m(level))
         poses.append(pose_blur_m(one, level, made.facts.get(one.name)))
     lean, known = np.stack(leans), np.isfinite(np.stack(leans)[..., 0])

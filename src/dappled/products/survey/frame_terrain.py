@@ -241,11 +241,10 @@ def _looked(one: Photograph, values: tuple[Floats, Floats], at: Floats) -> tuple
     """(step in height, its σ, 1/Z less the measured one) that a frame says of places (rows, columns, 3)."""
     eye = one.eye
     flat = at.reshape(-1, 3)
-    pixels = eye.project(flat)
+    pixels = eye.shown_at(flat)
     axis = eye.rotation[:, 2]
     distance = ((flat - eye.centre) / (eye.scale, eye.scale, 1.0)) @ axis
-    rows, columns = eye.shape
-    inside = (pixels >= 0).all(axis=1) & (pixels <= [columns - 1, rows - 1]).all(axis=1) & (distance > 0)
+    inside = np.isfinite(pixels[:, 0]) & (distance > 0)
     pick = np.where(inside[:, None], pixels, 0)[:, ::-1].T
     inverse, sigma = (
         np.where(inside, ndimage.map_coordinates(v, pick, order=1, mode="nearest"), np.nan) for v in values

@@ -88,22 +88,18 @@ def _worth(made: Survey, one: Photograph, two: Photograph) -> float:
 
 
 def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:
-    at = one.eye.project(places)
-    rows, columns = one.eye.shape
-    return np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
+    return np.isfinite(one.eye.shown_at(places)[:, 0])
 
 
 def _mapped(made: Survey, one: Photograph, places: Floats, size: float) -> Singles:
     """A frame on the ground at places (rows, columns, 2); NaN where it doesn't look."""
     height = made.ground.heights(places[..., 0], places[..., 1])
-    at = one.eye.project(np.concatenate([places, height[..., None]], axis=-1).reshape(-1, 3))
-    rows, columns = one.eye.shape
-    inside = np.asarray(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1))
+    at = one.eye.shown_at(np.concatenate([places, height[..., None]], axis=-1).reshape(-1, 3))
     image = np.asarray(one.image, np.float32)
     image = image[..., None] if image.ndim == 2 else image
     level = float(np.nanmedian(height))
     smooth = map_grid.smoothed_to(image, size / one.eye.scale / one.eye.gsd_m(level))
-    seen = map_grid.sample(smooth, np.where(inside[:, None], at, np.nan).reshape(*places.shape[:2], 2))
+    seen = map_grid.sample(smooth, at.reshape(*places.shape[:2], 2))
     return seen[..., 0] if seen.shape[2] == 1 else seen
 
 
