@@ -17,6 +17,8 @@ from types import MappingProxyType
 from typing import Any, Self, TypeAlias
 
 Value: TypeAlias = str | int | float | bool | None
+# What a result was made with, beside its own frames: its findings are told with its name.
+_BESIDE = frozenset({"bare frames", "calibration", "white frame"})
 _NO_FACTS: Mapping[str, Value] = MappingProxyType({})
 
 
@@ -402,9 +404,12 @@ def remedy(one: Finding) -> str:
 
 
 def named(one: Finding, under: Subject | None = None) -> str:
-    """What was found, of what, where there are several such things; what stands `under` its subject's name needs it not
-    again."""
-    return text(one) if one.subject.which == "" or one.subject == under else f"{one.subject}: {text(one)}"
+    """What was found, of what, where there are several such things or the result isn't about it.
+
+    What stands `under` its subject's name needs it not again.
+    """
+    plain_one = one.subject.which == "" and one.subject.kind not in _BESIDE
+    return text(one) if plain_one or one.subject == under else f"{one.subject}: {text(one)}"
 
 
 def told(one: Finding, under: Subject | None = None) -> str:

@@ -19,6 +19,7 @@ MODULES_A_FOLDER, LINES_A_MODULE = 26, 500  # the largest of 2026-11-27
 
 # What nothing in src calls, and why it stays.
 UNUSED = {
+    "_check_value": "argparse calls it, to refuse a word that is no choice",
     "__getattr__": "Python calls it, for the public names that are loaded when they are asked for",
     "__dir__": "Python calls it, for `dir(dappled)`",
     "collect": "prometheus_client calls it",

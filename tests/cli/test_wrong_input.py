@@ -103,7 +103,7 @@ def test_a_period_of_the_scene_is_no_light_field(
 @pytest.mark.parametrize(
     ("named", "told"),
     [
-        ("mask-1", "stronger peaks stand half-way between this mask's carriers: another mask, with periods twice as"),
+        ("mask-1", "stronger peaks stand half-way between this mask's carriers: another mask, of double periods"),
         ("mask-4", "which should stand out as well: another mask"),
     ],
 )

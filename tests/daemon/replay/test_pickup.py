@@ -97,7 +97,7 @@ def test_a_second_card_that_numbers_from_1_again_is_brought_too(
     told = capfd.readouterr()
     out = told.out
     assert "3 frames brought, 0 already there, 0 missing" in out
-    assert "note: card: the camera's memory card was changed" in told.err
+    assert "note: the camera's memory card was changed" in told.err
     expected = [(card / name).read_bytes() for card in (first, second) for name in names]
     assert flight.frames() == dict(enumerate(expected))
     (noticed,) = [of_json_text(text) for _, text in flight.events("noticed")]

@@ -230,7 +230,7 @@ def test_a_log_that_was_cut_short_is_in_doubt_where_frames_need_the_rest(
     assert main(call) == code
     said = capsys.readouterr().err
     if form == "bin" or code:  # of a link's log no more is read than the frames need
-        assert f"{'caution' if code else 'note'}: log {log}: " in said
+        assert f"{'in doubt' if code else 'note'}: log {log}: " in said
     assert main([*call, "--anyway"]) == 0
 
 
