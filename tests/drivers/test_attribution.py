@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,8 @@ def test_a_clock_that_was_set_back_to_the_time_of_a_shot_that_was_given_up_is_no
     assert found.doubt is None or found.doubt.facts["rival"] == 9
     alone = attribute(clue(5030, 168.0, since_s), [claim(5, 130)], [], KNOWN)
     assert (alone.doubt is None) == (doubt is None)
+    counted = attribute(replace(clue(5030, 168.0, since_s), after=4), [claim(5, 130)], [claim(9, 167)], KNOWN)
+    assert (counted.shot, counted.doubt) == (5, None)  # the camera's count agrees with its clock
 
 
 def test_the_first_frame_is_in_doubt_where_another_picture_comes_soon_after_its_shot() -> None:

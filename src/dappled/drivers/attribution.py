@@ -131,9 +131,9 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
 
     By names, a file is of no shot before `clue.after` or behind `clue.before`. By the body's clock it is of a shot that
     it fits. Of several that fit, and where there is no clock, files come in order; a shot given up is a rival, and in
-    doubt where its picture would be known already. A file
-    that fits none is a picture of another moment, a stray, where it can have been made then: not before `since_ns` and
-    not after the awaited shot was fired. Else the body was slow or its clock was set, and it is the awaited shot's, in
+    doubt where its picture would be known already and no names confirm its place. A file that fits none is a picture of
+    another moment, a stray, where it can have been made then: not before `since_ns` and not after the awaited shot was
+    fired. Else the body was slow or its clock was set, and it is the awaited shot's, in
     doubt; so is the second such file in a row. From then on the new time counts.
     """
     claims = [one for one in (*late, *waiting) if _possible(one, clue)]
@@ -217,8 +217,8 @@ def _by_order(
 
 def _would_be_known(claim: Claim, clue: FileClue) -> bool:
     """Whether this shot's picture was made before a time whose pictures are all known: the body's clock may have been
-    set back to the time of this shot."""
-    return clue.since_ns is not None and claim.fired_ns + TOLERANCE_S * 1e9 < clue.since_ns
+    set back to the time of this shot. Not where times run as the camera counts: a body may write a file late."""
+    return clue.after is None and clue.since_ns is not None and claim.fired_ns + TOLERANCE_S * 1e9 < clue.since_ns
 
 
 def _unconfirmed(chosen: Claim, awaited: Claim | None) -> Finding:
