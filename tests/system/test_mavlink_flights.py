@@ -18,6 +18,7 @@ from dappled.daemon.camera_protocol.parameters import code
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.findings import Code, Subject
 from dappled.flight import LedgerReader
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
@@ -103,10 +104,16 @@ def test_a_pilot_is_told_of_a_camera_that_went_and_came_back(tmp_path: Path) -> 
             peer.command(2000, 0, 0, 1, 1)
             assert peer.ack(2000) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
             body.fault("clear")
+            peer.until(lambda m: m.get_type() == "STATUSTEXT" and "over: the camera is" in m.text, "camera back")
             daemon.until_ready()
             assert shoot(peer, 2) == (0, 1)
             folder = daemon.service.folder
-        assert any(event.startswith("refused: IMAGE_START_CAPTURE from mavlink:255/190") for event in told(folder))
+        with LedgerReader.open(folder / "flight.sqlite") as ledger:
+            (refused,) = [event.finding for event in ledger.events() if event.kind == "refused"]
+        assert refused is not None
+        assert refused.code in {Code.CAMERA_ABSENT, Code.CAMERA_FAULTED}
+        assert refused.subject == Subject("source", "mavlink:255/190")
+        assert refused.facts["request"] == "IMAGE_START_CAPTURE"
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from dappled.daemon.health.standing import NewFindings
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.findings import Finding, Level, told, worst
+from dappled.findings import Finding, Level, Subject, named, told
 
 PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
@@ -36,21 +36,26 @@ class PilotMessages:
 
 
 class Alarms:
-    """Warns of each finding above a note once, when it begins, and says when the last one has ended."""
+    """Warns of each finding above a note once, when it begins, and says when a stop or the last one has ended."""
 
     def __init__(self) -> None:
         self._new = NewFindings()
-        self.troubled = False
+        self._stops: dict[Subject, Finding] = {}
+
+    @property
+    def troubled(self) -> bool:
+        """Whether there was a stop at the last call of `lines`."""
+        return bool(self._stops)
 
     def lines(self, found: Sequence[Finding], *, again: bool = False) -> list[tuple[str, int]]:
-        """The sentences to send now, each with its severity. `again` repeats those that last. From now on it is
-        `troubled` where one of them is a stop."""
+        """The sentences to send now, each with its severity. `again` repeats those that last."""
         before, new = bool(self._new), self._new.among(found, again=again)
-        self.troubled = worst(found) is Level.STOP
+        before_stops, self._stops = self._stops, {one.subject: one for one in found if one.level is Level.STOP}
         lines = [(told(one), _SEVERITIES[one.level]) for one in new]
         if before and not self._new:
-            lines.append(("all is well again", mavlink.MAV_SEVERITY_INFO))
-        return lines
+            return [("all is well again", mavlink.MAV_SEVERITY_INFO)]
+        ended = [one for subject, one in before_stops.items() if subject not in self._stops]
+        return lines + [(f"over: {named(one)}", mavlink.MAV_SEVERITY_INFO) for one in ended]
 
 
 class GroundStations:
