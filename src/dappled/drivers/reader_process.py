@@ -8,6 +8,7 @@ The process writes arrays end to end into a temporary file, and an answer in JSO
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import math
 import mmap
@@ -86,7 +87,8 @@ def read(
         except subprocess.TimeoutExpired:
             raise ValueError(f"the {library} library did not come to an end with it") from None
         if done.returncode != 0:
-            raise ValueError(f"the {library} library failed on it")
+            most = claims.in_words(memory)  # C libraries end or crash without a word when they get none
+            raise ValueError(f"the {library} library failed on it, or takes more memory than {most}")
         answered.seek(0)
         answer = parse_json(answered.read(_ANSWER_BYTES + 1), _ANSWER_BYTES)
         if "kind" in answer:
@@ -94,13 +96,16 @@ def read(
         return _mapped(out, answer["arrays"]), answer["text"]
 
 
-def serve(answer: Callable[[str, Sequence[str]], ReadArrays]) -> None:
-    """In the process: let `answer(path, words)` read the file, and hand over what it returns or raises."""
+def serve(answer: Callable[[str, Sequence[str]], ReadArrays], library: str) -> None:
+    """In the process: let `answer(path, words)` read the file, and hand over what it returns or raises. The `library`'s
+    module is loaded before memory is limited: what it takes itself isn't the file's."""
     path, out, memory, seconds, *words = sys.argv[1:]
-    _limit(int(memory))
-    _limit_use(int(memory), int(seconds))
     stdout = sys.stdout
     sys.stdout = sys.stderr  # libraries print
+    with suppress(ImportError):  # `answer` says so
+        importlib.import_module(library)
+    _limit(int(memory))
+    _limit_use(int(memory), int(seconds))
     stdout.write(json.dumps(_answered(answer, path, words, out, int(memory))))
     stdout.flush()
 
@@ -119,7 +124,8 @@ def _answered(
     except (MemoryError, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EFBIG, errno.ENOMEM):
             return {"kind": "damage", "words": first_line(error)}
-        _limit(None)
+        error.__traceback__ = None  # its frames hold what was read
+        _unlimit()
         most = claims.in_words(memory)
         return {"kind": "memory", "words": f"it takes more memory or disk to read than is free, or than {most}"}
     except Exception as error:  # noqa: BLE001  # these libraries raise anything on damaged bytes
@@ -132,14 +138,23 @@ def _written(file: IO[bytes], name: str, array: NDArray[Any]) -> tuple[str, str,
     return name, array.dtype.str, list(array.shape)
 
 
-def _limit(memory: int | None) -> None:
-    """Limit the memory that this process may take from now on, where the system can; None: end the limit."""
+def _limit(memory: int) -> None:
+    """Limit the memory that this process may take from now on, where the system can."""
     with suppress(ImportError, OSError, ValueError):
         import resource  # noqa: PLC0415  # Windows has none
 
         _, most = resource.getrlimit(resource.RLIMIT_AS)
         taken = int(_STATM.read_text(encoding="ascii").split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (most if memory is None else taken + memory, most))
+        resource.setrlimit(resource.RLIMIT_AS, (taken + memory, most))
+
+
+def _unlimit() -> None:
+    """End the limit of memory. Nothing may be opened here: that takes some."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource  # noqa: PLC0415  # Windows has none
+
+        _, most = resource.getrlimit(resource.RLIMIT_AS)
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
 
 
 def _limit_use(size: int, seconds: int) -> None:

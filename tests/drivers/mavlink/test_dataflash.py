@@ -143,7 +143,7 @@ def of_nothing(count: int) -> bytes:
     ("budget", "says"),
     [
         (Budget(1e9, patience_s=1.0), "come to an end"),
-        (Budget(1e9, memory=1 << 24, ratio=0), "more memory"),
+        (Budget(1e9, memory=1 << 22, ratio=0), "more memory"),
     ],
     ids=["time", "memory"],
 )

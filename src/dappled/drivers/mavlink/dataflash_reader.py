@@ -56,4 +56,4 @@ def _array(column: list[Any]) -> NDArray[Any]:
 
 
 if __name__ == "__main__":
-    reader_process.serve(_answer)
+    reader_process.serve(_answer, "pymavlink.DFReader")

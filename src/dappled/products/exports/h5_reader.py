@@ -51,4 +51,4 @@ def _answer(path: str, words: Sequence[str]) -> ReadArrays:
 
 
 if __name__ == "__main__":
-    reader_process.serve(_answer)
+    reader_process.serve(_answer, "h5py")
