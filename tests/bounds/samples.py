@@ -77,8 +77,8 @@ def honest(folder: Path) -> dict[str, Path]:
 _FOLDERS = ("facts", "manifest", "views", "background", "lytro-raw")
 _SHOT = '{"cause":{"kind":"k","sequence":null,"source":"s"},"index":%s,"wished_monotonic_ns":1,"wished_utc_ns":1}\n'
 _LINE = (
-    '{"key":"%s","flight":"f","frame":"g","outputs":[{"name":"a/b.zarr","size":%s,"sha256":"0"}],"error":null,'
-    '"seconds":1.0,"cpu_seconds":1.0,"peak_mb":1.0}\n'
+    '{"key":"%s","flight":"f","frame":"g","outputs":[{"name":"a/b.zarr","kind":"lightfield","size":%s,"sha256":"0"}],'
+    '"error":null,"seconds":1.0,"cpu_seconds":1.0,"peak_mb":1.0}\n'
 )
 
 

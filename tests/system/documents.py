@@ -77,7 +77,7 @@ ELSEWHERE = {
 """Commands that need more than this stage has, and the tests that give it to them."""
 
 FINDINGS = {
-    "dappled doctor": "go",  # no-go: not every place on the stage has a camera
+    "dappled doctor": "NO GO",  # no-go: not every place on the stage has a camera
     "dappled depth --flight": "fly lower, or use pairs of frames",  # the demo's frames are at the limit of Eq 5
 }
 """Commands that may end with 1 here because of what they find, and what they say then; the documents say so too."""
