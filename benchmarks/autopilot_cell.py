@@ -437,7 +437,7 @@ def _tagged(truth_ns: int, exposure: ExposureTime, pose: Pose) -> Tagged:
             upright = (pose.altitude_msl_m - truth.altitude_msl_m) / pose.vertical_sigma_m
     if pose.attitude is not None and pose.attitude_sigma_rad is not None:
         attitude = turn_rad(pose.attitude, truth.attitude) / pose.attitude_sigma_rad
-    doubt = "in doubt" in exposure.source
+    doubt = bool(exposure.doubts)
     return Tagged(off_ms * 1e6 / exposure.sigma_ns, off_ms, across, upright, attitude, doubt, exposure.source)
 
 

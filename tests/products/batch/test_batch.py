@@ -329,6 +329,7 @@ def test_a_torn_manifest_keeps_its_whole_lines(tmp_path: Path) -> None:
         Manifest(tmp_path)
 
 
+@pytest.mark.slow  # Dask is in the larger environment
 def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workers, "_PATIENCE_S", 0.5)
     with pytest.raises(DappledError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
