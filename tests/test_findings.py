@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -56,3 +57,14 @@ def test_facts_from_a_damaged_file_are_shown_as_they_are() -> None:
     assert findings.of_json_text('{"code": "camera.absent"}') is None
     assert findings.of_json_text("the camera is absent") is None
     assert findings.of_json_text(findings.json_text(one)) == one
+
+
+def test_a_number_that_no_format_takes_is_shown() -> None:
+    assert findings.text(finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=10**400))
+
+
+def test_a_subject_that_is_no_name_is_refused() -> None:
+    row = finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=0.1).to_json()
+    assert findings.of_json_text(json.dumps(row)) is not None
+    row["subject"]["which"] = [1]
+    assert findings.of_json_text(json.dumps(row)) is None

@@ -319,8 +319,10 @@ class Finding:
 
     @classmethod
     def from_json(cls, row: Mapping[str, Any]) -> Self:
-        """What `to_json` made. Raises KeyError or ValueError where a part is missing or unknown."""
+        """What `to_json` made. Raises KeyError, TypeError or ValueError where a part is missing or unknown."""
         about = row["subject"]
+        if not isinstance(about["which"], str | int):
+            raise TypeError("a finding's subject is a name or a number")
         return cls(
             Code(row["code"]),
             Subject(str(about["kind"]), about["which"]),
@@ -385,7 +387,7 @@ class _Sentences(string.Formatter):
             return f"{value} {format_spec[1:]}" + ("" if value == 1 else "s")
         try:
             return format(value, format_spec)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             return str(value)
 
 

@@ -85,8 +85,8 @@ def test_a_finding_is_said_once_each_time_it_begins() -> None:
     )
     remarks.look()
     assert lines == []  # not yet a second old
-    a, b = (finding(Code.THREAD_ENDED, Subject("thread", name), thread=name) for name in "ab")
-    words = {one: f"thread {name}: the {name} thread has ended: restart dappled" for one, name in ((a, "a"), (b, "b"))}
+    a, b = (finding(Code.THREAD_ENDED, Subject("thread", name)) for name in "ab")
+    words = {one: f"thread {name}: it has ended: restart dappled" for one, name in ((a, "a"), (b, "b"))}
     for now in ([b, a], [a], [a, b]):
         here[:] = now
         clock.advance(1)

@@ -249,7 +249,7 @@ def test_another_component_with_our_ids_is_a_problem(
     try:
         service._autopilot.identity.settled = True  # as after three seconds
         said = list[str]()
-        monkeypatch.setattr(service.component, "say", lambda text, *_: said.append(text))
+        monkeypatch.setattr(service.component, "say", lambda text, *_, **__: said.append(text))
         with Peer(service.links.port(0), 1, settings.mavlink.component_id) as twin:
             twin.packer.seq = 200
             twin.heartbeat()
@@ -272,7 +272,7 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         (pending,) = shots
         component, said = service.component, list[str]()
         assert pending.tag is not None
-        monkeypatch.setattr(component, "say", lambda text, *_: said.append(text))
+        monkeypatch.setattr(component, "say", lambda text, *_, **__: said.append(text))
         for length_mm in (35.0, None, 35.0, 55.0):
             pending.tag = replace(pending.tag, focal_length_mm=length_mm)
             service._events.tagged(pending)
@@ -336,7 +336,7 @@ def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
     try:
         with monkeypatch.context() as broken:
             broken.setattr(service._answers, "dead_threads", lambda: ["answers"])
-            assert "the answers thread has ended: restart dappled" in problems(service.health())
+            assert "thread answers: it has ended: restart dappled" in problems(service.health())
             assert service.healthy()
             broken.setattr(service._pipeline, "dead_threads", lambda: ["capture"])
             assert not service.healthy()
@@ -354,7 +354,7 @@ def test_a_camera_driver_s_thread_that_dies_is_reported(
         assert service.healthy()
         dead.append("gphoto2")
         assert not service.healthy()
-        assert "the gphoto2 thread has ended: restart dappled" in problems(service.health())
+        assert "thread gphoto2: it has ended: restart dappled" in problems(service.health())
     finally:
         service.stop()
 

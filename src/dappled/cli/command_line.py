@@ -253,7 +253,7 @@ def _number(text: str, kind: type, form: Argument) -> float | int:
     except ValueError:
         number = math.nan
     low_enough = number >= rule.low if form.above is None else number > form.above
-    if low_enough and number <= rule.high and (math.isfinite(number) or form.infinite):
+    if low_enough and number <= rule.high and (isinstance(number, int) or math.isfinite(number) or form.infinite):
         return number
     what = "a whole number" if kind is int else "a number"
     unit = f" {rule.unit}" if rule.unit else ""

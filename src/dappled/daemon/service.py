@@ -37,7 +37,7 @@ from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.health.record import DecodingState
-from dappled.daemon.health.standing import StandingFindings, unasked
+from dappled.daemon.health.standing import StandingFindings
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
@@ -380,8 +380,8 @@ class Service:
     def _publish_health(self) -> None:
         record = self.health()
         self._publisher.publish("health", record)
-        for text, severity in self._alarms.lines(unasked(record), again=self.component.audience_has_grown()):
-            self.component.say(text, severity)
+        for text, severity in self._alarms.lines(record, again=self.component.audience_has_grown()):
+            self.component.say(text, severity, news=True)  # it began or ended again
 
     def healthy(self) -> bool:
         """Whether everything runs that photographs are taken and kept with. Viewers' parts don't count."""

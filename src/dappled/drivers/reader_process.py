@@ -122,7 +122,7 @@ def _answered(
     except KeyError as error:
         return {"kind": "key", "words": str(error.args[0])[:200]}
     except (MemoryError, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in (errno.EFBIG, errno.ENOMEM):
+        if isinstance(error, OSError) and error.errno not in (errno.EFBIG, errno.ENOMEM, errno.ENOSPC, errno.EDQUOT):
             return {"kind": "damage", "words": first_line(error)}
         error.__traceback__ = None  # its frames hold what was read
         _unlimit()

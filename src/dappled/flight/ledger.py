@@ -487,5 +487,7 @@ def _tag(value: dict[str, Any]) -> Tag:
 
 
 def _result(value: dict[str, Any]) -> Result:
-    """A record of `results`. Raises TypeError for anything else."""
-    return Result(**value)
+    """A record of `results`. Raises KeyError, TypeError or ValueError for anything else."""
+    found = Result(**value)
+    found.verdict  # noqa: B018  # its findings are read from the same row
+    return found

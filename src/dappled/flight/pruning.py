@@ -61,7 +61,7 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
         raise FlightError(f"{path} can't be read: {error}") from error
     with LedgerReader.open(folder.ledger) as ledger:
         noted = [found for event in ledger.events() if event.kind == EVENT and (found := event.finding) is not None]
-    if hashlib.sha256(data).hexdigest() not in {one.facts.get("sha256") for one in noted}:
+    if hashlib.sha256(data).hexdigest() not in [one.facts.get("sha256") for one in noted]:
         raise FlightError(f"{path} was changed: the ledger has no event with its SHA-256; use another copy of it")
     try:
         rows = [Removed(**json.loads(line)) for line in data.decode().splitlines()]

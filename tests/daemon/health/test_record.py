@@ -117,8 +117,8 @@ def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: P
             "decoding fails: the last 3 frames are kept, not decoded: dark",
         ),
         ({"decoding": DecodingState(True, misfit="c.toml was made")}, "frames can't be decoded: c.toml was made"),
-        ({"dead": ["mavlink 0"]}, "the mavlink 0 thread has ended: restart dappled"),
-        ({"dead": ["capture"]}, "the capture thread has ended: restart dappled"),
+        ({"dead": ["mavlink 0"]}, "thread mavlink 0: it has ended: restart dappled"),
+        ({"dead": ["capture"]}, "thread capture: it has ended: restart dappled"),
         ({"items": 3}, "decode fell behind by 2 frames, kept in the record"),
     ],
 )

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, GroundStations, PilotMessages
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.findings import Code, Finding, Subject, finding, told
+from dappled.findings import Code, Finding, Level, Subject, finding, told
 
 CAMERA = finding(Code.CAMERA_ABSENT, Subject("camera"), reason="")
 
@@ -13,19 +15,23 @@ def disk(left_mb: int) -> Finding:
     return finding(Code.DISK_FILLING, Subject("disk"), left_mb=left_mb, least_mb=200)
 
 
+def health(*found: Finding, age_s: float = 60.0) -> dict[str, Any]:
+    return {"findings": [{**one.to_json(), "age_s": age_s} for one in found]}
+
+
 def test_a_finding_is_told_once_though_its_numbers_change_and_its_end_too() -> None:
     alarms = Alarms()
     warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
-    assert alarms.lines([]) == []
-    assert alarms.lines([disk(409)]) == [(told(disk(409)), warning)]
+    assert alarms.lines(health()) == []
+    assert alarms.lines(health(disk(409))) == [(told(disk(409)), warning)]
     troubled = [alarms.troubled]
-    assert alarms.lines([CAMERA, disk(408)]) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
+    assert alarms.lines(health(CAMERA, disk(408))) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
     troubled += [alarms.troubled]
-    assert alarms.lines([disk(407)]) == [("over: the camera is absent", info)]
-    assert alarms.lines([disk(406)]) == []
-    assert alarms.lines([]) == [("all is well again", info)]
+    assert alarms.lines(health(disk(407))) == [("over: the camera is absent", info)]
+    assert alarms.lines(health(disk(406))) == []
+    assert alarms.lines(health()) == [("all is well again", info)]
     assert [*troubled, alarms.troubled] == [False, True, False]
-    assert alarms.lines([disk(409)]) == [(told(disk(409)), warning)]
+    assert alarms.lines(health(disk(409))) == [(told(disk(409)), warning)]
 
 
 def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
@@ -36,12 +42,35 @@ def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
     assert len(lines.messages(text, 4, 10 * 10**9)) == 2
 
 
+def test_what_comes_back_at_once_is_told_again() -> None:
+    lines = PilotMessages()
+    assert all(lines.messages("the camera is absent", 3, now_ns, news=True) for now_ns in (0, 3 * 10**9))
+
+
+def test_all_is_well_when_nothing_stands_that_may_still_settle() -> None:
+    alarms = Alarms()
+    starting = finding(Code.CAMERA_STARTING, Subject("camera"))
+    alarms.lines(health(CAMERA))
+    assert alarms.lines(health(starting, age_s=0.0)) == [("over: the camera is absent", mavlink.MAV_SEVERITY_INFO)]
+    assert alarms.lines(health(starting, age_s=1.0)) == []
+    assert alarms.lines(health()) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
+
+
+def test_what_becomes_a_stop_is_told_again_and_is_not_over_as_a_caution() -> None:
+    alarms = Alarms()
+    silent = finding(Code.LINK_SILENT, Subject("link", "a"), Level.CAUTION, seconds=5)
+    worse = finding(Code.LINK_SILENT, Subject("link", "a"), Level.STOP, seconds=9)
+    assert [severity for _, severity in alarms.lines(health(silent))] == [mavlink.MAV_SEVERITY_WARNING]
+    assert [severity for _, severity in alarms.lines(health(worse))] == [mavlink.MAV_SEVERITY_ERROR]
+    assert alarms.lines(health(silent)) == []
+
+
 def test_what_lasts_is_told_again_when_it_is_asked_for() -> None:
     alarms = Alarms()
-    alarms.lines([CAMERA])
-    assert alarms.lines([CAMERA], again=True) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
-    assert alarms.lines([], again=True) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
-    assert alarms.lines([], again=True) == []
+    alarms.lines(health(CAMERA))
+    assert alarms.lines(health(CAMERA), again=True) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
+    assert alarms.lines(health(), again=True) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
+    assert alarms.lines(health(), again=True) == []
 
 
 def heartbeat(system: int, kind: int = mavlink.MAV_TYPE_GCS) -> MavlinkMessage:

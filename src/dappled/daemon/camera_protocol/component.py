@@ -404,9 +404,9 @@ class Component:
         self._send_changed_parameters()
         self._links.send(self._status.settings())
 
-    def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING) -> None:
-        """Send a line to the pilot (STATUSTEXT)."""
-        for message in self._lines.messages(text, severity, self._clock.monotonic_ns()):
+    def say(self, text: str, severity: int = mavlink.MAV_SEVERITY_WARNING, *, news: bool = False) -> None:
+        """Send a line to the pilot (STATUSTEXT); `news` although it was sent just before."""
+        for message in self._lines.messages(text, severity, self._clock.monotonic_ns(), news=news):
             self._links.send(message)
 
     def audience_has_grown(self) -> bool:

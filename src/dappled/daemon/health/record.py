@@ -131,7 +131,7 @@ def record(
     missing = shots.without_camera()
     deaf = fresh and settings.pose.on_gimbal and vehicle is not None and not vehicle.gimbal_attitude
     now = [
-        *(finding(Code.THREAD_ENDED, Subject("service"), thread=name) for name in dead_threads),
+        *(finding(Code.THREAD_ENDED, Subject("thread", name)) for name in dead_threads),
         *([] if missing is None else [missing]),
         *silences,
         *found,

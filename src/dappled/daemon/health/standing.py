@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dappled.findings import WORDS, Code, Finding, Subject, above_note, in_order
+from dappled.findings import WORDS, Code, Finding, Level, Subject, above_note, in_order
 
 ALL_IS_WELL = "all is well"
 
@@ -54,10 +54,13 @@ def unasked(health: Mapping[str, Any]) -> list[Finding]:
 
 
 class NewFindings:
-    """Which findings above a note the last call did not have. One whose numbers have changed is still the same."""
+    """Which findings above a note the last call did not have, or had at a lower level.
+
+    One whose numbers have changed is still the same.
+    """
 
     def __init__(self) -> None:
-        self._known: set[tuple[Code, Subject]] = set()
+        self._known: dict[tuple[Code, Subject], Level] = {}
 
     def __bool__(self) -> bool:
         """Whether there was any at the last call."""
@@ -66,5 +69,5 @@ class NewFindings:
     def among(self, found: Sequence[Finding], *, again: bool = False) -> list[Finding]:
         """The new ones; with `again` all. These are the known ones from now on."""
         known, now = self._known, above_note(found)
-        self._known = {one.kind for one in now}
-        return [one for one in now if again or one.kind not in known]
+        self._known = {one.kind: one.level for one in now}
+        return [one for one in now if again or one.level > known.get(one.kind, Level.NOTE)]

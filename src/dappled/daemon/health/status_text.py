@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import threading
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
-from dappled.daemon.health.standing import NewFindings
+from dappled.daemon.health.standing import NewFindings, in_record, unasked
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.findings import Finding, Level, Subject, named, told
+from dappled.findings import Finding, Level, Subject, above_note, named, told
 
 PIECE_BYTES = 50
 LONGEST_BYTES = 4 * PIECE_BYTES
@@ -21,15 +22,15 @@ _SEVERITIES = {Level.CAUTION: mavlink.MAV_SEVERITY_WARNING, Level.STOP: mavlink.
 
 
 class PilotMessages:
-    """Turns sentences into messages. The same sentence is sent at most once in ten seconds."""
+    """Turns sentences into messages. The same sentence is sent at most once in ten seconds, unless it is `news`."""
 
     def __init__(self) -> None:
         self._numbers = itertools.cycle(range(1, 65536))
         self._sent: deque[tuple[str, int]] = deque(maxlen=_REMEMBERED)
 
-    def messages(self, text: str, severity: int, now_ns: int) -> list[MavlinkMessage]:
-        """The messages of a sentence; none where it was sent just before. Time is monotonic."""
-        if any(sent == text and now_ns - at_ns < AGAIN_NS for sent, at_ns in list(self._sent)):
+    def messages(self, text: str, severity: int, now_ns: int, *, news: bool = False) -> list[MavlinkMessage]:
+        """The messages of a sentence; none where it was sent just before and isn't `news`. Time is monotonic."""
+        if not news and any(sent == text and now_ns - at_ns < AGAIN_NS for sent, at_ns in list(self._sent)):
             return []
         self._sent.append((text, now_ns))
         return list(_pieces(text, severity, next(self._numbers)))
@@ -40,6 +41,7 @@ class Alarms:
 
     def __init__(self) -> None:
         self._new = NewFindings()
+        self._troubled = False
         self._stops: dict[Subject, Finding] = {}
 
     @property
@@ -47,14 +49,19 @@ class Alarms:
         """Whether there was a stop at the last call of `lines`."""
         return bool(self._stops)
 
-    def lines(self, found: Sequence[Finding], *, again: bool = False) -> list[tuple[str, int]]:
-        """The sentences to send now, each with its severity. `again` repeats those that last."""
-        before, new = bool(self._new), self._new.among(found, again=again)
+    def lines(self, health: Mapping[str, Any], *, again: bool = False) -> list[tuple[str, int]]:
+        """The sentences of a health record to send now, each with its severity. `again` repeats those that last."""
+        found = unasked(health)
+        standing = {one.kind for one in above_note(in_record(health))}  # those that may settle are not over
+        before, new = self._troubled, self._new.among(found, again=again)
+        self._troubled = bool(self._new) or (before and bool(standing))
         before_stops, self._stops = self._stops, {one.subject: one for one in found if one.level is Level.STOP}
         lines = [(told(one), _SEVERITIES[one.level]) for one in new]
-        if before and not self._new:
+        if before and not standing:
             return [("all is well again", mavlink.MAV_SEVERITY_INFO)]
-        ended = [one for subject, one in before_stops.items() if subject not in self._stops]
+        ended = [
+            one for subject, one in before_stops.items() if subject not in self._stops and one.kind not in standing
+        ]
         return lines + [(f"over: {named(one)}", mavlink.MAV_SEVERITY_INFO) for one in ended]
 
 
