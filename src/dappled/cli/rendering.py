@@ -101,8 +101,6 @@ def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
     if verb.json:
         if report.values is not None:
             print(json.dumps(_with_findings(report), indent=2))
-        elif report.findings:
-            print(json.dumps({"findings": [one.to_json() for one in findings.in_order(report.findings)]}))
     else:
         for line in report.lines:
             print(printable(line))
