@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose, Quaternion, camera_pose, metres_per_radian
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import Tag, TimeSource, recording
+from dappled.flight import Recording, Tag, TimeSource, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import landscape
@@ -84,29 +84,33 @@ def fly(
         truth = exposure.truth
         assert truth.pose is not None
         truths.append(truth)
-        request(begun, index)
-        frame = deliver(begun, index, exposure.file, f"IMG_{index:04d}.DNG")
-        pose = as_recorded(told(index, truth.pose))
-        begun.ledger.add_tag(
-            Tag(
-                index,
-                pose.utc_ns,
-                10_000,
-                TimeSource.HOT_SHOE,
-                50.0,
-                F_NUMBER,
-                0.001,
-                100,
-                CAMERA,
-                MASK,
-                frame.sha256,
-                pose,
-            )
-        )
+        record(begun, index, exposure.file, F_NUMBER, as_recorded(told(index, truth.pose)))
     begun.close()
     calibration = simulation.write_calibration(camera, folder)
     recipe = Recipe(camera=CAMERA, mask=MASK, calibration=str(calibration))
     return Flown(begun.folder.path, recipe, path, tuple(truths), scene.ground)
+
+
+def record(begun: Recording, index: int, data: bytes, f_number: float, pose: Pose) -> None:
+    """A frame of a shot, with its tag by the hot shoe."""
+    request(begun, index)
+    frame = deliver(begun, index, data, f"IMG_{index:04d}.DNG")
+    begun.ledger.add_tag(
+        Tag(
+            index,
+            pose.utc_ns,
+            10_000,
+            TimeSource.HOT_SHOE,
+            50.0,
+            f_number,
+            0.001,
+            100,
+            CAMERA,
+            MASK,
+            frame.sha256,
+            pose,
+        )
+    )
 
 
 def as_recorded(true: TruePose) -> Pose:

@@ -9,15 +9,14 @@ from pathlib import Path
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Quaternion
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import Tag, TimeSource, recording
+from dappled.flight import recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene.bench import Bench, TexturedPlane
 from dappled.mocks.scene.masked_camera import MaskedCamera, Truth, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid
 from dappled.mocks.simulation import CAMERA, MASK
-from tests.flight.makers import deliver, request
-from tests.products.flown import START_NS, as_recorded
+from tests.products.flown import START_NS, as_recorded, record
 
 F_NUMBER = 7.4  # the widest
 LEVEL_NORTH: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -39,25 +38,7 @@ def frames(folder: Path, camera: MaskedCamera, poses: Sequence[TruePose]) -> tup
     for index, pose in enumerate(poses):
         exposure = camera.expose(float(index), index, f_number=F_NUMBER)
         truths.append(exposure.truth)
-        request(begun, index)
-        frame = deliver(begun, index, exposure.file, f"IMG_{index:04d}.DNG")
-        told = as_recorded(pose)
-        begun.ledger.add_tag(
-            Tag(
-                index,
-                told.utc_ns,
-                10_000,
-                TimeSource.HOT_SHOE,
-                50.0,
-                F_NUMBER,
-                0.001,
-                100,
-                CAMERA,
-                MASK,
-                frame.sha256,
-                told,
-            )
-        )
+        record(begun, index, exposure.file, F_NUMBER, as_recorded(pose))
     begun.close()
     calibration = simulation.write_calibration(camera, folder)
     return begun.folder.path, Recipe(camera=CAMERA, mask=MASK, calibration=str(calibration)), truths
