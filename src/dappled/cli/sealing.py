@@ -9,8 +9,8 @@ from dappled.flight import seal_key
 from dappled.flight.seal_key import SealKey
 
 
-def key_of(config: Path | None) -> SealKey | None:
-    """The key that a settings file names as record.seal_key; None where it names none. Raises ConfigError, and
-    FlightError where the key can't be read."""
-    file = settings.load(config).record.seal_key
+def key_of(config: Path | None, given: Path | None = None) -> SealKey | None:
+    """The key in the file that is `given`, else the one that a settings file names as record.seal_key; None where it
+    names none. Raises ConfigError, and FlightError where the key can't be read."""
+    file = given or settings.load(config).record.seal_key
     return seal_key.load(Path(file)) if file else None

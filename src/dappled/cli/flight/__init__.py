@@ -13,7 +13,7 @@ from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
 from dappled.cli.verb import CallError, Output, Report, SettingsArgument, Verb, argument, flag, option
 from dappled.clock import SystemClock
-from dappled.flight import flight_report, offload, owner_seal, seal_key
+from dappled.flight import flight_report, offload, owner_seal
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import CheckReport
 
@@ -62,7 +62,7 @@ class CheckFlight(FlightArgument, Verb):
 
     def run(self, output: Output) -> Report:
         """See Verb."""
-        key = sealing.key_of(self.config) if self.key is None else seal_key.load(self.key)
+        key = sealing.key_of(self.config, self.key)
         return _of_check(flight_check.check(self.chosen(output), key), signed=self.key is not None)
 
 
@@ -79,7 +79,7 @@ class SealFlight(FlightArgument, Verb):
     def run(self, output: Output) -> Report:
         """See Verb."""
         flight = self.chosen(output)
-        key = sealing.key_of(self.config) if self.key is None else seal_key.load(self.key)
+        key = sealing.key_of(self.config, self.key)
         if key is None:
             named = "give --key FILE, or record.seal_key in --config"
             raise CallError(f"no key is named to sign with: {named}; dappled keys seal makes one")
