@@ -123,7 +123,6 @@ class Report:
 
     values: Any = None
     lines: Sequence[str] = ()
-    written: Sequence[Path] = ()
     findings: Sequence[Finding] = ()
     doubted: bool = False
     extent: str = ""
