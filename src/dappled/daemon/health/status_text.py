@@ -41,7 +41,7 @@ class Alarms:
 
     def __init__(self) -> None:
         self._new = NewFindings()
-        self._troubled = False
+        self._lasting = False  # whether something that was told has not ended
         self._stops: dict[Subject, Finding] = {}
 
     @property
@@ -53,8 +53,8 @@ class Alarms:
         """The sentences of a health record to send now, each with its severity. `again` repeats those that last."""
         found = unasked(health)
         standing = {one.kind for one in above_note(in_record(health))}  # those that may settle are not over
-        before, new = self._troubled, self._new.among(found, again=again)
-        self._troubled = bool(self._new) or (before and bool(standing))
+        before, new = self._lasting, self._new.among(found, again=again)
+        self._lasting = bool(standing) and (before or bool(self._new))
         before_stops, self._stops = self._stops, {one.subject: one for one in found if one.level is Level.STOP}
         lines = [(told(one), _SEVERITIES[one.level]) for one in new]
         if before and not standing:
