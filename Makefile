@@ -75,7 +75,7 @@ long: ## what is too long for each change: the long tests, arm64, the README in 
 mutations: setup ## break the code in one place at a time: the default tests must catch each; ONE=word for some
 	@$(BIN)/python tools/mutations.py $(ONE)
 
-walk: setup ## the modules that a command and a frame pass, traced anew and written into ARCHITECTURE.md
+walk: setup ## the modules that a command and a frame pass, traced anew and written into docs/modules.md with the list of all modules
 	@$(BIN)/python -m tests.architecture.walk --write
 
 clean-room: ## the README's commands in bare Debian roots (SUITES="bookworm trixie", RUN="make demo && make test"); as root

@@ -1,4 +1,4 @@
-"""How many modules a command and a frame pass, and that ARCHITECTURE.md lists them."""
+"""How many modules a command and a frame pass, and that docs/modules.md lists them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_a_command_and_a_frame_pass_few_modules_and_the_page_lists_them(tmp_path
     assert (set(command), set(frame)) == (set(walked.command), set(walked.frame)), "run `make walk`"
 
 
-def test_the_architecture_page_lists_every_module() -> None:
+def test_the_page_lists_every_module() -> None:
     page = walk.PAGE.read_text(encoding="utf-8")
     assert walk.between(page, walk.MODULES) == walk.module_list(), "run `make walk`"
 

@@ -1,7 +1,7 @@
 """Trace the modules that one command and one frame pass in a simulated flight.
 
     python -m tests.architecture.walk            print both walks
-    python -m tests.architecture.walk --write    render them, and the list of all modules, into ARCHITECTURE.md
+    python -m tests.architecture.walk --write    render them, and the list of all modules, into docs/modules.md
 
 The command is an IMAGE_START_CAPTURE: from the packet on a MAVLink link, through shutter and camera driver, to the
 acknowledgement. A frame is followed from the camera's arrival event to the published slices, in the daemon and in its
@@ -23,7 +23,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "src" / "dappled"
-PAGE = ROOT / "ARCHITECTURE.md"
+PAGE = ROOT / "docs" / "modules.md"
 WALK = ("<!-- walk: begin -->", "<!-- walk: end -->")
 MODULES = ("<!-- modules: begin -->", "<!-- modules: end -->")
 RECORDED = {"command": 18, "frame": 49}  # modules passed on 2026-11-27
