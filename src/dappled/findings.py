@@ -440,6 +440,11 @@ def plain(value: Any) -> Any:
     return [plain(one) for one in value] if isinstance(value, list | tuple) else value
 
 
+def of_subject(found: Iterable[Finding], subject: Subject) -> list[Finding]:
+    """What was found of the frame at hand, said of a subject that has a name."""
+    return [replace(one, subject=subject) if one.subject == FRAME else one for one in found]
+
+
 def first_by_name(frames: Iterable[tuple[str, Iterable[Finding]]]) -> list[Finding]:
     """What was found of frames, by their names: each code once, of the first of them.
 
@@ -449,9 +454,8 @@ def first_by_name(frames: Iterable[tuple[str, Iterable[Finding]]]) -> list[Findi
     """
     first: dict[tuple[Code, str], Finding] = {}
     for name, found in frames:
-        for one in found:
-            subject = Subject("frame", name) if one.subject == FRAME else one.subject
-            first.setdefault((one.code, subject.kind), replace(one, subject=subject))
+        for one in of_subject(found, Subject("frame", name)):
+            first.setdefault((one.code, one.subject.kind), one)
     return list(first.values())
 
 

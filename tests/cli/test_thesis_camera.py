@@ -150,7 +150,7 @@ def test_behind_a_lens_that_tells_no_f_number_the_carriers_are_found_or_nothing_
     assert made.attributes["carriers_found"] is None
     assert [one.code for one in made.doubts] == [Code.CARRIERS_UNCONFIRMED]
     capsys.readouterr()
-    assert main(["carriers", bare, *_quarter(tmp_path)]) == 0
+    assert main(["carriers", bare, *_quarter(tmp_path)]) == 1
     assert "the f-number is unknown" in capsys.readouterr().err
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -12,7 +12,7 @@ from dappled.cli.geotag import MarkArguments, geoid_or_none
 from dappled.cli.placing import Placing
 from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, argument, flag, option
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, first_by_name, to_rows, told
+from dappled.findings import Finding, Subject, first_by_name, to_rows
 from dappled.flight import disk_error, layout
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import KINDS, Done, Job, Manifest
@@ -60,11 +60,13 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
     def run(self, output: Output) -> Report:
         """See Verb."""
         jobs: list[Job] = []
+        doubts: list[Finding] = []
         refused = 0
         lists: list[Callable[[Manifest], list[str]]] = []
         for flight in self._folders():
             try:
-                planned, placed = self._planned(flight, output)
+                planned, placed, found = self._planned(flight, output)
+                doubts += found
                 jobs += planned
                 lists.append(partial(_lists, placed=placed, jobs=planned))
             except DappledError as error:  # go on with the other flights
@@ -90,30 +92,30 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
                 for text in write(manifest):
                     refused += 1
                     output.warn(text)
-            doubts = _doubts(manifest, jobs)
-        for name, one in doubts:
-            output.warn(f"{name}: in doubt: {told(one)}")
+            doubts += _doubts(manifest, jobs)
         if not jobs:
             raise DappledError("these flights hold no frames")
         said = f"{counted(len(todo) - bad, 'frame')} made, {len(jobs) - len(todo)} already there, {bad} failed"
-        return Report(None, [said], doubted=bool(doubts), failed=bool(bad or refused))
+        return Report(None, [said], findings=doubts, failed=bool(bad or refused))
 
-    def _planned(self, flight: Path, output: Output) -> tuple[list[Job], list[Placed]]:
-        """The jobs of one flight, and where its frames were taken. Raises DappledError."""
+    def _planned(self, flight: Path, output: Output) -> tuple[list[Job], list[Placed], list[Finding]]:
+        """The jobs of one flight, where its frames were taken, and its marks' doubts. Raises DappledError."""
         folder = layout.open_folder(flight)
         facts = layout.read_facts(folder)
         recipe, options = self.recipe(folder.path, facts), self.options(facts)
         marked = geoid = None
+        doubts: list[Finding] = []
         if self.pos:
             geoid = earth.geoid(self.geoid)
             marked = marks.find(folder.path, self.pos, geoid, self.mark_arm(options.mounting, output))
             for text in marks.sentences(marked):
                 output.remark(text)
+            doubts = [replace(one, subject=_of_flight(folder.name, one.subject)) for one in marked.doubts]
         elif "mcap" in self.kinds:  # its altitudes are above the ellipsoid, or unknown
             geoid = geoid_or_none(self.geoid, output)
         placed, _ = geotags.read(folder.path, options.mounting, geoid, marked)
         by_index = {one.frame.index: one for one in placed}
-        return batch.plan(folder.path, recipe, options, self.kinds, self.output, placed=by_index), placed
+        return batch.plan(folder.path, recipe, options, self.kinds, self.output, placed=by_index), placed, doubts
 
 
 CLASSES = {"batch": ProcessFlights}
@@ -128,13 +130,18 @@ def _tell(done: Done, output: Output) -> None:
     output.row({**said, "doubts": to_rows(done.doubts), "seconds": done.seconds, "files": files})
 
 
-def _doubts(manifest: Manifest, jobs: Sequence[Job]) -> list[tuple[str, Finding]]:
+def _of_flight(flight: str, subject: Subject) -> Subject:
+    """What a finding is about, where there are several flights."""
+    return Subject(subject.kind, f"{flight}/{subject.which}" if subject.which != "" else flight)
+
+
+def _doubts(manifest: Manifest, jobs: Sequence[Job]) -> list[Finding]:
     """What is in doubt about the light fields of each flight."""
     found = []
     for flight in dict.fromkeys(job.flight for job in jobs):
         known = [manifest.done[job.key] for job in jobs if job.flight == flight and job.key in manifest.done]
         doubts = first_by_name((Path(done.frame).stem, done.doubts) for done in known)
-        found += [(Path(flight).name, one) for one in doubts]
+        found += [replace(one, subject=_of_flight(Path(flight).name, one.subject)) for one in doubts]
     return found
 
 

@@ -13,7 +13,7 @@ from PIL import Image
 
 from dappled import durable
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, flag, option
+from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.config import profiles
 from dappled.decode.calibration.law_search import LawSearch
 from dappled.decode.decoder import CarriersFrom
@@ -68,7 +68,7 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ShowCarriers(Overwriting, RecipeArguments, Verb):
+class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
     """Show the predicted and the measured carriers."""
 
     examples = (
@@ -113,10 +113,7 @@ class ShowCarriers(Overwriting, RecipeArguments, Verb):
             plane, table = self._measured(self.frame)
             if self.picture:
                 _save(self._picture(plane, table), self.picture)
-        if table.doubt:
-            output.warn(told(table.doubt, FRAME))
-        failed = table.checked is not None and bool(table.checked.contradiction)
-        return Report(_as_json(table), _lines(table), failed=failed)
+        return Report(_as_json(table), _lines(table), findings=[table.doubt] if table.doubt else ())
 
     def _picture(self, plane: Plane, table: Table) -> Any:
         if self.around is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, rec
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, flag, option
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
-from dappled.findings import FRAME, told
+from dappled.findings import FRAME, Finding, told
 from dappled.products.exports import light_files
 
 
@@ -53,14 +54,14 @@ class DecodeFrames(Overwriting, Doubtable, FramesArguments, Verb):
             refuse_same_names(found, self.output, ".zarr")
             self.output.mkdir(parents=True, exist_ok=True)
 
-        def decoded(frame: Path) -> bool:
+        def decoded(frame: Path) -> Sequence[Finding]:
             target = self.output if single else self.output / f"{frame.stem}.zarr"
             made = darkroom.decode(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
             if not self.anyway:
                 _refuse_contradicted(frame, made)
             light_files.save(target, made.light_field, overwrite=self.overwrite)
             output.row(_facts(target, made), f"{target}: {summary(made)}")
-            return bool(made.doubts)
+            return made.doubts
 
         return each_frame(found, output, decoded, into_folder=not single, failure="could not be decoded")
 
@@ -116,6 +117,4 @@ def summary(made: DecodeResult) -> str:
         whole += f", by the law {field.attributes['law']} ({made.search.sentence})"
     if words := views_words(field):
         whole += f"; {words}"
-    if others := [one for one in made.doubts if one not in (made.contradiction, made.unsettled)]:
-        whole += f"; in doubt: {'; '.join(told(one, FRAME) for one in others)}"
     return whole

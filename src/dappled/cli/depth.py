@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.cli.field_arguments import opened_field
+from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.decode import DecodeError
@@ -92,14 +92,14 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         """See Verb."""
         if self.field is None:
             return self._heights(output)
-        found = opened_field(self.field, output, self)
+        found = opened_field(self.field, self)
         made = found.depth(self.method, between=self.between, window=self.window)
         distances = found.distances(made) if found.ranging is not None else None
         report: dict[str, Any] = summary(found, made, distances)
         for path in self.output:
             report.setdefault("written", []).append(str(path))
             report |= self._write(path, found, made, distances)
-        return Report(report, words(report), doubted=bool(found.doubts))
+        return Report(report, words(report), findings=doubts(found))
 
     def _heights(self, output: Output) -> Report:
         """Heights of a flight."""
@@ -126,7 +126,7 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
                     prints.save(path, _picture(found.height_m, "m"))
         lines = frame_terrain.words(made, found)
         values = frame_terrain.summary(made, found) | {"notes": lines[1:], "written": written}
-        return Report(values, [*lines, *(f"written: {path}" for path in written)], doubted=bool(made.doubts))
+        return Report(values, [*lines, *(f"written: {path}" for path in written)], findings=made.doubts)
 
     def _together(self, made: Survey, output: Output) -> Report:
         """Heights of a flight where all of its frames agree."""
@@ -142,7 +142,7 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         values = {"known": known, "height_m": _quartiles(surface.height_m), "sigma_m": sigma, "written": written}
         told = "" if sigma is None else f", to ±{sigma[1]:.2g} m (median)"
         line = f"{counted(len(made.photographs), 'frame')} together: {known:.0%} of the map known{told}"
-        return Report(values, [line, *(f"written: {path}" for path in written)], doubted=bool(made.doubts))
+        return Report(values, [line, *(f"written: {path}" for path in written)], findings=made.doubts)
 
     def _write(
         self, path: Path, found: OpenedLightField, made: DepthMap, distances: DistanceMap | None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.cli.field_arguments import FieldArguments, RangingArguments, opened_field, views_words
+from dappled.cli.field_arguments import FieldArguments, RangingArguments, doubts, opened_field, views_words
 from dappled.cli.verb import CallError, Output, OutputExistsError, Overwriting, Report, Verb, flag, option
 from dappled.findings import to_rows
 from dappled.products.exports import exports, light_files
@@ -53,13 +53,13 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
 
     def run(self, output: Output) -> Report:
         """See Verb."""
-        found = opened_field(self.field, output, self)
+        found = opened_field(self.field, self)
         written = self._write(found)
         words = views_words(found.field)
         if words and not self.json:
             output.remark(words)
         facts = {"file": str(written), "as": self.kind, "views": words or None, "doubts": to_rows(found.doubts)}
-        return Report(facts, [str(written)], doubted=bool(found.doubts))
+        return Report(facts, [str(written)], findings=doubts(found))
 
     def _write(self, found: OpenedLightField) -> Path:
         """Write the light field; returns the path. Raises DappledError."""

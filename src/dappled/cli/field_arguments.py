@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.cli.verb import Doubtable, Output, argument, option
+from dappled.cli.verb import Doubtable, argument, option
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw import calibration_files
-from dappled.findings import FRAME, told
+from dappled.findings import Finding, Subject, of_subject
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 
@@ -36,9 +36,8 @@ class RangingArguments:
     )  # fmt: skip
 
 
-def opened_field(path: Path, output: Output, ranging: RangingArguments | None = None) -> OpenedLightField:
-    """The light field of a path, with the distances that the arguments give. What is in doubt about it is said:
-    whatever is made of it is in doubt for that. Raises DappledError."""
+def opened_field(path: Path, ranging: RangingArguments | None = None) -> OpenedLightField:
+    """The light field of a path, with the distances that the arguments give. Raises DappledError."""
     found = opened.light_field(path, focus_m=None if ranging is None else ranging.focus)
     if ranging is not None and ranging.calibration is not None:
         tables = calibration_files.tables(ranging.calibration)
@@ -48,9 +47,12 @@ def opened_field(path: Path, output: Output, ranging: RangingArguments | None = 
             )
         found = OpenedLightField(opened.with_ranging(found.field, Ranging.from_dict(tables[RANGING])), found.path)
         found.metres()  # the user named it: refuse it if it is for another focal length
-    for doubt in found.doubts:
-        output.warn(f"{path} is in doubt: {told(doubt, FRAME)}")
     return found
+
+
+def doubts(found: OpenedLightField) -> list[Finding]:
+    """What is in doubt about a light field: whatever is made of it is in doubt for that."""
+    return of_subject(found.doubts, Subject("light field", str(found.path)))
 
 
 def views_words(field: LightField) -> str:

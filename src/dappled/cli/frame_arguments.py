@@ -12,6 +12,7 @@ from dappled.decode.optics import LAWS
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
 from dappled.errors import DappledError, counted
+from dappled.findings import Finding, Level, first_by_name, worst
 from dappled.flight import layout
 
 # No JPEG: beside a raw file it is the same picture again. One that is named is taken.
@@ -135,17 +136,23 @@ def _is_frame(path: Path) -> bool:
 
 
 def each_frame(
-    frames: Sequence[Path], output: Output, make: Callable[[Path], bool], *, into_folder: bool, failure: str
+    frames: Sequence[Path],
+    output: Output,
+    make: Callable[[Path], Sequence[Finding]],
+    *,
+    into_folder: bool,
+    failure: str,
 ) -> Report:
     """Make something of each frame: one that fails is told, and the others go on.
 
-    `make` says whether its result is in doubt; `failure` says what became of the frames that failed. Raises the
+    `make` says what it found; `failure` says what became of the frames that failed. Raises the
     DappledError of a frame that goes to no folder.
     """
-    bad = doubted = 0
+    bad = 0
+    found: dict[Path, Sequence[Finding]] = {}
     for frame in output.each(frames):
         try:
-            doubted += make(frame)
+            found[frame] = make(frame)
         except DappledError as error:
             if not into_folder:
                 raise
@@ -155,4 +162,8 @@ def each_frame(
     of_all = counted(len(frames), "frame")
     if bad:
         output.remark(f"{bad} of {of_all} {failure}")
-    return Report(doubted=bool(doubted), extent=f"{doubted} of {of_all}" if into_folder else "", failed=bool(bad))
+    if not into_folder:
+        return Report(findings=[one for each in found.values() for one in each])
+    doubted = sum(worst(each) > Level.NOTE for each in found.values())
+    told = first_by_name((frame.stem, each) for frame, each in found.items())
+    return Report(findings=told, extent=f"{doubted} of {of_all}", failed=bool(bad))

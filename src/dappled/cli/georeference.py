@@ -13,7 +13,6 @@ from dappled.cli.calibrate import lens
 from dappled.cli.placing import Refining
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.errors import DappledError, counted
-from dappled.findings import told
 from dappled.flight import layout
 from dappled.products.maps import difference, map_files, photographs, terrain
 from dappled.products.maps.difference import DifferenceError, MapDifference
@@ -134,7 +133,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                     missing.append(str(error))
             if self.against:
                 files += self._changes(made, terrain_of, folder, output, missing)
-        made = replace(made, notes=(*made.notes, *(f"in doubt: {told(one)}" for one in made.doubts), *missing))
+        made = replace(made, notes=(*made.notes, *missing))
         report = map_files.write_report(made, folder, files)
         for why in (*(why for _, why in made.left), *made.notes):
             output.remark(why)
@@ -144,7 +143,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         return Report(
             json.loads(report.read_text()),
             [*lines, *map(str, (*files, report))],
-            doubted=bool(made.doubts),
+            findings=made.doubts,
             failed=bool(missing),
         )
 

@@ -115,7 +115,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
                     made[name] = copy
                     add(1)
         copied = [str(path) for path in made.values() if isinstance(path, Path)]
-        found = [*found, *geotags.doubts(self.flight)]
+        found = [*found, *geotags.doubts(self.flight), *(marked.doubts if marked else ())]
         without_copy = {name: reason for name, reason in made.items() if isinstance(reason, str)}
         for text in marks.sentences(marked) if marked else ():
             output.remark(text)
@@ -143,7 +143,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
             words += f" to {' and '.join(folders)}"
         if self.copies:
             words += f", {len(copied)} {'copy' if len(copied) == 1 else 'copies'} with EXIF"
-        return Report(values, [words], findings=found, doubted=bool(marked and marked.doubts))
+        return Report(values, [words], findings=found)
 
     def mounting(self, facts: Mapping[str, Any]) -> Mounting:
         """See Mounted. Raises DappledError for a wrong mount."""

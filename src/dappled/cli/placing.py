@@ -17,7 +17,6 @@ from dappled.daemon.pipeline import recipes
 from dappled.decode.geometry import Vector3
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.findings import told
 from dappled.flight import layout
 from dappled.products.maps import earth, georeference
 from dappled.products.maps.georeference import Options, Survey, Watch
@@ -190,11 +189,10 @@ class Refining(Placing):
         return made
 
     def placed(self, flight: Path, output: Output, stack: ExitStack, *, watch: Watch | None = None) -> Survey:
-        """A flight's frames on the map, for verbs that make no map. What is in doubt about them is said. Raises
-        DappledError."""
+        """A flight's frames on the map, for verbs that make no map. Raises DappledError."""
         made = self.survey(flight, output, stack, [], watch=watch)
-        for text in (*(f"in doubt: {told(one)}" for one in made.doubts), *(why for _, why in made.left)):
-            output.remark(text)
+        for _, why in made.left:
+            output.remark(why)
         return made
 
     def _refined(self, made: Survey, base: Path | None, output: Output) -> Survey:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import durable
-from dappled.cli.field_arguments import opened_field
+from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
@@ -145,7 +145,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         """See Verb."""
         if self.field is None:
             return self._flight(output)
-        found = opened_field(self.field, output, self)
+        found = opened_field(self.field, self)
         planes, notes = self._planes(found), list[Note]()
         captions = [caption for caption, _ in planes]
         if self._sharpest:
@@ -167,7 +167,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
             "doubts": to_rows(found.doubts),
         }
         said = f"{', '.join(c for c in captions if c) or 'one picture'}: {self.output}"
-        return Report(values, [*(note.text for note in notes), said], doubted=bool(found.doubts))
+        return Report(values, [*(note.text for note in notes), said], findings=doubts(found))
 
     def _flight(self, output: Output) -> Report:
         """Refocus a whole flight."""
@@ -195,7 +195,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
             first, *others = synthetic_aperture.words(one)
             lines += [f"{height:g} m: {first}", *others]
         return Report(
-            {"file": str(self.output), "planes": planes}, [*lines, f"written: {self.output}"], doubted=bool(made.doubts)
+            {"file": str(self.output), "planes": planes}, [*lines, f"written: {self.output}"], findings=made.doubts
         )
 
     def _flight_eyes(self, made: Survey, form: str) -> Report:
@@ -206,7 +206,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         facts = {"left": left, "right": right, "baseline_m": found.baseline_m, "baseline_share": found.share}
         apart = f"{found.baseline_m:.3g} m apart, {found.share:.0%} of the distance; {self.output}"
         line = f"frames {left} (left) and {right}: {apart}"
-        return Report({"file": str(self.output), **facts}, [line], doubted=bool(made.doubts))
+        return Report({"file": str(self.output), **facts}, [line], findings=made.doubts)
 
     def _planes(self, found: OpenedLightField) -> list[tuple[str, float]]:
         """(caption, disparity) of each plane that was asked for."""

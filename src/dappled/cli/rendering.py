@@ -106,8 +106,7 @@ def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
             print(printable(line))
     for one in findings.in_order(report.findings):
         output.remark(f"{'in doubt' if one.level > Level.NOTE else one.level.word}: {findings.told(one)}")
-    doubted = report.doubted or findings.worst(report.findings) > Level.NOTE
-    if doubted and not getattr(verb, "anyway", False):
+    if findings.worst(report.findings) > Level.NOTE and not getattr(verb, "anyway", False):
         if isinstance(verb, Doubtable):
             extent = f", {report.extent}" if report.extent else ""
             output.warn(f"written, but in doubt{extent}: see above; --anyway accepts that")

@@ -27,7 +27,7 @@ from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
-from dappled.findings import Finding, first_of_each
+from dappled.findings import Finding, first_of_each, in_order, to_rows
 from dappled.flight import LIVE, TimeSource, layout
 from dappled.flight.checks import flight_check
 
@@ -99,7 +99,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
     interval: float | None = option(
         "--interval", "time between the frames of a folder", None, metavar="S", low=0, otherwise="1",
     )  # fmt: skip
-    json: bool = flag("--json", "print one JSON object per frame")
+    json: bool = flag("--json", "print one JSON object per frame, and one with what was found, if anything was")
 
     @property
     def _is_flight(self) -> bool:
@@ -161,6 +161,8 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
             )
         told = first_of_each(found)
         if not self.verify:
+            if told:
+                output.row({"findings": to_rows(in_order(told))})
             return Report(findings=told, failed=bool(progress.bad))
         problems += writer.verdict(decoded=recipe is not None)
         for text in problems:
@@ -170,6 +172,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         left = f" ({undecoded} left undecoded in flight)" if undecoded else ""
         verdict = counted(len(problems), "difference") if problems else _same(writer)
         values = {"verified": count, "differences": problems, "left_undecoded": undecoded}
+        values["findings"] = to_rows(in_order(told))
         output.row(values, f"verified {counted(count, 'frame')}: {verdict}{left}")
         return Report(findings=told, failed=bool(problems))
 

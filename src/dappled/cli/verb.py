@@ -117,14 +117,12 @@ class Output(Protocol):
 class Report:
     """What a verb did: `values` are printed with --json, `lines` without it.
 
-    The result is in doubt where a finding is above note, or `doubted` says so, and of what `extent`; `failed` where
-    something was not done.
+    The result is in doubt where a finding is above note, and so is its `extent`; `failed` where something was not done.
     """
 
     values: Any = None
     lines: Sequence[str] = ()
     findings: Sequence[Finding] = ()
-    doubted: bool = False
     extent: str = ""
     failed: bool = False
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dappled.cli.field_arguments import FieldArguments, opened_field, views_words
+from dappled.cli.field_arguments import FieldArguments, doubts, opened_field, views_words
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
@@ -47,7 +47,7 @@ class DrawViews(Overwriting, FieldArguments, Verb):
 
     def run(self, output: Output) -> Report:
         """See Verb."""
-        found = opened_field(self.field, output)
+        found = opened_field(self.field)
         if self.of == "epi":
             made, note = epi.drawn(found.stack, self.row, self.column), ""
         else:
@@ -62,7 +62,7 @@ class DrawViews(Overwriting, FieldArguments, Verb):
         return Report(
             {**facts, "doubts": to_rows(found.doubts), **({"note": note} if note else {})},
             [*([note] if note else []), said],
-            doubted=bool(found.doubts),
+            findings=doubts(found),
         )
 
 

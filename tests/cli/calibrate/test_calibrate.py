@@ -160,13 +160,13 @@ def test_a_wrong_mask_is_told_in_a_sentence(
     assert "\n" not in told
     assert not (tmp_path / "c.toml").exists()
     assert main(["calibrate", *words, "--anyway"]) == 0
-    assert "written with this doubt in it: calibration: neither law explains" in capsys.readouterr().err
+    assert "in doubt: calibration: neither law explains" in capsys.readouterr().err
     assert [one.code for one in calibration_files.load(tmp_path / "c.toml").doubts] == [Code.LAW_NEITHER]
     frame = [*words[:-2], "--calibration", str(tmp_path / "c.toml"), "-o", str(tmp_path / "f.npz")]
     assert main(["decode", *frame]) == 1
     (doubt,) = light_files.load(tmp_path / "f.npz").doubts
     assert doubt.code is Code.LAW_NEITHER
-    assert f"in doubt: {findings.told(doubt)}\n" in capsys.readouterr().out
+    assert f"in doubt: {findings.told(doubt)}\n" in capsys.readouterr().err
 
 
 def test_a_dark_frame_is_taken_off_and_one_of_another_size_is_refused(

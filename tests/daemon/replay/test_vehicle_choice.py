@@ -74,7 +74,9 @@ def test_evidence_says_which_vehicle_counts(
     assert main(["replay", str(frames), "--telemetry", str(log), "--json"]) == 0
     shown = capsys.readouterr()
     assert f"vehicle 2 counts, by its {by}; vehicle 1 is in it too" in shown.err
-    assert round(float(json.loads(shown.out)["tag"]["pose"]["latitude_rad"]) * 57.29577951, 1) == 20.0
+    frame, found = map(json.loads, shown.out.splitlines())
+    assert round(float(frame["tag"]["pose"]["latitude_rad"]) * 57.29577951, 1) == 20.0
+    assert [(one["code"], one["facts"]["by"]) for one in found["findings"]] == [("log.vehicle", by)]
 
 
 def test_a_vehicle_can_t_be_chosen_without_telemetry(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -233,8 +233,8 @@ def test_what_one_form_refuses_the_others_keep(
     assert said.err.splitlines() == [
         *["dappled batch: the time of frames/000000.dng in UTC was never known"] * 2,
         f"dappled batch: {full}",
-        f"dappled batch: first: in doubt: frame 000000: {told(CLIPPED, FRAME)}",
-        f"dappled batch: second: in doubt: frame 000000: {told(CLIPPED, FRAME)}",
+        f"in doubt: frame second/000000: {told(CLIPPED, FRAME)}",
+        f"in doubt: frame first/000000: {told(CLIPPED, FRAME)}",
         "dappled batch: written, but in doubt: see above; --anyway accepts that",
     ]
     rows = [json.loads(line) for line in said.out.splitlines()]

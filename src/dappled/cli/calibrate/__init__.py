@@ -95,8 +95,6 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
         camera = darkroom.camera(seen[0].model)
         found = fit_views(darkroom, seen, choose_law=not self.law)
         found = self._judged(found, seen, camera.mask_distance_mm)
-        for doubt in found.doubts:
-            output.warn(f"written with this doubt in it: {told(doubt)}")
         written = calibration_files.save(to, found)
         if bad:
             output.remark(f"{len(bad)} of {counted(len(paths), 'frame')} could not be used")
@@ -104,7 +102,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
         return Report(
             report.as_values(found, camera.mask_distance_mm),
             [*lines, f"written to {written[0]} and {written[1]}"],
-            doubted=bool(found.doubts),
+            findings=found.doubts,
             failed=bool(bad),
         )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from dappled.cli.picture import places
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, flag, option
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import counted
+from dappled.findings import Finding
 from dappled.products.handover import picture_files
 
 
@@ -47,24 +49,22 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
             refuse_same_names(found, self.output, f".{self.kind}")
             durable.make_folder(self.output)
 
-        def pictured(frame: Path) -> bool:
+        def pictured(frame: Path) -> Sequence[Finding]:
             target = self.output if single else self.output / f"{frame.stem}.{self.kind}"
             return self._made(maker, frame, target, output)
 
         return each_frame(found, output, pictured, into_folder=not single, failure="gave no picture")
 
-    def _made(self, maker: PictureMaker, frame: Path, target: Path, output: Output) -> bool:
-        """Make and write one picture; whether it is in doubt. Raises DappledError."""
+    def _made(self, maker: PictureMaker, frame: Path, target: Path, output: Output) -> Sequence[Finding]:
+        """Make and write one picture; what was found of it. Raises DappledError."""
         beside = target.with_suffix(".sigma.tif")
         self.refuse_existing(target, beside if self.sigma else None)
         made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
         durable.write_file(target, picture_files.encoded(made, target.suffix, places.place_of(frame)))
         if self.sigma:
             durable.write_file(beside, picture_files.sigma_file(made))
-        for one in findings.in_order(made.findings):
-            output.warn(findings.told(one))
         output.row(_facts(target, made), f"{target}: {summary(made)}")
-        return made.in_doubt
+        return made.findings
 
 
 CLASSES = {"picture": MakePictures}

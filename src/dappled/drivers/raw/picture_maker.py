@@ -25,7 +25,7 @@ from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
-from dappled.findings import Code, Finding, Level, Subject, finding, worst
+from dappled.findings import Code, Finding, Level, Subject, finding
 
 _TURNED, _SCALED = 0.03, 0.02  # radians, and of the period: how far a mask may lie from a law's prediction
 _TURNED_SINCE, _SCALED_SINCE = 0.02, 0.006  # since its calibration
@@ -48,11 +48,6 @@ class MadePicture:
     f_number: float | None
     colour_matrix: Floats | None
     findings: tuple[Finding, ...]
-
-    @property
-    def in_doubt(self) -> bool:
-        """Whether anything is worse than a note."""
-        return worst(self.findings) > Level.NOTE
 
 
 class PictureMaker:

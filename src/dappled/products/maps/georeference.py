@@ -14,7 +14,7 @@ import numpy as np
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
-from dappled.findings import Finding, first_by_name, text
+from dappled.findings import Finding, first_by_name
 from dappled.flight import FlightFolder, Frame, Tag
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
@@ -77,8 +77,9 @@ class Survey:
 
     @property
     def doubts(self) -> list[Finding]:
-        """What is in doubt about the photographs' light fields."""
-        return first_by_name((one.name, one.doubts) for one in self.photographs)
+        """What is in doubt about the photographs' light fields, and what their lens was not told."""
+        of_lens = self.lens.doubts if self.lens else ()
+        return [*first_by_name((one.name, one.doubts) for one in self.photographs), *of_lens]
 
     def tags(self) -> dict[str, str]:
         """The metadata of map files."""
@@ -219,7 +220,7 @@ def with_own_lens(
     points, unseen = references.sighted(points, {one.name for one in made.photographs})
     found = self_calibration.find(made.photographs, made.ground, control=points, sigmas=sigmas, progress=progress)
     photos = self_calibration.with_lens(made.photographs, found)
-    return replace(made, photographs=tuple(photos), notes=(*made.notes, *unseen, *map(text, found.doubts)), lens=found)
+    return replace(made, photographs=tuple(photos), notes=(*made.notes, *unseen), lens=found)
 
 
 def decode(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
