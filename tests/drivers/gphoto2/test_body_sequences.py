@@ -79,9 +79,12 @@ class Flight:
             event = self.camera.next_event(left_s)
             if event is None:
                 continue
-            self.events.append((event, content(event)[:12] if isinstance(event, Arrival) else b""))
+            self.hear(event)
             if until and isinstance(event, Arrival | ShotFailed | (until[1] or ShotFailed)) and event.shot == until[0]:
                 return
+
+    def hear(self, event: CameraEvent) -> None:
+        self.events.append((event, content(event)[:12] if isinstance(event, Arrival) else b""))
 
     def note(self, shot: int | None) -> None:
         number = self.body.releases
@@ -135,7 +138,8 @@ class Flight:
             self.follow(12.0, (self.shots, None))
         self.follow(1.0)
         self.camera.stop()
-        self.follow(0.3)
+        while event := self.camera.next_event(0.0):
+            self.hear(event)
         found, accounted = [], set[int]()
         noticed = [event.finding for event, _ in self.events if isinstance(event, Noticed)]
         doubted = {one.subject.which for one in noticed if one.subject.kind == "frame"}

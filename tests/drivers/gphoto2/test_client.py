@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import itertools
 import math
 import os
 import signal
@@ -22,13 +23,25 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from dappled.clock import SystemClock
 from dappled.drivers import usb_bus
-from dappled.drivers.camera import Arrival, CameraError, Companion, Fired, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    CameraError,
+    CameraEvent,
+    Companion,
+    Fired,
+    Identity,
+    Noticed,
+    ShotFailed,
+    StateChanged,
+)
 from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.gphoto2.client import GPhoto2Camera, Spawn, open_camera, spawn_process
-from dappled.drivers.gphoto2.messages import Carryover
+from dappled.drivers.gphoto2.messages import Carryover, event_message
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
 from dappled.drivers.raw.raw_file import read_exif
+from dappled.findings import Code, Subject, finding
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from dappled.testing import (
@@ -584,6 +597,48 @@ def test_a_process_that_can_t_be_started_now_is_tried_again(body: SimulatedBody)
         until_state(camera, "ready")
         camera.fire(2)
         _ended(until_shot_ends(camera, 2))
+
+
+class HastyClock(SystemClock):
+    """Each reading is two seconds later than the one before: a ping is due after every message."""
+
+    def __init__(self) -> None:
+        super().__init__(0)
+        self._read = itertools.count(0, 2 * 10**9)
+
+    def monotonic_ns(self) -> int:
+        return next(self._read)
+
+
+def test_what_a_process_said_before_it_ended_is_heard_and_the_unlisted_card_is_told() -> None:
+    """Of a process that has ended commands can't be sent; its last words wait in the socket."""
+    left = [finding(Code.PICTURE_ON_CARD, Subject("picture", f"/store/IMG_{number:04d}.CR2")) for number in range(4)]
+    told: list[CameraEvent] = [
+        StateChanged("ready", "", 0, Identity("Canon", "450D", "1", "usb:1,2")),
+        *(Noticed(one, 0) for one in left),
+    ]
+    started: list[subprocess.Popen[bytes]] = []
+
+    def spawn(_settings: GPhoto2Settings, _carryover: Carryover) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
+        if started:
+            raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM))
+        started.append(subprocess.Popen([sys.executable, "-c", "raise SystemExit(1)"]))
+        channel, there = ProcessChannel.pair()
+        child = ProcessChannel(there)
+        for event in told:
+            child.send(event_message(event).body)
+        child.close()
+        return started[0], channel
+
+    camera = GPhoto2Camera(GPhoto2Settings(), spawn=spawn, clock=HastyClock())
+    with running(camera):
+        events = until(camera, lambda event: isinstance(event, StateChanged) and "can't be started" in event.reason)
+    assert [event.finding for event in events if isinstance(event, Noticed)] == left
+    last = until_state(camera, "absent")
+    assert last.reason == "the camera was stopped"
+    notice = camera.next_event(5.0)
+    assert isinstance(notice, Noticed)
+    assert notice.finding.code is Code.CARD_NOT_LISTED
 
 
 def test_a_body_that_comes_back_under_another_address_is_found() -> None:

@@ -24,7 +24,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.child_process import ChannelError, ProcessChannel
-from dappled.drivers.gphoto2.messages import message_event
+from dappled.drivers.gphoto2.messages import Carryover, message_event
 from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -568,6 +568,20 @@ def test_what_stays_on_the_card_is_named_at_the_end(ready: Harness) -> None:
     while (message := ready.channel.receive(0.0)) is not None:
         events.append(message_event(message))
     assert noticed(events) == [(Code.PICTURE_ON_CARD, f"{FOLDER}/IMG_0004.CR2")]
+
+
+def test_a_process_that_never_saw_the_card_of_the_one_before_says_so_at_the_end(harness: Harness) -> None:
+    camera = harness.camera
+    camera.errors["open"] = [AbsentError("pulled")]
+    before = Carryover(serial=camera.identity.serial)
+    harness.loop = CameraLoop(harness.loop_channel, GPhoto2Settings(), camera.open, harness.clock, before)
+    harness.turn(steps=1)
+    harness.channel.send({"do": "stop"})
+    harness.loop.run()
+    events = []
+    while (message := harness.channel.receive(0.0)) is not None:
+        events.append(message_event(message))
+    assert noticed(events) == [(Code.CARD_NOT_LISTED, "")]
 
 
 def test_an_announced_file_on_a_card_that_was_taken_out_is_named(ready: Harness) -> None:

@@ -109,6 +109,7 @@ class GPhoto2Camera(QueuedCamera):
         self._live = _Live()  # guarded by the lock
         self._identity: Identity | None = None
         self._known_settings: tuple[Setting, ...] = ()
+        self._looked_last = False  # the process ended by itself when it was asked to: it has named what stays
 
     def start(self) -> None:
         """Start the camera's process. Raises CameraError when called twice."""
@@ -182,16 +183,17 @@ class GPhoto2Camera(QueuedCamera):
     def stop(self) -> None:
         """Ask the process to end, which lists the card once more, and kill it after 1.4 s. Shots that had not ended
         fail."""
+        stopped_before = self._loop.stopping.is_set()
         self._loop.stopping.set()
         with self._lock, contextlib.suppress(ChannelError):  # it is killed below
             if self._channel is not None:
                 self._channel.send({"do": "stop"})
-        if self._loop.stop(_STOP_S):
-            return
+        ended = self._loop.stop(_STOP_S)
         with self._lock:
-            if self._process is not None:
+            if not ended and self._process is not None:
                 self._process.kill()
-        if self._identity is not None and self._settings.capture_target == "card":
+        listed = (ended and self._looked_last) or self._identity is None or self._settings.capture_target != "card"
+        if not listed and not stopped_before:
             self.report(Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), self._clock.monotonic_ns()))
         self._loop.stop(_KILL_S)
 
@@ -221,6 +223,7 @@ class GPhoto2Camera(QueuedCamera):
             channel.close()
             end_child(process)
             stopped = self._loop.stopping.is_set()
+            self._looked_last = stopped and process.returncode == 0
             for shot in pending:
                 self.report(
                     ShotFailed(shot, "the camera was stopped" if stopped else reason, self._clock.monotonic_ns())
@@ -237,7 +240,7 @@ class GPhoto2Camera(QueuedCamera):
         try:
             while True:
                 if self._loop.stopping.is_set():
-                    channel.send({"do": "stop"})  # again: the process may have begun after `stop` sent it
+                    _tell(channel, "stop")  # again: the process may have begun after `stop` sent it
                 message = channel.receive(_PING_S)
                 now_ns = self._clock.monotonic_ns()
                 if message is not None:
@@ -258,7 +261,7 @@ class GPhoto2Camera(QueuedCamera):
                     )
                 if now_ns - asked_ns > _PING_S * 1e9:
                     asked_ns = now_ns
-                    channel.send({"do": "ping"})
+                    _tell(channel, "ping")
         except ChannelError as error:
             return f"the camera's process ended unexpectedly ({error}); it starts again"
 
@@ -311,3 +314,9 @@ class GPhoto2Camera(QueuedCamera):
             self.report(StateChanged("faulted", reason, now_ns))
             self._loop.stopping.wait(wait_ns / 1e9)
         self._budget.spend(self._clock.monotonic_ns())
+
+
+def _tell(channel: ProcessChannel, what: str) -> None:
+    """Send a command. Where the process is gone, `receive` says so, after all that it had said before."""
+    with contextlib.suppress(ChannelError):
+        channel.send({"do": what})

@@ -71,6 +71,7 @@ class CameraLoop:
         self._state = CameraState(settings.timeouts, carryover or Carryover())
         self._viewfinder = Viewfinder(channel)
         self._session: Session | None = None
+        self._keeps_files = settings.capture_target == "card"
         self._open_at_ns = 0
 
     def run(self) -> None:
@@ -101,7 +102,7 @@ class CameraLoop:
 
     def _look_last(self) -> None:
         """Name the pictures that stay on the card."""
-        if self._session is not None and not self._session.keeps_files:
+        if not self._keeps_files:
             return
         for _ in range(0 if self._session is None else _LAST_TRIES):  # the body may still be closing
             if self._session is not None:
@@ -238,7 +239,7 @@ class CameraLoop:
             self._open_at_ns = self._now_ns() + round(self._settings.timeouts.retry_s * 1e9)
             self._send_state("absent" if isinstance(error, AbsentError) else "faulted", str(error))
             return
-        self._session = session
+        self._session, self._keeps_files = session, session.keeps_files
         self._state.opened(session.identity.serial, self._now_ns())
         if session.keeps_files:
             self._sender.send(*self._state.listed(session.contents(), self._now_ns()))

@@ -278,9 +278,9 @@ class CameraState:
         return [*told, *(_on_card(file, now_ns) for file in waiting)]
 
     def not_listed(self, now_ns: int) -> list[CameraEvent]:
-        """The card can't be listed for the last time."""
-        is_known = self._card.is_listed
-        return [Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), now_ns)] if is_known else []
+        """The card can't be listed for the last time: pictures may stay on it, of this process or one before."""
+        known = self.serial is not None
+        return [Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), now_ns)] if known else []
 
     def list_due(self, now_ns: int, quiet_s: float) -> bool:
         """Whether a picture may have been missed, and the camera had nothing to do for so long."""
