@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, rivals, true_name
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, FramedShot, attribute, rivals, true_name
 from dappled.findings import Code, Subject, finding
 
 SECOND = 10**9
@@ -57,16 +57,52 @@ def test_a_clock_that_was_set_back_to_the_time_of_a_shot_that_was_given_up_is_no
     assert (counted.shot, counted.doubt) == (5, None)  # the camera's count agrees with its clock
 
 
-def test_the_first_frame_is_in_doubt_where_another_picture_comes_soon_after_its_shot() -> None:
-    """A picture by hand just before the first shot has no rival clock: its own picture is the stray then."""
-    framed = [claim(1, 200)]
-    first = attribute(clue(5000, 200.6), [], framed, BodyClock())
+@pytest.mark.parametrize("dated", [True, False])
+@pytest.mark.parametrize("came_after_s", [0.6, 7.0])
+def test_the_first_frame_is_in_doubt_where_another_picture_comes_soon_after_its_shot(
+    dated: bool, came_after_s: float
+) -> None:
+    """A picture by hand just before the first shot has no rival clock: its own picture is the stray then. Nor has one
+    by a body that tells no time; where frames take their time to come, its own does, too."""
+    at_s = 200 + came_after_s
+    first = attribute(clue(5000 if dated else None, at_s), [], [claim(1, 200)], BodyClock())
     assert (first.shot, first.doubt) == (1, None)
-    (doubt,) = rivals("2.RAF", clue(5002, 202.5), framed, first.clock)
+    framed = [FramedShot(claim(1, 200), round(at_s * SECOND))]
+    soon, late = (clue(5000 + one_s if dated else None, 200 + one_s) for one_s in (2.3 * came_after_s, 20.5))
+    (doubt,) = rivals("2.RAF", soon, framed, first.clock)
     assert doubt.kind == (Code.FRAME_RIVAL_PICTURE, Subject("frame", 1))
-    assert rivals("2.RAF", clue(5020, 220.5), framed, first.clock) == []  # the shot's own would have come sooner
+    assert rivals("2.RAF", late, framed, first.clock) == []  # the shot's own would have come sooner
     second = attribute(clue(5010, 210.5), [], [claim(2, 210)], first.clock)
-    assert rivals("3.RAF", clue(5012, 212.5), [claim(2, 210)], second.clock) == []  # now the clock tells
+    third = [FramedShot(claim(2, 210), round(210.5 * SECOND))]
+    if dated:
+        assert rivals("3.RAF", clue(5012, 212.5), third, second.clock) == []  # now the clock tells
+
+
+def test_a_time_between_those_of_two_shots_leaves_the_frame_in_doubt() -> None:
+    """One of them has no file, and by whole seconds the time fits both as badly."""
+    found = attribute(clue(4900 + 201.5, 205.0), [], [claim(4, 200), claim(5, 204)], BodyClock((4900.0, 4898.5)))
+    assert found.shot == 4
+    assert found.doubt == finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=5)
+
+
+@pytest.mark.parametrize("offsets", [(4900.0,), (4900.0, 4900.3)])
+def test_a_picture_three_seconds_after_its_shot_is_in_doubt_though_few_files_tell_the_clock(
+    offsets: tuple[float, ...],
+) -> None:
+    found = attribute(clue(4900 + 202.9, 203.2), [], [claim(4, 200)], BodyClock(offsets))
+    assert found.doubt is not None
+    assert found.doubt.code is Code.FRAME_CLOCK_DISAGREES
+
+
+def test_pictures_by_hand_after_shots_without_one_are_not_taken_for_a_clock_that_was_set() -> None:
+    """Twice in a row is chance; from the third on the body is one that takes its time."""
+    doubts, clock = [], KNOWN
+    for shot in range(4, 7):
+        at_s = 200.0 + 20 * shot
+        found = attribute(clue(4900 + at_s + 4, at_s + 4.5), [], [claim(shot, at_s)], clock)
+        clock = found.clock
+        doubts.append(found.doubt is not None)
+    assert doubts == [True, True, False]
 
 
 def test_a_body_that_took_its_time_to_focus_keeps_its_frame_in_doubt() -> None:

@@ -21,6 +21,7 @@ _LEAST_S = 1.5
 """Two times in whole seconds differ by less than one, and the shutter's latencies by some tenths."""
 _SIGMAS = 4.0
 _SLOW_S = 5.0
+_SLOWER = 2.5
 _FEW = 4
 _KEPT = 16
 _DNG_VERSION = 50706
@@ -77,9 +78,7 @@ class BodyClock:
     @property
     def limit_s(self) -> float:
         """How far a file's time may be from its shot's: four standard deviations of those that are known, at least 1.5
-        s and at most 3 s."""
-        if len(self.offsets_s) < _FEW:
-            return TOLERANCE_S
+        s and at most 3 s. Needs at least one offset."""
         return min(max(_SIGMAS * pstdev(self.offsets_s), _LEAST_S), TOLERANCE_S)
 
     def off_s(self, claim: Claim, taken_s: float) -> float:
@@ -113,6 +112,14 @@ class BodyClock:
 
 
 @dataclass(frozen=True, slots=True)
+class FramedShot:
+    """A shot whose frame has come, and when that was announced or first listed (monotonic)."""
+
+    claim: Claim
+    arrived_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Attribution:
     """The shot that made a file, None for a stray; what is known of the body's clock after it; and a finding where the
     shot is in doubt."""
@@ -133,8 +140,8 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     it fits. Of several that fit, and where there is no clock, files come in order; a shot given up is a rival, and in
     doubt where its picture would be known already and no names confirm its place. A file that fits none is a picture of
     another moment, a stray, where it can have been made then: not before `since_ns` and not after the awaited shot was
-    fired. Else the body was slow or its clock was set, and it is the awaited shot's, in
-    doubt; so is the second such file in a row. From then on the new time counts.
+    fired. Else the body was slow or its clock was set, and it is the awaited shot's, in doubt. The new time counts from
+    the second such file in a row on; from the third, where they may be pictures by hand after shots without one.
     """
     claims = [one for one in (*late, *waiting) if _possible(one, clue)]
     awaited = next((one for one in waiting if one in claims), None)
@@ -157,27 +164,34 @@ def attribute(clue: FileClue, late: Sequence[Claim], waiting: Sequence[Claim], c
     alone = all(one.before < likely.before or other_s > apart_s + 1.0 for one, other_s in rivalling[1:])
     agreeing = likely.before + (not _of_another_moment(clue, awaited, taken_s, clock))
     chosen = likely.claim if likely.before else awaited
-    if agreeing > (1 if len(rivalling) == 1 else _FEW) and alone and apart_s <= _LEAST_S:
+    by_hand = 0 < clock.off_s(chosen, taken_s) <= (clue.arrived_ns - chosen.fired_ns) / 1e9 + clock.limit_s
+    needed = _FEW if len(rivalling) > 1 else 2 if by_hand else 1
+    if agreeing > needed and alone and apart_s <= _LEAST_S:
         return Attribution(chosen.shot, clock.learnt(chosen, taken_s))
     doubt = _disagrees(chosen, taken_s, clock) if agreeing else None
     told = replace(clock, rivals=(*(one for one, _ in rivalling), *clock.rivals)[:_KEPT])
     return Attribution(chosen.shot if doubt else None, told, doubt)
 
 
-def rivals(stray: str, clue: FileClue, framed: Sequence[Claim], clock: BodyClock) -> list[Finding]:
+def rivals(stray: str, clue: FileClue, framed: Sequence[FramedShot], clock: BodyClock) -> list[Finding]:
     """The doubts of frames that have come, which a stray of this name may be instead: it was made as their shot was.
 
-    A frame by which alone the body's clock is known agrees with it in any case: what comes soon after its shot may be
-    its picture.
+    Where the body tells no time, or a frame is the only one by which its clock is known, what comes soon after the shot
+    may be its picture: within 5 s, or two and a half times as long as the frame took.
     """
-    taken_s = clue.taken_s
-    if taken_s is None or not clock.offsets_s:
-        return []
-    soon_ns = _SLOW_S * 1e9 if len(clock.offsets_s) == 1 else 0
+    taken_s, offsets = clue.taken_s, clock.offsets_s
+
+    def may_be(one: FramedShot) -> bool:
+        fired_ns = one.claim.fired_ns
+        if taken_s is not None and offsets and abs(clock.off_s(one.claim, taken_s)) <= _LEAST_S:
+            return True
+        soon_ns = max(_SLOW_S * 1e9, _SLOWER * (one.arrived_ns - fired_ns))
+        return (taken_s is None or len(offsets) < 2) and 0 <= clue.arrived_ns - fired_ns <= soon_ns
+
     return [
-        finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", one.shot), picture=stray)
+        finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", one.claim.shot), picture=stray)
         for one in framed
-        if abs(clock.off_s(one, taken_s)) <= _LEAST_S or 0 <= clue.arrived_ns - one.fired_ns <= soon_ns
+        if may_be(one)
     ]
 
 
@@ -195,11 +209,14 @@ def _by_order(
     dated_s = taken_s if clock.offsets_s else None
     rivals = [one for one in claims if one in late]
     chosen = awaited if awaited in claims else claims[0] if len(claims) == 1 else None
-    if dated_s is not None and chosen is not None and not rivals:
-        nearest = min(claims, key=lambda one: abs(clock.off_s(one, dated_s)))
-        off_s = abs(clock.off_s(chosen, dated_s))
-        if off_s > _LEAST_S and abs(clock.off_s(nearest, dated_s)) < off_s - 1.0:
+    if dated_s is not None and chosen is not None and not rivals and len(claims) > 1:
+        nearest = min((one for one in claims if one != chosen), key=lambda one: abs(clock.off_s(one, dated_s)))
+        off_s, nearest_s = (abs(clock.off_s(one, dated_s)) for one in (chosen, nearest))
+        if off_s > _LEAST_S and nearest_s < off_s - 1.0:
             chosen = nearest  # the awaited shot's file is late, or there is none
+        elif off_s > _LEAST_S and nearest_s < off_s + 1.0:
+            subject = Subject("frame", chosen.shot)
+            return Attribution(chosen.shot, clock, finding(Code.FRAME_RIVAL_SHOTS, subject, rival=nearest.shot))
     if dated_s is not None and rivals:
         chosen = min(claims, key=lambda one: abs(clock.off_s(one, dated_s)))
     if chosen is None:

@@ -368,7 +368,7 @@ class World:
                 accounted.add(data)
                 if data not in by_data:
                     found.counts["older"] += 1
-                    if event.shot is not None and "doubt" not in event.facts:
+                    if event.shot is not None and "doubt" not in event.facts and event.shot not in self.doubted:
                         found.wrong.append(f"{data!r}, older than the flight, is shot {event.shot}'s")
                 elif event.shot is not None:
                     self._judge_frame(at_s, event, by_data[data], found)

@@ -233,6 +233,7 @@ def test_a_folder_on_another_volume_is_another_card(tmp_path: Path, monkeypatch:
     for shot, name in enumerate(("1234-ABCD", "1234-ABCD", "5678-EF00")):
         volume[0] = name
         watched.fire(shot, 10.0 * shot)
-        (tmp_path / f"{shot}.npy").write_bytes(name.encode())
-        watched.look(3)
+        (tmp_path / f"{shot}.npy").write_bytes(b"%d on " % shot + name.encode())
+        came = watched.look(3)
+    assert came == [(2, b"2 on 5678-EF00", "")]  # those that were brought from the other volume are there, too
     assert watched.codes == [Code.CARD_CHANGED]

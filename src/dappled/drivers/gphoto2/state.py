@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dappled import picture_order
-from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, rivals
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, FramedShot, attribute, rivals
 from dappled.drivers.camera import (
     Arrival,
     CameraEvent,
@@ -92,7 +92,7 @@ class CameraState:
         self._cut_off: tuple[CameraFile, ...] = ()  # announced and not fetched when the link broke
         self._missed = False  # a picture may have been missed
         self._quiet_ns = 0  # when something was last heard of a shot or a file
-        self._framed: deque[Claim] = deque(maxlen=LATE_LIMIT)  # the last shots whose frames have come
+        self._framed: deque[FramedShot] = deque(maxlen=LATE_LIMIT)  # the last shots whose frames have come
         self._held: dict[Stem, Held] = {}  # JPEGs that wait for the raw file beside them
         self._last_frame: tuple[Stem, bool, int] | None = None  # (stem, whether it is a JPEG, shot)
         self._settings_due_ns: int | None = None
@@ -385,7 +385,8 @@ class CameraState:
         waiting = [] if current is None else [current]
         found = attribute(clue, self._late, waiting, self._clock)
         self._clock = found.clock
-        self._framed.extend(claim for claim in (*self._late, *waiting) if claim.shot == found.shot)
+        framed = (claim for claim in (*self._late, *waiting) if claim.shot == found.shot)
+        self._framed.extend(FramedShot(claim, announced.seen_ns) for claim in framed)
         if current is not None and found.shot == current.shot:
             self.current = None
         left = [claim for claim in self._late if claim.shot != found.shot]

@@ -17,7 +17,7 @@ from typing import Any
 
 from dappled import durable, picture_order
 from dappled.clock import Clock
-from dappled.drivers.attribution import BodyClock, Claim, FileClue, attribute, rivals
+from dappled.drivers.attribution import BodyClock, Claim, FileClue, FramedShot, attribute, rivals
 from dappled.drivers.camera import Arrival, Blob, CameraError, Companion, Noticed, ShotFailed
 from dappled.drivers.wired import matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
@@ -58,7 +58,7 @@ class FileWatch:
         self._lock = threading.Lock()
         self._claims: list[Claim] = []
         self._late: list[Claim] = []
-        self._framed: deque[Claim] = deque(maxlen=_LATE)  # the last shots whose frames have come
+        self._framed: deque[FramedShot] = deque(maxlen=_LATE)  # the last shots whose frames have come
         self._past_ns = -1
         self._body_clock = BodyClock()
         self._done: set[FoundFile] = set()
@@ -202,12 +202,14 @@ class FileWatch:
     def _is_brought(self, one: FoundFile) -> Generator[Arrival | Companion | Noticed, None, bool]:
         """Whether a file is one that was delivered. Yields another version of it for the same shot."""
         was = self._brought.get(one.name)
-        if was is None or was.file.card != one.card:
+        if was is None:
             return False
         try:
             same, taken_s = _begins_with(self._source.open(one), was), self._date(one)
         except CameraError:
             return True  # the next look may find it again
+        if was.file.card != one.card and not (same and one.size == was.size):
+            return False
         if not same and (taken_s is None or taken_s != was.taken_s):
             return False
         if not same or one.size != was.size:
@@ -249,7 +251,8 @@ class FileWatch:
         facts = {"doubt": made.doubt.to_json()} if made.doubt else {}
         if (yield from self._bring(made.shot, group, facts)):
             self._body_clock = made.clock
-            self._framed.extend(one for one in (*self._late, *waiting) if one.shot == made.shot)
+            framed = (one for one in (*self._late, *waiting) if one.shot == made.shot)
+            self._framed.extend(FramedShot(one, clue.arrived_ns) for one in framed)
             doubts = rivals(group.main.name, clue, self._framed, made.clock) if made.shot is None else []
             for doubt in doubts:
                 yield Noticed(doubt, self._clock.monotonic_ns())
@@ -301,7 +304,8 @@ class FileWatch:
         offsets_s = self._body_clock.offsets_s
         matched = matching.match(shots, dated, offset_s=median(offsets_s) - to_utc_s if offsets_s else None)
         sure = bool(offsets_s) or self._is_known_card(now)
-        if not matched.pairs and offsets_s:  # the body's clock may have been set
+        rival = any(doubt.code is Code.PICTURE_RIVAL_SHOTS for doubt in matched.doubts)
+        if not matched.pairs and offsets_s and not rival:  # the body's clock may have been set
             matched, sure = matching.match(shots, dated), False
         sure = sure or (not matched.shots and len(matched.pairs) >= _ENOUGH)
         by_name = {group.main.name: group for group in fresh}
