@@ -36,7 +36,7 @@ def test_on_a_machine_without_any_camera_it_ends_with_what_to_do_next(capfd: pyt
     assert main(["doctor", "--json"]) == 1
     told = json.loads(capfd.readouterr().out)
     assert told["next"].startswith("connect the camera")
-    assert {one["state"] for one in told["checks"]} <= {"go", "caution", "no-go"}
+    assert {one["level"] for one in told["checks"]} <= {"note", "caution", "stop"}
 
 
 def settings(folder: Path, picture: str) -> Path:
@@ -151,7 +151,7 @@ def test_a_running_daemon_without_a_camera_is_no_go(
     told = json.loads(capfd.readouterr().out)
     assert told["verdict"] == "no-go"
     first = told["checks"][0]
-    assert (first["name"], first["state"], first["text"]) == ("camera.absent", "no-go", "the camera is absent: no body")
+    assert (first["code"], first["level"], first["facts"]) == ("camera.absent", "stop", {"reason": "no body"})
     assert told["next"]
 
 
@@ -218,7 +218,13 @@ def test_the_simulated_camera_is_go_and_its_latency_is_what_the_simulation_knows
     assert done.returncode == 0, done.stdout + done.stderr
     told = json.loads(done.stdout)
     assert told["verdict"] == "go"
-    assert {one["name"] for one in told["test_shot"]} == {"focal length", "exposure", "carriers", "focus", "motion"}
+    assert {one["subject"]["kind"] for one in told["test_shot"]} == {
+        "focal length",
+        "exposure",
+        "carriers",
+        "focus",
+        "motion",
+    }
     latency = told["latency"]
     assert latency["to_exposure"]["shots"] >= 2
     assert all(45 <= true_ms <= 75 for true_ms in latency["truth_ms"])

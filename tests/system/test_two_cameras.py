@@ -116,7 +116,7 @@ def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(
             assert record["shots"]["safe"] == asked[name]
             _, judged = says("doctor", "--config", file)
             assert judged["flight"] == record["flight"]
-            assert not [one for one in judged["checks"] if one["name"] == "settings"]
+            assert not [one for one in judged["checks"] if one["subject"]["kind"] == "settings"]
         for daemon in daemons:
             daemon.send_signal(signal.SIGTERM)
         assert [daemon.wait(60) for daemon in daemons] == [0, 0]

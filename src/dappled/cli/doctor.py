@@ -6,7 +6,7 @@ import json
 import statistics
 import tempfile
 import time
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,15 +20,15 @@ from dappled.config.schema import read_toml
 from dappled.config.settings import Settings
 from dappled.daemon import settings_check, test_shot
 from dappled.daemon.health import frame_checks, go_no_go, host_checks
-from dappled.daemon.health.host_checks import Check
 from dappled.daemon.health.standing import in_record
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.test_shot import Latency
 from dappled.drivers import usb_bus
 from dappled.errors import DappledError, counted
-from dappled.findings import named, remedy
+from dappled.findings import Code, Finding, Level, Subject, finding, remedy, text, to_rows
 
-_WORDS = {"go": "go", "caution": "caution", "no-go": "NO GO"}
+_WORDS = {Level.NOTE: "go", Level.CAUTION: "caution", Level.STOP: "NO GO"}
+_SETTINGS = Subject("settings")
 _VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO GO"}
 HEAR_S = 5.0  # a daemon publishes its health every second
 
@@ -75,10 +75,10 @@ def _examined(arguments: ExamineMachine, output: Output) -> Report:
         if arguments.simulate:
             settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
         checked = host_checks.run(settings)
-        report: dict[str, Any] = {"checks": _facts(checked)}
-        ready = all(one.state != "no-go" for one in checked if one.name in ("camera", "disk"))
+        report: dict[str, Any] = {"checks": to_rows(checked)}
+        ready = all(one.level < Level.STOP for one in checked if one.subject.kind in ("camera", "disk"))
         good = not host_checks.next_step(checked)
-        lines = _lines(checked)
+        lines = [*_lines(checked)]
         if (arguments.test_shot or arguments.latency) and ready:
             more, shot = _shoot(settings, arguments, folder, truth, output)
             lines, report, good = [*lines, *more], {**report, **shot}, good and shot["verdict"] != "no-go"
@@ -98,36 +98,36 @@ def _beside(endpoint: str, settings: Settings, arguments: ExamineMachine) -> Rep
             "(dappled trigger, the ground station, the console)"
         )
     report, user = status.health(endpoint, HEAR_S, status.unit(arguments.config)), status.stranger(endpoint)
-    checks = [Check(one.code.value, go_no_go.state([one]), named(one), remedy(one)) for one in in_record(report)]
-    looked: list[Check] = []
+    checks = in_record(report)
+    looked: list[Finding] = []
     if report["camera"]["state"] not in ("ready", "busy", "starting"):  # then another program may hold it
         looked = [
             one
             for check in (host_checks.bodies, host_checks.grabbers)
             for one in check(settings, host_checks.Machine())
         ]
-    verdict = host_checks.verdict(checks)
+    verdict = go_no_go.state(checks)
     if arguments.config is not None:
         compared = _differences(arguments.config, settings, report, endpoint)
         looked += compared
-        verdict = host_checks.verdict([*checks, *compared])
+        verdict = go_no_go.state([*checks, *compared])
     todo = host_checks.next_step(looked) or ("`dappled status` says more" if verdict == "no-go" else "")
     whose = "a daemon runs here" if user is None else f"not your own daemon but that of user {user} runs here"
     lines = [f"{whose}, flight {report['flight']}; it reports", *_lines([*checks, *looked])]
     lines.append(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
-    facts = _facts([*checks, *looked])
-    found = {"flight": report["flight"], "user": user, "checks": facts, "verdict": verdict, "next": todo}
+    rows = to_rows([*checks, *looked])
+    found = {"flight": report["flight"], "user": user, "checks": rows, "verdict": verdict, "next": todo}
     return Report(found, lines, failed=verdict == "no-go")
 
 
-def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoint: str) -> list[Check]:
+def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoint: str) -> list[Finding]:
     """What the daemon at this endpoint was not started with, though the file says it. The flight's folder holds its
     settings."""
     flown = Path(report["disk"]["folder"]) / "flight.toml"
     try:
         tables, _ = read_toml(flown)
     except DappledError as error:
-        return [Check("settings", "caution", f"{file} can't be compared with the daemon's settings: {error}")]
+        return [finding(Code.SETTINGS_UNREAD, _SETTINGS, file=str(file), why=str(error))]
     live = tables.get("settings", {})
     live.get("record", {})["min_free_mb"] = report.get("min_free_bytes", 0) // 1_000_000  # it can change in flight
     ours = configuration.to_tables(wanted)
@@ -135,24 +135,20 @@ def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoi
         ours["publish"]["slices"] = endpoint
         if wanted.publish.ask == f"{wanted.publish.slices}.ask":
             ours["publish"]["ask"] = f"{endpoint}.ask"
-    todo = (
-        f"restart the daemon with this file (sudo systemctl restart {status.unit(file)}), or name the file that it was "
-        "started with"
-    )
     simulated: Collection[tuple[str, str]] = ()
     found = []
     if str(tables.get("camera", {}).get("serial", "")).startswith("SIM"):
         from dappled.mocks.simulation import REPLACED  # noqa: PLC0415  # a real flight doesn't load the mocks
 
         simulated = REPLACED
-        text = f"the daemon simulates: camera and calibration of {file} are not in use"
-        found = [Check("settings", "caution", text, "start `dappled run` without --simulate to fly")]
+        found = [finding(Code.SETTINGS_SIMULATED, _SETTINGS, file=str(file))]
+    of_file = {"file": str(file), "unit": status.unit(file)}
     return found + [
-        Check(
-            "settings", "no-go", f"{table}.{key} is {_toml(ours, table, key)} in {file}, the daemon has {there}", todo
-        )
+        finding(
+            Code.SETTINGS_DIFFER, Subject("settings"), setting=f"{table}.{key}", wanted=wish, live=there
+        ).with_facts(**of_file)
         for table, key, *_ in configuration.describe()
-        if (table, key) not in simulated and (there := _toml(live, table, key)) != _toml(ours, table, key)
+        if (table, key) not in simulated and (there := _toml(live, table, key)) != (wish := _toml(ours, table, key))
     ]
 
 
@@ -160,17 +156,15 @@ def _toml(tables: Mapping[str, Any], table: str, key: str) -> str:
     return json.dumps(tables.get(table, {}).get(key), ensure_ascii=False)
 
 
-def _lines(checks: Sequence[Check]) -> list[str]:
-    return [f"{_WORDS[one.state]:8} {one.name:11} {one.text}" for one in checks]
+def _lines(found: Iterable[Finding], *, remedies: bool = False) -> Iterator[str]:
+    for one in found:
+        todo = f": {remedy(one)}" if remedies and one.level > Level.NOTE and remedy(one) else ""
+        which = f"{one.subject.which}: " if one.subject.which != "" else ""
+        yield f"{_WORDS[one.level]:8} {one.subject.kind:11} {which}{text(one)}{todo}"
 
 
-def _facts(checks: Sequence[Check]) -> list[dict[str, str]]:
-    return [{"name": one.name, "state": one.state, "text": one.text, "todo": one.todo} for one in checks]
-
-
-def _last(checks: Sequence[Check], verdict: str | None) -> str:
-    todo = host_checks.next_step(checks)
-    if todo:
+def _last(found: Sequence[Finding], verdict: str | None) -> str:
+    if todo := host_checks.next_step(found):
         return f"next: {todo}"
     if verdict is not None:
         return _VERDICTS[verdict]
@@ -188,29 +182,23 @@ def _shoot(
     ours = settings if arguments.test_shot else replace(settings, decode=replace(settings.decode, enabled=False))
     latencies: list[Latency] = []
     frame: Path | None = None
-    problem = ""
+    judged: list[Finding] = []
     with test_shot.daemon(ours, folder, place) as daemon, _hot_shoe(ours, truth):
         for _ in output.each(range(count), "shot"):
             pending = daemon.shoot()
             if pending.frame is None:
-                problem = pending.problem or pending.follows
+                why = pending.problem or pending.follows
+                judged = [finding(Code.SHOT_WITHOUT_FRAME, Subject("test shot"), why=why)]
                 break
             latencies.append(test_shot.latency(pending))
             frame = frame or daemon.flight / pending.frame.name
-        lines: list[str] = []
-        facts: dict[str, Any] = {"verdict": "go", "flight": str(daemon.flight) if arguments.keep else None}
-        if problem:
-            lines.append(f"{_WORDS['no-go']:8} {'test shot':11} {problem}")
-            facts["verdict"] = "no-go"
-        elif arguments.test_shot and frame is not None:
+        flight = str(daemon.flight) if arguments.keep else None
+        if arguments.test_shot and frame is not None and not judged:
             judged = _judged(frame, recipe)
-            facts |= {
-                "test_shot": [
-                    {"name": one.name, "state": one.state, "text": one.text, "measured": one.measured} for one in judged
-                ],
-                "verdict": host_checks.verdict(judged),
-            }
-            lines += _lines(judged)
+    lines = [*_lines(judged, remedies=True)]
+    facts: dict[str, Any] = {"verdict": go_no_go.state(judged), "flight": flight}
+    if arguments.test_shot:
+        facts["test_shot"] = to_rows(judged)
     if arguments.latency and latencies:
         timed = _timed(latencies, None if truth is None else _true_latencies(truth, len(latencies)))
         lines += timed.pop("lines")
@@ -218,11 +206,11 @@ def _shoot(
     return lines, facts
 
 
-def _judged(frame: Path, recipe: Any) -> list[Check]:
+def _judged(frame: Path, recipe: Any) -> list[Finding]:
     try:
         return frame_checks.check_frame(frame, recipe)
     except DappledError as error:
-        return [Check("picture", "no-go", f"it can't be read as a picture: {error}")]
+        return [finding(Code.FRAME_UNREADABLE, Subject("picture"), why=str(error))]
 
 
 _SPANS = {

@@ -12,11 +12,10 @@ from PIL import Image
 from scipy import ndimage
 
 from dappled.daemon.health.frame_checks import check_frame, sharpness
-from dappled.daemon.health.host_checks import Check, verdict
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError
-from dappled.findings import Code, Subject, finding, told
+from dappled.findings import Code, Finding, Level, Subject, finding, told
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
 from tests.decode.ray_frames import MASKS, Shot
@@ -31,22 +30,21 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def by_name(findings: list[Check]) -> dict[str, Check]:
-    return {one.name: one for one in findings}
+def by_name(found: list[Finding]) -> dict[str, Finding]:
+    return {one.subject.kind: one for one in found}
 
 
 def test_a_good_frame_is_go(good: Path) -> None:
     found = by_name(check_frame(good, RECIPE))
-    assert {one.state for one in found.values()} == {"go"}
+    assert {one.level for one in found.values()} == {Level.NOTE}
     assert set(found) == {"focal length", "exposure", "carriers", "focus", "motion"}
-    assert found["focal length"].measured["focal_length_mm"] == 50.0
-    assert verdict(list(found.values())) == "go"
+    assert found["focal length"].facts["focal_length_mm"] == 50.0
 
 
 def test_without_a_mask_configured_the_rest_is_looked_at(good: Path) -> None:
     found = by_name(check_frame(good, None))
-    assert found["carriers"].state == "caution"
-    assert found["exposure"].state == "go"
+    assert found["carriers"].level == Level.CAUTION
+    assert found["exposure"].level == Level.NOTE
 
 
 def test_a_clipped_frame_is_no_go(tmp_path: Path) -> None:
@@ -55,8 +53,8 @@ def test_a_clipped_frame_is_no_go(tmp_path: Path) -> None:
     metered_s, _ = camera.metered(14.8)
     path.write_bytes(camera.expose(10.0, 1, f_number=14.8, exposure_s=8 * metered_s).file)
     found = by_name(check_frame(path, None))
-    assert found["exposure"].state == "no-go"
-    assert "expose less" in found["exposure"].text
+    assert found["exposure"].level == Level.STOP
+    assert "expose less" in told(found["exposure"])
 
 
 def refuse(*_: object, **__: object) -> None:
@@ -67,11 +65,11 @@ def test_a_jpeg_is_no_go_behind_a_mask(good: Path, tmp_path: Path, monkeypatch: 
     path = tmp_path / "good.jpg"
     values = reading.read(good).mosaic
     Image.fromarray((255 * (values / values.max()) ** (1 / 2.2)).astype(np.uint8)).save(path, quality=95)
-    assert by_name(check_frame(path, None))["tones"].state == "caution"
+    assert by_name(check_frame(path, None))["tones"].level == Level.CAUTION
     monkeypatch.setattr(Darkroom, "decode", refuse)
     found = by_name(check_frame(path, RECIPE))["tones"]
-    assert found.state == "no-go"
-    assert found.text == "it is a JPEG: its tones are not linear; set the camera to raw files"
+    assert found.level == Level.STOP
+    assert told(found).startswith("it is a JPEG: its tones are not linear")
 
 
 def test_what_a_calibration_is_in_doubt_about_is_a_caution(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -81,7 +79,7 @@ def test_what_a_calibration_is_in_doubt_about_is_a_caution(good: Path, monkeypat
         Darkroom, "decode", lambda *words, **names: replace(decode(*words, **names), calibration_doubts=(doubt,))
     )
     found = by_name(check_frame(good, RECIPE))
-    assert (found["doubts"].state, found["doubts"].text) == ("caution", told(doubt))
+    assert found["calibration"] == doubt
 
 
 def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:
@@ -89,13 +87,13 @@ def test_a_frame_without_light_is_no_go(tmp_path: Path) -> None:
     camera = reference_camera(1, scale=0.25)
     metered_s, _ = camera.metered(14.8)
     path.write_bytes(camera.expose(10.0, 1, f_number=14.8, exposure_s=metered_s / 50).file)
-    assert "expose more" in by_name(check_frame(path, None))["exposure"].text
+    assert "expose more" in told(by_name(check_frame(path, None))["exposure"])
 
 
 def test_the_wrong_mask_shows_no_carriers(good: Path) -> None:
     found = by_name(check_frame(good, Recipe(camera="reference-36mm", mask="mask-5")))
-    assert found["carriers"].state == "no-go"
-    assert "mask" in found["carriers"].text
+    assert found["carriers"].level == Level.STOP
+    assert "mask" in told(found["carriers"])
 
 
 def test_a_mask_away_from_its_place_is_cautioned_of(tmp_path: Path) -> None:
@@ -109,8 +107,8 @@ def test_a_mask_away_from_its_place_is_cautioned_of(tmp_path: Path) -> None:
     found = by_name(
         check_frame(tmp_path / "stopped.dng", Recipe(camera=str(tmp_path / "off.toml"), mask="reference-5x5"))
     )
-    assert found["carriers"].state == "caution"
-    assert "farther out than predicted" in found["carriers"].text
+    assert found["carriers"].level == Level.CAUTION
+    assert "farther out than predicted" in told(found["carriers"])
 
 
 def test_a_file_that_is_no_picture_is_an_error(tmp_path: Path) -> None:
@@ -135,16 +133,16 @@ def ground(seed: int) -> NDArray[np.float64]:
 @pytest.mark.parametrize("seed", range(5))
 def test_focus_and_motion_are_told_apart(seed: int) -> None:
     sharp = ground(seed)
-    assert [one.state for one in sharpness(sharp)] == ["go", "go"]
-    assert [one.state for one in sharpness(ndimage.gaussian_filter(sharp, 2.0))] == ["no-go", "caution"]
+    assert [one.level for one in sharpness(sharp)] == [Level.NOTE, Level.NOTE]
+    assert [one.level for one in sharpness(ndimage.gaussian_filter(sharp, 2.0))] == [Level.STOP, Level.CAUTION]
     for axis, word in ((1, "across"), (0, "along")):
         focus, motion = sharpness(ndimage.uniform_filter1d(sharp, 5, axis=axis))
-        assert (focus.state, motion.state) == ("go", "no-go")
-        assert f"lost {word}" in motion.text
+        assert (focus.level, motion.level) == (Level.NOTE, Level.STOP)
+        assert f"lost {word}" in told(motion)
     falling = np.diag(np.ones(5)) / 5
     focus, motion = sharpness(ndimage.convolve(sharp, falling))
-    assert motion.state == "no-go"
-    assert "falling" in motion.text
+    assert motion.level == Level.STOP
+    assert "falling" in told(motion)
 
 
 def test_carriers_by_another_law_or_none_to_be_seen_are_cautions(tmp_path: Path) -> None:
@@ -155,5 +153,5 @@ def test_carriers_by_another_law_or_none_to_be_seen_are_cautions(tmp_path: Path)
     for shot, words in ((stopped, "seen by the law geometric, none where configured"), (opened, "none can be seen")):
         frame = dng_of(tmp_path / f"{shot.f_number}.dng", shot, shot.frame())
         one = by_name(check_frame(frame, recipe))["carriers"]
-        assert one.state == "caution"
-        assert words in one.text
+        assert one.level == Level.CAUTION
+        assert words in told(one)

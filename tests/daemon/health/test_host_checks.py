@@ -12,9 +12,10 @@ import pytest
 
 from dappled.config.settings import CameraSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import host_checks
-from dappled.daemon.health.host_checks import Check, Machine, next_step
+from dappled.daemon.health.host_checks import Machine, next_step
 from dappled.drivers.camera import CameraError
 from dappled.drivers.usb_bus import CANON, FUJIFILM, UsbBody
+from dappled.findings import Code, Finding, Level, Subject, finding, remedy, text
 from tests.daemon.fakes import FakeCamera
 
 EOS = UsbBody(1, 5, CANON, 0x3145, "PTP", "EOS 450D")
@@ -31,7 +32,7 @@ def having(machine: Machine, *bodies: UsbBody) -> Machine:
     return replace(machine, bodies=lambda: list(bodies))
 
 
-def the_one(findings: list[Check]) -> Check:
+def the_one(findings: list[Finding]) -> Finding:
     (found,) = findings
     return found
 
@@ -42,27 +43,27 @@ def no_libusb() -> list[UsbBody]:
 
 def test_without_a_camera_it_says_what_to_do_next(machine: Machine) -> None:
     found = the_one(host_checks.bodies(Settings(), machine))
-    assert found.state == "no-go"
-    assert "USB mode" in found.todo
-    assert "--simulate" in found.todo
+    assert found.level == Level.STOP
+    assert "USB mode" in remedy(found)
+    assert "--simulate" in remedy(found)
 
 
 def test_without_a_libusb_it_says_what_to_install(machine: Machine) -> None:
     found = host_checks.libraries(Settings(), replace(machine, bodies=no_libusb))
-    assert found[-1].state == "no-go"
-    assert "apt install" in found[-1].todo
+    assert found[-1].level == Level.STOP
+    assert "apt install" in remedy(found[-1])
     assert host_checks.bodies(Settings(), replace(machine, bodies=no_libusb)) == []
 
 
 def test_a_body_that_can_be_fired(machine: Machine) -> None:
     found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
-    assert (found.state, "can be fired" in found.text, "EOS 450D" in found.text) == ("go", True, True)
+    assert (found.level, "can be fired" in text(found), "EOS 450D" in text(found)) == (Level.NOTE, True, True)
 
 
 def test_a_body_in_the_wrong_usb_mode(machine: Machine) -> None:
     found = the_one(host_checks.bodies(Settings(), having(machine, replace(EOS, mode="mass storage"))))
-    assert found.state == "no-go"
-    assert "PTP" in found.todo
+    assert found.level == Level.STOP
+    assert "PTP" in remedy(found)
 
 
 def test_a_body_that_this_user_may_not_open(machine: Machine, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,8 +72,8 @@ def test_a_body_that_this_user_may_not_open(machine: Machine, monkeypatch: pytes
     node.write_bytes(b"")
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != node)  # root may do everything
     found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
-    assert found.state == "no-go"
-    assert "udev rule" in found.todo
+    assert found.level == Level.STOP
+    assert "udev rule" in remedy(found)
 
 
 def test_a_body_that_another_program_holds(machine: Machine) -> None:
@@ -81,8 +82,8 @@ def test_a_body_that_another_program_holds(machine: Machine) -> None:
     (process / "fd" / "3").symlink_to(EOS.node(machine.dev / "bus" / "usb"))
     (process / "comm").write_text("gvfsd-gphoto2\n")
     found = the_one(host_checks.bodies(Settings(), having(machine, EOS)))
-    assert "gvfsd-gphoto2 (process 4711)" in found.text
-    assert "gvfs-gphoto2-volume-monitor" in found.todo
+    assert "gvfsd-gphoto2 (process 4711)" in text(found)
+    assert "gvfs-gphoto2-volume-monitor" in remedy(found)
 
 
 def test_gvfs_is_named_as_the_culprit(machine: Machine) -> None:
@@ -90,25 +91,25 @@ def test_gvfs_is_named_as_the_culprit(machine: Machine) -> None:
     (machine.proc / "17").mkdir()
     (machine.proc / "17" / "comm").write_text("gvfs-gphoto2-vo\n")
     found = the_one(host_checks.grabbers(Settings(), machine))
-    assert found.state == "no-go"
-    assert "mask --now" in found.todo
+    assert found.level == Level.STOP
+    assert "mask --now" in remedy(found)
     elsewhere = Settings(camera=CameraSettings(port="ptpip:127.0.0.1:1:1"))
-    assert the_one(host_checks.grabbers(elsewhere, machine)).state == "caution"
+    assert the_one(host_checks.grabbers(elsewhere, machine)).level == Level.CAUTION
 
 
 def test_a_fujifilm_is_told_to_need_a_wire(machine: Machine) -> None:
     finepix = UsbBody(1, 6, FUJIFILM, 0x1BF, "mass storage", "FinePix S5200")
     found = the_one(host_checks.bodies(Settings(), having(machine, finepix)))
-    assert "can't fire it" in found.text
-    assert "camera.shutter" in found.todo
+    assert "can't fire it" in text(found)
+    assert "camera.shutter" in remedy(found)
     right = Settings(camera=CameraSettings(driver="fujifilm", shutter="relay:0"))
-    assert the_one(host_checks.bodies(right, having(machine, finepix))).state == "go"
+    assert the_one(host_checks.bodies(right, having(machine, finepix))).level == Level.NOTE
 
 
 def test_a_driver_that_opens_is_ready(machine: Machine) -> None:
     settings = Settings(camera=CameraSettings(driver="simulated", options={"picture": "pattern:1000:dng"}))
     found = the_one(host_checks.camera(settings, machine))
-    assert (found.state, "Simulated" in found.text) == ("go", True)
+    assert (found.level, "Simulated" in text(found)) == (Level.NOTE, True)
 
 
 @pytest.mark.parametrize(
@@ -121,9 +122,9 @@ def test_a_driver_that_opens_is_ready(machine: Machine) -> None:
 )
 def test_a_driver_that_can_t_be_opened_says_why(machine: Machine, camera: dict[str, Any], words: str) -> None:
     found = the_one(host_checks.camera(Settings(camera=CameraSettings(**camera)), replace(machine, open_s=0.3)))
-    assert found.state == "no-go"
-    assert words in found.text
-    assert found.todo
+    assert found.level == Level.STOP
+    assert words in text(found)
+    assert remedy(found)
 
 
 def test_a_driver_that_fails_as_it_begins_costs_no_other_finding(
@@ -136,8 +137,8 @@ def test_a_driver_that_fails_as_it_begins_costs_no_other_finding(
     broken = Broken()
     monkeypatch.setattr(host_checks, "open_camera", lambda _: broken)
     found = host_checks.run(Settings(), machine, [host_checks.camera, host_checks.mask])
-    assert [one.name for one in found] == ["camera", "mask"]
-    assert (found[0].state, "no such port" in found[0].text, broken.stopped) == ("no-go", True, True)
+    assert [one.subject.kind for one in found] == ["camera", "mask"]
+    assert (found[0].level, "no such port" in text(found[0]), broken.stopped) == (Level.STOP, True, True)
 
 
 def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,42 +154,42 @@ def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeyp
     closed.mkdir()
     monkeypatch.setattr(os, "stat", stat)
     settings = Settings(record=RecordSettings(directory=str(closed / "flights")))
-    assert the_one(host_checks.disk(settings, machine)).state == "go"
+    assert the_one(host_checks.disk(settings, machine)).level == Level.NOTE
 
 
 def test_the_disk(machine: Machine, tmp_path: Path) -> None:
     def at(folder: Path, least: int = 0) -> Settings:
         return Settings(record=RecordSettings(directory=str(folder), min_free_mb=least))
 
-    assert the_one(host_checks.disk(at(tmp_path / "not" / "yet"), machine)).state == "go"
-    assert the_one(host_checks.disk(at(tmp_path, 10_000_000), machine)).state == "no-go"
+    assert the_one(host_checks.disk(at(tmp_path / "not" / "yet"), machine)).level == Level.NOTE
+    assert the_one(host_checks.disk(at(tmp_path, 10_000_000), machine)).level == Level.STOP
 
 
 def test_the_disk_of_somebody_else(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     settings = Settings(record=RecordSettings(directory=str(tmp_path)))
-    assert "record.directory" in the_one(host_checks.disk(settings, machine)).todo
+    assert "record.directory" in remedy(the_one(host_checks.disk(settings, machine)))
 
 
 @pytest.mark.parametrize(
-    ("check", "settings", "state"),
+    ("check", "settings", "level"),
     [
-        (host_checks.link, Settings(), "caution"),
-        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("/dev/no-such-tty:57600",))), "no-go"),
-        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("udpin:127.0.0.1:14550",))), "go"),
-        (host_checks.mask, Settings(), "caution"),
-        (host_checks.clock, Settings(), "go"),
+        (host_checks.link, Settings(), Level.CAUTION),
+        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("/dev/no-such-tty:57600",))), Level.STOP),
+        (host_checks.link, Settings(mavlink=MavlinkSettings(url=("udpin:127.0.0.1:14550",))), Level.NOTE),
+        (host_checks.mask, Settings(), Level.CAUTION),
+        (host_checks.clock, Settings(), Level.NOTE),
     ],
 )
 def test_the_rest(
-    machine: Machine, check: Callable[[Settings, Machine], list[Check]], settings: Settings, state: str
+    machine: Machine, check: Callable[[Settings, Machine], list[Finding]], settings: Settings, level: Level
 ) -> None:
-    assert the_one(check(settings, machine)).state == state
+    assert the_one(check(settings, machine)).level == level
 
 
 def test_a_clock_that_nobody_keeps_is_noted(machine: Machine) -> None:
     found = the_one(host_checks.clock(Settings(), replace(machine, unsynchronised=lambda: True)))
-    assert (found.state, "chrony" in found.todo) == ("caution", True)
+    assert (found.level, "chrony" in remedy(found)) == (Level.CAUTION, True)
 
 
 def test_this_machine_s_own_clock_can_be_asked() -> None:
@@ -196,6 +197,10 @@ def test_this_machine_s_own_clock_can_be_asked() -> None:
 
 
 def test_the_first_wrong_thing_is_the_next_step() -> None:
-    findings = [Check("a", "go", ""), Check("b", "caution", "", "later"), Check("c", "no-go", "", "now")]
-    assert next_step(findings) == "now"
-    assert next_step(findings[:2]) == ""
+    found = [
+        finding(Code.CLOCK_SYNCHRONISED, Subject("clock")),
+        finding(Code.CLOCK_UNSYNCHRONISED, Subject("clock")),
+        finding(Code.DISK_CLOSED, Subject("disk"), place="/mnt", folder="/mnt/flights"),
+    ]
+    assert next_step(found) == "make /mnt/flights yours, or set record.directory"
+    assert next_step(found[:2]) == ""
