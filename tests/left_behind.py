@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-GRACE_S = 5.0
+GRACE_S = 30.0
 # Libraries start one of these for the life of the process, when they first need it: pyzmq, for messages that are sent
 # without a copy; tqdm; Zarr, a loop of asyncio with its own two sockets; multiprocessing.
 FOREVER = ("GarbageCollectorThread", "TMonitor")

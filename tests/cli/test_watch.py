@@ -65,22 +65,23 @@ def test_silence_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert f"nothing came from ipc://{tmp_path}/nobody: is a daemon running there?" in said.err
 
 
-def test_a_daemon_that_sends_no_slices_is_a_failure(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_daemon_that_sends_no_slices_is_a_failure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     endpoint = f"ipc://{tmp_path}/s"
     publisher = Publisher(endpoint, f"ipc://{tmp_path}/a", high_water_mark=8)
     publisher.start("20261121T101503Z-1a2b3c4d", lambda _request, _reply: None)
     over = threading.Event()
+    monkeypatch.setattr("dappled.cli.watch._show", lambda *_: over.set())  # one is heard, then silence
 
     def send() -> None:
-        for _ in range(40):  # for a second, then silence
+        while not over.wait(0.025):
             publisher.publish("health", {"utc_ns": 1})
-            if over.wait(0.025):
-                return
 
     sender = threading.Thread(target=send)
     sender.start()
     try:
-        assert main(["watch", endpoint, "--timeout", "1"]) == 1
+        assert main(["watch", endpoint, "--timeout", "2"]) == 1
     finally:
         over.set()
         sender.join()

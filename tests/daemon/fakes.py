@@ -135,7 +135,7 @@ class FakeDecoder:
         self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
     ) -> DecodedFrame:
         self.seen.append(path)
-        assert self.gate.wait(20)
+        assert self.gate.wait(60)
         if self.problem:
             raise DecodeProcessError(self.problem)
         body = mmap.mmap(-1, 16)
@@ -165,7 +165,7 @@ class Rig:
 
     def ended(self, index: int) -> PendingShot:
         """A shot, once it is finished."""
-        until = time.monotonic() + 20
+        until = time.monotonic() + 60
         while time.monotonic() < until:
             for pending in list(self.shots):
                 if pending.shot.index == index:
@@ -276,7 +276,7 @@ class NoPoses:
 
 
 def eventually(condition: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < until, f"never: {what}"
         threading.Event().wait(0.002)

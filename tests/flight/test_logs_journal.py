@@ -122,7 +122,7 @@ def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypat
     journal.note(shot(3))
     assert len(writes) == 1
     assert writes[0].endswith(b"\n")
-    assert flushed.wait(10)
+    assert flushed.wait(60)
     assert journal.problem is None
     journal.close()
 

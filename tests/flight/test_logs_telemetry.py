@@ -191,7 +191,7 @@ def test_a_block_counts_once_it_is_on_the_disk(tmp_path: Path, monkeypatch: pyte
     may, synced, fdatasync = threading.Event(), threading.Event(), os.fdatasync
 
     def slow(fd: int) -> None:
-        assert may.wait(30)
+        assert may.wait(60)
         fdatasync(fd)
         synced.set()
 
@@ -202,8 +202,8 @@ def test_a_block_counts_once_it_is_on_the_disk(tmp_path: Path, monkeypatch: pyte
         pass
     assert log.blocks(0) == []
     may.set()
-    assert synced.wait(30)
-    deadline = time.monotonic() + 30
+    assert synced.wait(60)
+    deadline = time.monotonic() + 60
     while len(found := log.blocks(0)) < 3 and time.monotonic() < deadline:
         pass
     assert [block.start for block in found] == [0, found[0].end, found[1].end]

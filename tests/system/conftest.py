@@ -10,10 +10,12 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests import shared
+from tests.system.flying import eventually
 
 FRAMES = 3
 
@@ -29,10 +31,21 @@ class Flown:
     watched: str
 
 
-def dappled(*arguments: str, cwd: Path | None = None, timeout_s: float = 60) -> subprocess.CompletedProcess[str]:
+def dappled(*arguments: str, cwd: Path | None = None, timeout_s: float = 110) -> subprocess.CompletedProcess[str]:
     """The `dappled` command in a process of its own."""
     command = [sys.executable, "-m", "dappled", *arguments]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def until_it_listens(process: subprocess.Popen[Any]) -> None:
+    """Until a subscriber in a process of its own has begun to connect: ZeroMQ has a thread for that. What is started
+    after it can't be earlier, however busy the machine is."""
+
+    def connects() -> bool:
+        names = Path(f"/proc/{process.pid}/task").glob("*/comm")
+        return process.poll() is not None or any(name.read_text() == "ZMQbg/IO/0\n" for name in names)
+
+    eventually(connects, "the subscriber connects")
 
 
 @pytest.fixture(scope="session")
@@ -55,14 +68,15 @@ def _fly(folder: Path, sockets: Path) -> Flown:
     (folder / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
     watch = subprocess.Popen(
         [sys.executable, "-m", "dappled", "watch", endpoint, "--save", str(folder / "received"),
-         "--count", str(FRAMES), "--timeout", "60"],
+         "--count", str(FRAMES), "--timeout", "120"],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
+        until_it_listens(watch)
         run = dappled(
             "run", "--simulate", "--seed", "5", "--frames", str(FRAMES), "--config", "dappled.toml", cwd=folder
         )
-        watched, _ = watch.communicate(timeout=60)
+        watched, _ = watch.communicate(timeout=120)
     finally:
         watch.kill()
     assert run.returncode == 0, run.stderr

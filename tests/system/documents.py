@@ -183,7 +183,7 @@ def stage(folder: Path, short: Path) -> Iterator[Stage]:
                 yield Stage(folder, environment, ground)
         finally:
             daemon.terminate()
-            daemon.wait(20)
+            daemon.wait(60)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from dappled.flight.checks import flight_check
 from tests.daemon.fakes import CallingObserver
 from tests.standing import problems
 
-DEADLINE_S = 30.0
+DEADLINE_S = 60.0
 
 
 def eventually(condition: Callable[[], object], what: str, deadline_s: float = DEADLINE_S) -> None:
@@ -93,7 +93,7 @@ def flying(settings: Settings) -> Iterator[Flying]:
         yield Flying(service, shots, settled)
     finally:
         service.ask_to_stop()
-        loop.join(5)
+        loop.join(DEADLINE_S)
         service.stop()
     assert not loop.is_alive()
     assert_whole(folder)

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 CHROMIUM = os.environ.get("CHROMIUM", "/usr/bin/chromium")
 SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
 TOKEN = "only-for-this-test-0123456789"  # noqa: S105  # it opens nothing
-DEADLINE_MS = 45_000
+DEADLINE_MS = 90_000
 LAPTOP, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
 GPU = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
@@ -88,10 +88,10 @@ def flown(
     try:
         yield Daemon(url, folder / "flights", process, said)
         process.send_signal(signal.SIGTERM)
-        assert process.wait(20) in (code, -signal.SIGKILL), "".join(said)
+        assert process.wait(60) in (code, -signal.SIGKILL), "".join(said)
     finally:
         process.kill()
-        reader.join(5)
+        reader.join(60)
         process.stderr.close()
     assert not any("Traceback" in line for line in said), "".join(said)
 

@@ -18,6 +18,7 @@ import pytest
 from dappled.findings import Code
 from tests.daemon.test_settings_check import calibration
 from tests.system.test_console import (
+    DEADLINE_MS,
     SCREENSHOTS,
     TOKEN,
     Daemon,
@@ -100,7 +101,7 @@ def page_of(browser: Browser, url: str, size: str, state: str = "") -> Page:
     touch = {"is_mobile": True, "has_touch": True} if "phone" in size else {}
     context = browser.new_context(viewport={"width": width, "height": height}, **touch)
     page = context.new_page()
-    page.set_default_timeout(45_000)
+    page.set_default_timeout(DEADLINE_MS)
     page.goto(f"{url}#token={TOKEN}")
     if state:
         until(page, f"document.querySelector('#verdict').dataset.state === {state!r}")
@@ -221,7 +222,7 @@ def test_a_flight_s_end_is_told_and_a_death_is_no_end(
         shoot(page)
         one.process.send_signal(number)
         until(page, f"document.querySelector('#verdict-word').textContent === {word!r}")
-        one.process.wait(20)
+        one.process.wait(60)
         page.wait_for_timeout(4000)  # it stays so when nothing is heard any more
         assert page.inner_text("#verdict-word") == word
         assert ticks(page) == 0

@@ -54,7 +54,7 @@ def liar(seed: int) -> Iterator[int]:
         listener.start()
         yield server.getsockname()[1]
         ended.set()
-        listener.join(5)
+        listener.join(60)
 
 
 @pytest.mark.slow

@@ -106,8 +106,8 @@ def test_every_accepted_request_has_one_outcome_at_the_ground_station_over_nine_
     dice = random.Random(17)  # noqa: S311  # kills anywhere between request and report, the same in each run
     port = free_port()
     ground = Ground(port)
-    # half a second an exposure: a kill that follows a request at once falls before its report on any machine
-    options = BodyOptions(picture="pattern:20000000:CR2", card_bytes=8 << 30, delay_s=0.5)
+    # two seconds an exposure: a kill that follows a request at once falls before its report on any machine
+    options = BodyOptions(picture="pattern:20000000:CR2", card_bytes=8 << 30, delay_s=2.0)
     with SimulatedBody.start(options) as body:
         (tmp_path / "dappled.toml").write_text(
             f'[camera]\nport = "{body.port}"\n[record]\ndirectory = "flights"\nmin_free_mb = 0\n'

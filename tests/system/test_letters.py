@@ -13,7 +13,7 @@ import pytest
 
 from dappled.cli import main
 from tests.schemas import schema
-from tests.system.conftest import dappled
+from tests.system.conftest import dappled, until_it_listens
 
 
 @pytest.fixture
@@ -39,10 +39,10 @@ def test_replay_publishes_its_slices_with_the_flight_s_pose(
     endpoint = f"ipc://{sockets}/letters"
     config = tmp_path / "dappled.toml"
     config.write_text(f'[publish]\nslices = "{endpoint}"\n')
-    watch = subprocess.Popen(
-        [sys.executable, "-m", "dappled", "watch", endpoint, "--save", str(tmp_path), "--count", "1", "--timeout", "60"]
-    )
+    words = ["watch", endpoint, "--save", str(tmp_path), "--count", "1", "--timeout", "120"]
+    watch = subprocess.Popen([sys.executable, "-m", "dappled", *words])
     try:
+        until_it_listens(watch)
         done = dappled(
             "replay", str(letters), "--match", "letters_ULF_M1.png", "--mask", "lenslet",
             "--white", str(letters / "letters_ULF_M1_white.png"), "--dark", str(letters / "letters_ULF_M1_dark.png"),
@@ -50,7 +50,7 @@ def test_replay_publishes_its_slices_with_the_flight_s_pose(
             "--publish", "--config", str(config),
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
-        assert watch.wait(60) == 0
+        assert watch.wait(120) == 0
     finally:
         watch.kill()
     header = json.loads((tmp_path / "000000.json").read_text())

@@ -148,7 +148,7 @@ def test_a_station_behind_a_vehicle_on_two_ports_has_each_report_once(tmp_path: 
     assert reports == [(index, 1) for index in range(4)]
     indices = [m.image_index for m in peer.heard if m.get_type() == "CAMERA_IMAGE_CAPTURED"]
     assert sorted(set(indices)) == list(range(4))
-    assert len(indices) <= 5  # one may be repeated where a busy machine is late with telemetry
+    assert len(indices) < 8  # some may be repeated where a busy machine is late with telemetry
 
 
 @pytest.mark.parametrize("keys", [["a", "b"], ["a", "b", "c"]])
@@ -208,7 +208,7 @@ def test_another_law_set_from_the_ground_begins_the_next_flight_and_both_verify(
         eventually(lambda: len(flights()) == 2, "the next flight", 120)
         eventually(photograph, "a photograph of the next flight", 120)
         daemon.send_signal(signal.SIGTERM)
-        _, err = daemon.communicate(timeout=60)
+        _, err = daemon.communicate(timeout=120)
     finally:
         daemon.kill()
         daemon.communicate()

@@ -70,7 +70,7 @@ def test_the_readme_leads_to_a_flight_report_with_a_simulated_450d(
             triggered = command(*trigger, cwd=tmp_path)
             assert triggered.returncode == 0, triggered.stderr
             process.send_signal(signal.SIGINT)
-            out, err = process.communicate(timeout=40)
+            out, err = process.communicate(timeout=120)
         finally:
             process.kill()
     assert process.returncode == 0, err
@@ -151,11 +151,11 @@ def test_the_operator_s_page_is_rehearsed_from_the_settings_to_the_copy(
             ) as watching:
                 (trigger,) = re.findall(r"`(dappled trigger --config \S+)`", OPERATING)
                 assert "image 0" in step([*words(trigger), "--count", "3"])
-                seen, _ = watching.communicate(timeout=90)
+                seen, _ = watching.communicate(timeout=120)
             assert watching.returncode == 0, seen
             assert "all is well" in step(steps("6.")["status"])
             process.send_signal(signal.SIGINT)
-            _out, err = process.communicate(timeout=60)
+            _out, err = process.communicate(timeout=120)
         finally:
             process.kill()
     assert process.returncode == 0, err

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.needs import without
-from tests.system.conftest import dappled
+from tests.system.conftest import dappled, until_it_listens
 
 ROOT = Path(__file__).parents[2]
 FRAMES = 3
@@ -98,13 +98,15 @@ def test_a_reader_reads_a_live_stream(made: Callable[[Path], list[str]], tmp_pat
     endpoint = f"ipc://{sockets}/reader-{getattr(made, '__name__', '')}"
     (tmp_path / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
     watch = [sys.executable, "-m", "dappled", "watch", endpoint, "--save", "received", "--count", str(FRAMES),
-             "--timeout", "60"]  # fmt: skip
+             "--timeout", "120"]  # fmt: skip
     reader = subprocess.Popen([*command, endpoint], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     keeper = subprocess.Popen(watch, cwd=tmp_path, stdout=subprocess.DEVNULL)
     try:
+        until_it_listens(reader)
+        until_it_listens(keeper)
         flown = dappled("run", "--simulate", "--frames", str(FRAMES), "--config", "dappled.toml", cwd=tmp_path)
-        said, complaints = reader.communicate(timeout=60)
-        assert keeper.wait(60) == 0
+        said, complaints = reader.communicate(timeout=120)
+        assert keeper.wait(120) == 0
     finally:
         reader.kill()
         keeper.kill()

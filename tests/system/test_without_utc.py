@@ -40,12 +40,12 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
             service.run(lambda: service.health()["camera"]["state"] == "ready")
             station = simulation.ground_station(1)
             service.run(lambda: not station.running())
-            until = time.monotonic() + 30
+            until = time.monotonic() + 60
             service.run(lambda: service.navigation.utc.learnt is not None or time.monotonic() > until)
             assert "UTC" not in "".join(problems(service.health()))
         finally:
             service.stop()
-        code, _ = station.wait(10)
+        code, _ = station.wait(60)
     assert code == 0
     assert service.folder.name.startswith("boot")
     assert flight_check.check(service.folder).problems == ()

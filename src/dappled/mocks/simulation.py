@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import secrets
+import itertools
+import os
 import socket
 import time
 from contextlib import ExitStack
@@ -93,8 +94,7 @@ class Simulation:
         self.world = world
         self.start_monotonic_ns = time.monotonic_ns()
         self._stack = ExitStack()
-        self._autopilot_port = free_port()
-        self._ground_port = next(port for port in iter(free_port, None) if port != self._autopilot_port)
+        self._autopilot_port, self._ground_port = free_port(), free_port()
         self._settings, self._folder = settings, folder
         self.rig = SimulatedCamera.of(settings)
 
@@ -186,16 +186,20 @@ class Simulation:
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:
     """A free port of loopback, for UDP or as `kind` says.
 
-    It lies outside the range from which the kernel assigns ports, so it is still free when it is bound.
+    It lies outside the range from which the kernel assigns ports, a process gives none twice, and processes beside each
+    other begin at different ones: so it is still free when it is bound.
     """
     last = _first_given_out() - 1
     first = max(1024, last - 12_000)  # above the ports of common services
     for _ in range(1000):
-        port = first + secrets.randbelow(last - first + 1)
+        port = first + (os.getpid() * 64 + next(_given)) % (last - first + 1)
         with socket.socket(socket.AF_INET, kind) as one, contextlib.suppress(OSError):
             one.bind(("127.0.0.1", port))
             return port
     raise OSError(errno.EADDRINUSE, f"no port of loopback between {first} and {last} is free")
+
+
+_given = itertools.count()
 
 
 def _first_given_out() -> int:

@@ -104,7 +104,7 @@ class Camera:
         self.shutter.stop()
         self.links.stop()
         self._fired.put(None)
-        self._worker.join(5)
+        self._worker.join(60)
 
     @property
     def url(self) -> str:
@@ -226,7 +226,7 @@ class Peer:
         padded = (*parameters, *[0.0] * (7 - len(parameters)))
         self.send(mavlink.MAVLink_command_long_message(*target, name, confirmation, *padded))
 
-    def until(self, wanted: Callable[[MavlinkMessage], bool], what: str, timeout_s: float = 20.0) -> MavlinkMessage:
+    def until(self, wanted: Callable[[MavlinkMessage], bool], what: str, timeout_s: float = 60.0) -> MavlinkMessage:
         """The first message not returned yet that is wanted; others before it are kept in `heard` alone."""
         deadline = time.monotonic() + timeout_s
         while True:

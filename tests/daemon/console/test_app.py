@@ -80,7 +80,7 @@ class Rig:
     answer: dict[str, Any] = field(default_factory=lambda: {"ok": True, "text": "shot 0", "lines": []})
 
     def client(self, **headers: str) -> httpx.Client:
-        return httpx.Client(base_url=self.url, timeout=20, headers=headers, trust_env=False)
+        return httpx.Client(base_url=self.url, timeout=60, headers=headers, trust_env=False)
 
     def post(self, path: str, body: Any, **headers: str) -> httpx.Response:
         given = {"origin": self.url, **headers}
@@ -89,7 +89,7 @@ class Rig:
 
 
 def eventually(condition: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + 20
+    until = time.monotonic() + 60
     while not condition():
         assert time.monotonic() < until, f"never: {what}"
         threading.Event().wait(0.01)
@@ -143,9 +143,9 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
         yield made
     finally:
         server.should_exit = True
-        threads[0].join(20)
+        threads[0].join(60)
         there.close()
-        threads[1].join(20)
+        threads[1].join(60)
         here.close()
         app.close()
         publisher.stop(0.1)

@@ -119,17 +119,17 @@ def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Pat
     console = Console(listener, setup(tmp_path), Handler(act), SystemClock())
     console.start()
     try:
-        with httpx.Client(base_url=url, timeout=30, headers={"origin": url.rstrip("/")}, trust_env=False) as client:
+        with httpx.Client(base_url=url, timeout=60, headers={"origin": url.rstrip("/")}, trust_env=False) as client:
             assert client.post("/api/shoot", json={"sequence": 1}).json()["text"] == "shot 5"
             first = running(console)
             assert first is not None
             assert os.getpriority(os.PRIO_PROCESS, first.pid) >= 15
             first.kill()
-            until = time.monotonic() + 30
+            until = time.monotonic() + 60
             while running(console) in (first, None):
                 assert time.monotonic() < until
                 threading.Event().wait(0.01)
-        with httpx.Client(base_url=url, timeout=30, trust_env=False) as client:
+        with httpx.Client(base_url=url, timeout=60, trust_env=False) as client:
             assert client.get("/api/state").json()["verdict"] is None  # nothing was heard of the daemon yet
     finally:
         console.stop()
@@ -175,12 +175,12 @@ def test_an_answer_that_fails_ends_one_process_and_not_the_console(tmp_path: Pat
     console = Console(listener, setup(tmp_path), Handler(act), SystemClock())
     console.start()
     try:
-        until, answer = time.monotonic() + 30, None
+        until, answer = time.monotonic() + 60, None
         while answer != {"ok": True, "text": "shot 1"}:
             assert time.monotonic() < until
             with (  # the process that was asked first may still be ending: a new connection each time
                 contextlib.suppress(httpx.HTTPError),
-                httpx.Client(base_url=url, timeout=30, headers={"origin": url.rstrip("/")}, trust_env=False) as client,
+                httpx.Client(base_url=url, timeout=60, headers={"origin": url.rstrip("/")}, trust_env=False) as client,
             ):
                 answer = client.post("/api/shoot", json={"sequence": 1}).json()
                 answer = {key: answer.get(key) for key in ("ok", "text")}

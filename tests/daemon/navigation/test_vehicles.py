@@ -175,9 +175,9 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
         eventually(lambda: shots, "the shot's end")
     finally:
         over.set()
-        speaking.join(5)
+        speaking.join(60)
         service.ask_to_stop()
-        loop.join(5)
+        loop.join(60)
         service.stop()
         for peer in peers:
             peer.__exit__(None, None, None)

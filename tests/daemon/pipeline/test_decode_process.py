@@ -70,19 +70,19 @@ def test_a_worker_that_died_between_two_frames_is_replaced_unseen(decoder: Decod
     first, killed = decoder.decode(frame, None, None, index=0), pid(decoder)
     os.kill(killed, signal.SIGKILL)
     assert decoder._process is not None
-    decoder._process.wait(5)
+    decoder._process.wait(60)
     assert decoder.decode(frame, None, None, index=0).sha256 == first.sha256
     assert pid(decoder) != killed
 
 
 def test_a_worker_that_hangs_is_given_up_and_replaced(frame: str) -> None:
-    decoder = DecodeProcess(RECIPE, timeout_s=20.0)
+    decoder = DecodeProcess(RECIPE, timeout_s=100.0)
     decoder.warm_up()
     os.kill(pid(decoder), signal.SIGSTOP)
     decoder._timeout_s = 0.2
     with pytest.raises(DecodeProcessError, match="given up"):
         decoder.decode(frame, None, None, index=0)
-    decoder._timeout_s = 20.0
+    decoder._timeout_s = 100.0
     assert decoder.decode(frame, None, None, index=0).sha256
     decoder.close()
 
@@ -96,7 +96,7 @@ def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> Non
         decoder.warm_up()
         os.kill(pid(decoder), signal.SIGKILL)
         assert decoder._process is not None
-        decoder._process.wait(5)
+        decoder._process.wait(60)
     clock.advance(20)
     with pytest.raises(DecodeProcessError, match="keeps crashing: it starts again in 40 s"):
         decoder.decode(frame, None, None, index=0)
@@ -105,14 +105,13 @@ def test_a_worker_that_keeps_dying_is_not_started_without_end(frame: str) -> Non
     decoder.close()
 
 
-@pytest.mark.timeout(40)  # the frame itself would take for ever
 def test_a_flight_that_ends_while_the_decoder_loads_says_nothing(caplog: pytest.LogCaptureFixture) -> None:
     decoder = DecodeProcess(RECIPE)
     warm_up = threading.Thread(target=decoder._warm_up)  # as `begin_warm_up`, with an end to wait for
     warm_up.start()
     eventually(lambda: decoder._channel, "it is started")
     decoder.close()
-    warm_up.join(20)
+    warm_up.join(60)
     assert caplog.messages == []
 
 
@@ -132,7 +131,7 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
     thread.start()
     eventually(decoder._turn.locked, "it is at work")
     decoder.close()
-    thread.join(5)
+    thread.join(60)
     assert len(problems) == 1
     with pytest.raises(DecodeProcessError, match="stopped"):
         decoder.decode(frame, None, None, index=0)
@@ -203,14 +202,14 @@ def test_an_answer_that_is_too_long_is_a_sentence_and_the_next_one_comes() -> No
     worker.start()
     try:
         here.send({"do": "decode", "path": "frame.cr2"})
-        answer = here.receive(20.0)
+        answer = here.receive(60.0)
         assert answer is not None
         assert "what frame.cr2 was decoded to can't be reported: a message of" in answer.body["error"]
         here.send({"do": "decode", "path": "frame.cr2"})
-        answer = here.receive(20.0)
+        answer = here.receive(60.0)
         assert answer is not None
         assert answer.body == {"carriers": "x"}
     finally:
         here.close()
-        assert worker.stop(20.0)
+        assert worker.stop(60.0)
         there.close()

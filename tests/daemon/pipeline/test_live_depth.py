@@ -44,7 +44,7 @@ class FakeMaker:
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
         self.asked.append((path, method))
-        assert self.gate.wait(20)
+        assert self.gate.wait(60)
         if self.problem:
             raise DecodeProcessError(self.problem)
         body = mmap.mmap(-1, 48)

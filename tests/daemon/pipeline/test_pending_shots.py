@@ -47,7 +47,7 @@ def test_an_end_that_comes_from_many_threads_at_once_is_told_once() -> None:
     start = threading.Barrier(4)
 
     def end() -> None:
-        start.wait(20)
+        start.wait(60)
         for pending in all_of_them:
             ends.finish(pending)
 
@@ -55,7 +55,7 @@ def test_an_end_that_comes_from_many_threads_at_once_is_told_once() -> None:
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join(60)
     assert sorted(ended) == list(range(200))
     assert ends.shots.open() == []
 

@@ -76,7 +76,7 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
             eventually(lambda: heard(len(shots) == 2), "the second shot's end")
         finally:
             service.ask_to_stop()
-            loop.join(5)
+            loop.join(60)
             service.stop()
     return left
 

@@ -62,7 +62,7 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     )
     pipeline.start()
     try:
-        replay.play(recording, shots, progress, time=replay.clock(recording), pace=pace, timeout_s=20)
+        replay.play(recording, shots, progress, time=replay.clock(recording), pace=pace, timeout_s=60)
     finally:
         pipeline.stop(5)
     assert len(ended) == len(recording.shots)

@@ -28,7 +28,7 @@ class Rig:
         self.inner = socket.socket(socket.AF_UNIX)
         self.inner.bind(str(folder / "inner"))
         self.inner.listen(64)
-        self.inner.settimeout(5)
+        self.inner.settimeout(60)
         listener = socket.create_server(("0.0.0.0", 0), backlog=64)  # noqa: S104  # to be reached by several addresses
         self.port = listener.getsockname()[1]
         self.clock = RecordedClock(10**18)
@@ -44,7 +44,7 @@ class Rig:
 
     def accept(self) -> socket.socket:
         one, _ = self.inner.accept()
-        one.settimeout(5)
+        one.settimeout(60)
         self._sockets.append(one)
         return one
 

@@ -132,11 +132,19 @@ class Flight:
     def _open(self) -> bool:
         return all(getattr(event, "shot", None) != self.shots or isinstance(event, Fired) for event, _ in self.events)
 
+    def _missing(self) -> set[int]:
+        """Exposures that have not arrived."""
+        return set(self.made) - {int(found) for _, data in self.events for found in re.findall(rb"shot (\d+)", data)}
+
     def problems(self) -> list[str]:
         """Stop the camera, and say what went wrong."""
         if self._open and self.shots:
             self.follow(12.0, (self.shots, None))
         self.follow(1.0)
+        for _ in range(20):  # by which a busy machine has brought them
+            if not self._missing():
+                break
+            self.follow(1.0)
         self.camera.stop()
         while event := self.camera.next_event(0.0):
             self.hear(event)

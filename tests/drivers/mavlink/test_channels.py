@@ -49,7 +49,7 @@ def test_a_client_is_not_closed_while_another_thread_writes_to_it() -> None:
         def write(self, _data: bytes) -> bool:
             told.append("begun")
             began.set()
-            assert go_on.wait(20)
+            assert go_on.wait(60)
             told.append("written")
             return True
 
@@ -62,7 +62,7 @@ def test_a_client_is_not_closed_while_another_thread_writes_to_it() -> None:
         listener._client = Slow()  # type: ignore[assignment]  # all that is asked of one
         writer = threading.Thread(target=listener.write, args=[b"x"])
         writer.start()
-        assert began.wait(20)
+        assert began.wait(60)
         with socket.create_connection(server.getsockname()):
             reader = threading.Thread(target=listener.read)
             reader.start()
@@ -70,7 +70,7 @@ def test_a_client_is_not_closed_while_another_thread_writes_to_it() -> None:
             assert told == ["begun"]
             go_on.set()
             for thread in (writer, reader):
-                thread.join(20)
+                thread.join(60)
             assert told == ["begun", "written", "closed"]
         listener.close()
 
@@ -99,7 +99,7 @@ def test_a_client_that_left_before_it_was_accepted_does_not_break_the_link(numbe
         with socket.create_connection(server.getsockname()) as client:
             assert listener.read() == b""  # the one that left
             client.sendall(b"here")
-            deadline, heard = time.monotonic() + 20, listener.read()
+            deadline, heard = time.monotonic() + 60, listener.read()
             while not heard:
                 assert time.monotonic() < deadline
                 listening.away = not listening.away  # again and again

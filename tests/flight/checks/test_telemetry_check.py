@@ -18,7 +18,7 @@ def folder(flight: Recording) -> FlightFolder:
     """A flight that is being recorded, with more than two blocks of telemetry."""
     while flight.telemetry.append(1, mavlink_2(b"x" * 200)) < 2.5 * BLOCK_BYTES / 220:
         pass
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 60
     while len(flight.telemetry.blocks(0)) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
     flight.ledger.add_event("camera", "a row takes the blocks with it")

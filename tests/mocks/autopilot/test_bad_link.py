@@ -20,7 +20,7 @@ from tests.simulated.bad_link import BadLink, LinkFaults
 def test_a_bad_radio_makes_no_photograph_twice_and_loses_no_report(faults: LinkFaults) -> None:
     """A wish whose four requests are all lost is told as not answered; that is the radio's right."""
     with Camera() as camera, BadLink(camera.links.port(0), faults) as radio:
-        ground = GroundStation.start(f"udpout:127.0.0.1:{radio.port}", 4, timeout_s=40)
+        ground = GroundStation.start(f"udpout:127.0.0.1:{radio.port}", 4, timeout_s=60)
         code, lines = ground.wait(100)
         camera.idle()
         had = [line["index"] for line in lines if line["ok"]]
@@ -33,8 +33,8 @@ def test_a_bad_radio_makes_no_photograph_twice_and_loses_no_report(faults: LinkF
 @pytest.mark.parametrize("manners", [["deaf"], ["nan"], ["deaf", "nan"]])
 def test_a_ground_station_without_manners_gets_one_photograph_a_wish(manners: Sequence[str]) -> None:
     with Camera() as camera:
-        ground = GroundStation.start(camera.url, 3, timeout_s=20, manners=manners)
-        code, lines = ground.wait(60)
+        ground = GroundStation.start(camera.url, 3, timeout_s=60, manners=manners)
+        code, lines = ground.wait(100)
         assert (code, [line["index"] for line in lines]) == (0, [0, 1, 2])
         assert len({cause.sequence for cause in camera.causes}) == len(camera.causes) == 3
         assert camera.failures() == 0
@@ -42,9 +42,9 @@ def test_a_ground_station_without_manners_gets_one_photograph_a_wish(manners: Se
 
 def test_a_ground_station_that_dies_leaves_the_camera_to_the_next() -> None:
     with Camera() as camera:
-        dying = GroundStation.start(camera.url, 3, timeout_s=20, manners=["dies"])
-        assert dying.wait(60)[0] != 0
+        dying = GroundStation.start(camera.url, 3, timeout_s=60, manners=["dies"])
+        assert dying.wait(100)[0] != 0
         eventually(lambda: len(camera.causes) == 1, "its wish")
         camera.idle()
-        code, lines = GroundStation.start(camera.url, 1, timeout_s=20).wait(60)
+        code, lines = GroundStation.start(camera.url, 1, timeout_s=60).wait(100)
         assert (code, [line["index"] for line in lines]) == (0, [1])
