@@ -5,6 +5,9 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import sqlite3
+from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -17,7 +20,6 @@ from dappled.flight import (
     Ledger,
     LedgerReader,
     Recording,
-    later_copy,
     layout,
     ledger_copies,
     offload,
@@ -28,10 +30,10 @@ from dappled.flight import (
 )
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import check
-from dappled.flight.later_copy import Added
 from dappled.flight.seal_key import SealKey
+from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, mavlink_2, request
+from tests.flight.makers import deliver, flip, mavlink_2, request
 
 CLOCK = RecordedClock(START_UTC_NS)
 
@@ -161,14 +163,69 @@ def test_two_that_went_apart_are_refused_and_the_way_home_that_is_told_leads_the
     assert check(copy).problems == check(closed).problems == ()
 
 
-def test_nothing_was_added() -> None:
-    assert not Added({}, {}, seals=False)
+def edited(ledger: Path, sql: str) -> None:
+    """What another program does to a ledger."""
+    with closing(sqlite3.connect(ledger)) as db, db:
+        db.execute(sql)
 
 
-@pytest.mark.parametrize("row", [(2, b"frames/a", "A", 4, "ab", 1), (2, "frames/a")])
-def test_a_row_of_the_copy_that_is_none_is_refused_in_a_sentence(row: tuple[str | int | bytes, ...]) -> None:
-    with pytest.raises(FlightError, match="a row in the ledger of the copy can't be read"):
-        later_copy.files({"frames": [row]})
+@pytest.mark.parametrize("where", ["here", "at the copy"])
+def test_an_edited_ledger_neither_replaces_a_copy_nor_is_replaced(closed: Path, tmp_path: Path, where: str) -> None:
+    """Rows that the chain doesn't know, while work here has made the copy's ledger the earlier one."""
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(closed, b"here")
+    edited((closed if where == "here" else copy) / "flight.sqlite", "UPDATE frames SET camera_name = 'B' WHERE idx = 1")
+    before = (copy / "flight.sqlite").read_bytes()
+    with pytest.raises(FlightError, match=r"the row of frames 1 was changed .*: the copy's ledger was not replaced"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert (copy / "flight.sqlite").read_bytes() == before
+    assert sorted(path.name for path in closed.glob("frames/*.cr2")) == ["000000.cr2", "000001.cr2"]
+
+
+@pytest.mark.parametrize("key", ["'['", "'[[1]]'", "'[1e999]'", "'[123456789012345678901]'", "'[1,2,3]'"])
+def test_a_link_of_the_copy_that_is_none_is_refused_in_a_sentence(closed: Path, tmp_path: Path, key: str) -> None:
+    copy = go(closed, tmp_path / "disk").destination
+    edited(copy / "flight.sqlite", f"INSERT INTO chain SELECT max(number) + 1, 'frames', {key}, 'a', 'b' FROM chain")  # noqa: S608  ours
+    with pytest.raises(FlightError, match=r"flight.sqlite is there already and is no copy|the copy .* is not intact"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert len(list(closed.glob("frames/*.cr2"))) == 2
+
+
+def test_a_file_that_changes_after_the_copy_was_checked_does_not_come_home(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would be sealed here as if work had written it."""
+    geotag(closed, b"before")
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(copy, b"there")
+
+    def meanwhile(path: Path) -> object:
+        found = check(path)
+        (copy / "geotags/geo.txt").write_bytes(b"other")
+        return found
+
+    monkeypatch.setattr(flight_check, "check", meanwhile)
+    with pytest.raises(FlightError, match=r"geo.txt changed while it was copied; try again"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert (closed / "geotags/geo.txt").read_bytes() == b"before"
+    assert len(list(closed.glob("frames/*.cr2"))) == 2
+
+
+def test_what_comes_home_is_read_back_here(closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk here lies about a list that work at the copy wrote."""
+    copy = go(closed, tmp_path / "disk").destination
+    geotag(copy, b"there")
+    whole = Tree.write
+
+    def lying(tree: Tree, name: str, pieces: Iterable[bytes | memoryview]) -> None:
+        whole(tree, name, pieces)
+        if tree.path == closed and name == "geotags/geo.txt":
+            flip(closed / name, 2)
+
+    monkeypatch.setattr(Tree, "write", lying)
+    with pytest.raises(FlightError, match=r"geo.txt reads back different"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert len(list(closed.glob("frames/*.cr2"))) == 2
 
 
 def test_a_different_frame_on_another_machine_is_not_written_over(

@@ -7,7 +7,7 @@ that came to the copy alone (a pickup there) stay there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from dappled import durable
@@ -15,12 +15,10 @@ from dappled.clock import Clock
 from dappled.errors import counted
 from dappled.flight import layout
 from dappled.flight.chain import Column
-from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger
-from dappled.flight.pruning import Proved
-from dappled.flight.records import Frame, Stray
 from dappled.flight.trees import FileIdentity, Tree
+from dappled.flight.verified_copy import Proved, copy_verified, hashed
 from dappled.shown import printable
 
 _FOLDERS = ("geotags/", "inputs/")
@@ -28,13 +26,24 @@ _FOLDERS = ("geotags/", "inputs/")
 Rows = Mapping[str, Sequence[Sequence[Column]]]
 
 
+def written_by_work(there: Tree) -> dict[str, tuple[FileIdentity, str]]:
+    """The files of a copy that later work writes or adds, apart from frames, with their SHA-256. Raises FlightError."""
+    return {
+        name: hashed(there, name)
+        for name in there.walk()
+        if not durable.is_temporary(name.rpartition("/")[2])
+        and (name.startswith(_FOLDERS) or (name.startswith("frames/") and name.endswith(layout.SIDECAR)))
+    }
+
+
 @dataclass(frozen=True, slots=True)
 class Added:
-    """What work at a copy added: `rows` of its ledger by table, `files` that came to it alone and were read back there,
-    and whether it has seals that we lack."""
+    """What work at a copy added: `rows` of its ledger by table, `frames` that came to it alone and were read back
+    there, the `files` that it wrote as they were when the copy was checked, and whether it has seals that we lack."""
 
     rows: Rows
-    files: Mapping[str, Proved]
+    frames: Mapping[str, Proved]
+    files: Mapping[str, tuple[FileIdentity, str]]
     seals: bool
 
     def __bool__(self) -> bool:
@@ -45,55 +54,18 @@ class Added:
         """How many rows."""
         return sum(map(len, self.rows.values()))
 
-    def bring_home(
-        self, folder: FlightFolder, source: Tree, there: Tree, manifest: Mapping[str, Proved], clock: Clock
-    ) -> None:
-        """Add the rows to the ledger here, after the files and seals that go with them. `manifest` tells what the
-        copy's files are, which were read back. Called again after a crash, it does the rest. Raises FlightError."""
-        for name in _written_by_work(there):
-            if name in manifest and manifest[name].sha256 == _sha256(source, name):
-                continue
+    def bring_home(self, folder: FlightFolder, source: Tree, there: Tree, clock: Clock) -> None:
+        """Add the rows to the ledger here, after the files and seals that go with them. Called again after a crash, it
+        does the rest. Raises FlightError, also where a file is not the one any more that was checked."""
+        for name, (identity, sha256) in self.files.items():
             parents = name.split("/")[:-1]
             for depth in range(1, len(parents) + 1):
                 source.enter("/".join(parents[:depth]), make=True)
-            _copy(there, source, name)
+            if source.stat(name) is None or hashed(source, name)[1] != sha256:
+                copy_verified(there, source, name, identity)
         if self.seals:
-            _copy(there, source, folder.seals.name)
+            copy_verified(there, source, folder.seals.name)
         source.sync()
         with Ledger(folder.ledger, clock) as ledger:
             text = f"{counted(self.count, 'row')} that later work added to the copy {there.path} were brought home"
             ledger.adopt(self.rows, printable(text))
-
-
-def files(rows: Rows) -> list[Frame | Stray]:
-    """The frames, companions and strays among the rows of a ledger. Raises FlightError for what is none."""
-    try:
-        frames = [Frame(*row) for row in rows.get("frames", ())]  # type: ignore[arg-type]  # as the columns are
-        # idx stands second in the row of a companion
-        companions = [Frame(row[1], row[0], *row[2:]) for row in rows.get("companions", ())]  # type: ignore[arg-type]  # likewise
-        strays = [Stray(*row) for row in rows.get("strays", ())]  # type: ignore[arg-type]  # likewise
-    except TypeError as error:
-        raise FlightError(f"a row in the ledger of the copy can't be read: {error}") from error
-    found: list[Frame | Stray] = [*frames, *companions, *strays]
-    if not all(isinstance(row.name, str) and isinstance(row.sha256, str) for row in found):
-        raise FlightError("a row in the ledger of the copy can't be read: its columns have other types")
-    return found
-
-
-def _written_by_work(there: Tree) -> Iterator[str]:
-    """The files of a copy that later work writes or adds, apart from frames."""
-    for name in there.walk():
-        if durable.is_temporary(name.rpartition("/")[2]):
-            continue
-        if name.startswith(_FOLDERS) or (name.startswith("frames/") and name.endswith(layout.SIDECAR)):
-            yield name
-
-
-def _sha256(tree: Tree, name: str) -> str:
-    with tree.reading(name) as fd:
-        return durable.hash_descriptor(fd, FileIdentity.of_fd(fd).size)
-
-
-def _copy(origin: Tree, goal: Tree, name: str) -> None:
-    with origin.reading(name) as fd:
-        goal.write(name, durable.pieces(fd, FileIdentity.of_fd(fd).size))

@@ -28,6 +28,7 @@ from dappled.flight.tables import (
     APPLICATION_ID,
     DEFINITIONS,
     KEYS,
+    ROW_OF,
     SCHEMA,
     SCHEMA_VERSION,
     TELEMETRY,
@@ -37,10 +38,6 @@ from dappled.flight.tables import (
 LIVE = "live"
 BUSY_S = 10.0
 _MOST_VALUE = 16 << 20  # bytes of a value or row; the longest that dappled writes takes some kB
-_ROW_OF = {
-    table: f"SELECT * FROM {table} WHERE {' AND '.join(f'{column} = ?' for column in key)}"  # noqa: S608  constants
-    for table, key in KEYS.items()
-}
 _Record = TypeVar("_Record")
 
 
@@ -428,7 +425,7 @@ class Ledger(LedgerReader):
         that has come since the last one; returns the number of blocks."""
         head = self.last_link()
         for table, key in self._written:
-            row = self._db.execute(_ROW_OF[table], key).fetchone()
+            row = self._db.execute(ROW_OF[table], key).fetchone()
             head = self._link(head, table, key, chain.row_digest(row))
         blocks = self._telemetry.blocks(self._blocks) if self._telemetry is not None and self._written else []
         for block in blocks:

@@ -1,27 +1,26 @@
-"""Copy a ledger as SQLite sees it, its write-ahead log included, and say which of two copies of it is the later one."""
+"""Bring a ledger and its seals to a copy of the flight, and say by their chains which of the two is the later one.
+
+Links are only added to a chain. So the ledger whose chain begins with all of the other's is the later one; where
+neither does, work went on at both, and nothing is replaced.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import os
-import sqlite3
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 
 from dappled import durable
 from dappled.bounds.claims import ClaimError, check_size
 from dappled.flight import seals
 from dappled.flight.chain import Column
+from dappled.flight.checks import chain_check
 from dappled.flight.errors import FlightError
-from dappled.flight.ledger import LedgerReader
-from dappled.flight.pruning import Proved
-from dappled.flight.tables import KEYS
-from dappled.flight.trees import FileIdentity, Tree
-
-_TABLES = "SELECT name FROM sqlite_master WHERE type = 'table'"
-_GROWS = ("chain", "frames", "companions", "strays", "poses", "tags", "results", "events")
-"""Tables whose rows are added and never changed. Of shots the state changes, of facts the value."""
+from dappled.flight.stored_rows import StoredRows
+from dappled.flight.trees import Tree
+from dappled.flight.verified_copy import Proved, prove
 
 
 def is_part(name: str) -> bool:
@@ -32,8 +31,8 @@ def is_part(name: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Brought:
-    """A ledger's copy: whether it was written, what it is now, and which rows it has that the source's lacks, by table:
-    work at the copy added them."""
+    """A copy of a ledger or of seals: whether it was written, what it is now, and which rows a ledger has that the
+    source's lacks, by table, with their links: work at the copy added them."""
 
     written: bool
     proved: Proved
@@ -41,46 +40,48 @@ class Brought:
 
 
 def bring(source: Tree, there: Tree, name: str) -> Brought:
-    """Copy the ledger. A copy that is an earlier state of the source's is replaced, a later one stays: rows were added
-    to it there.
+    """Copy the ledger as SQLite sees it, its write-ahead log included. A copy that is an earlier state of the source's
+    is replaced, a later one stays.
 
-    Raises FlightError where each has rows that the other lacks, or a disk refuses.
+    Raises FlightError where each has links that the other lacks, where one of them is not what its own chain says and
+    the copy would be replaced, or a disk refuses.
     """
-    with LedgerReader.open(source.path / name) as ledger:
-        image = ledger.image()
-    goal = there.path / name
-    if there.stat(name) is not None:
-        try:
-            with LedgerReader.open(goal) as held:
-                theirs = held.image()
-        except FlightError as error:
-            raise FlightError(
-                f"{goal} is there already and is no copy of the ledger ({error}): move it away first"
-            ) from error
-        if theirs == image:
-            return Brought(False, _proved(there, name, image), {})
-        if _within(image, theirs):
-            return Brought(False, _proved(there, name, theirs), _added(image, theirs))
-        if not _within(theirs, image):
-            raise _apart(source, there, name)
+    with StoredRows.open(source.path / name) as ours:
+        image, head = ours.image(), ours.last_link()
+        if there.stat(name) is not None:
+            goal = there.path / name
+            try:
+                with StoredRows.open(goal) as theirs:
+                    held, their_head = theirs.image(), theirs.last_link()
+                    stays = held == image or (head is not None and theirs.link(head.number) == head)
+                    later = theirs.written_after(head.number) if stays and head is not None else {}
+                    wrong = () if stays else chain_check.compare(theirs).problems
+            except FlightError as error:
+                raise FlightError(
+                    f"{goal} is there already and is no copy of the ledger ({error}): move it away first"
+                ) from error
+            if stays:
+                return Brought(False, _proved(source, there, name, held), later)
+            if their_head is None or ours.link(their_head.number) != their_head:
+                raise _apart(source, there, name)
+            _refuse_edited(goal, wrong)
+            _refuse_edited(source.path / name, chain_check.compare(ours).problems)
     there.write(name, [image])
-    return Brought(True, _proved(there, name, image), {})
+    return Brought(True, _proved(source, there, name, image), {})
 
 
-def bring_seals(source: Tree, there: Tree, name: str) -> tuple[bool, Proved] | None:
+def bring_seals(source: Tree, there: Tree, name: str) -> Brought | None:
     """Copy the seals, as `bring` does the ledger: lines are only added to them. None where the source has none.
 
     Raises FlightError where each has lines that the other lacks, or a disk refuses.
     """
     if source.stat(name) is None:
         return None
-    ours, theirs = _content(source, name), _content(there, name)
+    ours, theirs = _contents(source, there, name)
     if theirs.startswith(ours):
-        return False, _proved(there, name, theirs)
-    if not ours.startswith(theirs):
-        raise _apart(source, there, name)
+        return Brought(False, _proved(source, there, name, theirs), {})
     there.write(name, [ours])
-    return True, _proved(there, name, ours)
+    return Brought(True, _proved(source, there, name, ours), {})
 
 
 def _apart(source: Tree, there: Tree, name: str) -> FlightError:
@@ -90,13 +91,23 @@ def _apart(source: Tree, there: Tree, name: str) -> FlightError:
     )
 
 
+def _refuse_edited(ledger: Path, problems: Sequence[str]) -> None:
+    """Raise FlightError for a ledger that something other than dappled wrote in: neither the only one of its kind nor
+    one that may replace another."""
+    if problems:
+        raise FlightError(
+            f"{ledger} is not what its chain says ({problems[0]}): the copy's ledger was not replaced, and nothing was "
+            f"removed; run `dappled flight check {ledger.parent}`, and move the copy with the wrong one away"
+        )
+
+
 class SealedStates:
     """Which earlier states of a flight's files the seals of two copies of it show, where one of them has all seals of
     the other and more: it is the later one."""
 
     def __init__(self, source: Tree, there: Tree, name: str) -> None:
-        """`name` is that of the file of seals. Raises FlightError."""
-        ours, theirs = _content(source, name), _content(there, name)
+        """`name` is that of the file of seals. Raises FlightError, also where each has lines that the other lacks."""
+        ours, theirs = _contents(source, there, name)
         self.source_is_later = theirs != b"" and ours.startswith(theirs) and ours != theirs
         self.copy_is_later = ours != b"" and theirs.startswith(ours) and ours != theirs
         self._states: set[tuple[str, str]] = set()
@@ -104,9 +115,21 @@ class SealedStates:
             found = seals.parse(max(ours, theirs, key=len), name).seals.values()
             self._states = {(file, sha256) for seal in found for file, (_, sha256) in seal.files.items()}
 
+    def differ(self, name: str) -> bool:
+        """Whether work may have written this file anew since one of the two copies was sealed."""
+        return bool(self._states) and not seals.never_changes(name)
+
     def has(self, name: str, sha256: str) -> bool:
         """Whether a file that later work may write anew had this content when the flight was sealed."""
         return not seals.never_changes(name) and (name, sha256) in self._states
+
+
+def _contents(source: Tree, there: Tree, name: str) -> tuple[bytes, bytes]:
+    """The seals here and there, where one begins with the other; FlightError where each has lines of its own."""
+    ours, theirs = _content(source, name), _content(there, name)
+    if not ours.startswith(theirs) and not theirs.startswith(ours):
+        raise _apart(source, there, name)
+    return ours, theirs
 
 
 def _content(tree: Tree, name: str) -> bytes:
@@ -122,49 +145,6 @@ def _content(tree: Tree, name: str) -> bytes:
         return b"".join(bytes(piece) for piece in durable.pieces(fd, found.st_size))
 
 
-def _proved(there: Tree, name: str, image: bytes) -> Proved:
-    found = there.stat(name)
-    assert found is not None
-    return Proved(FileIdentity.of(found), hashlib.sha256(image).hexdigest())
-
-
-def _within(earlier: bytes, later: bytes) -> bool:
-    """Whether every row of one ledger is in the other."""
-    try:
-        with closing(_opened(earlier)) as one, closing(_opened(later)) as other:
-            return all(_rows(one, query) <= _rows(other, query) for query in _queries(one))
-    except sqlite3.Error:
-        return False
-
-
-def _opened(image: bytes) -> sqlite3.Connection:
-    connection = sqlite3.connect(":memory:")
-    # SQLite reads no WAL database from memory; bytes 18 and 19 of the header say how it is journalled
-    try:
-        connection.deserialize(image[:18] + b"\1\1" + image[20:])
-    except sqlite3.Error:
-        connection.close()
-        raise
-    return connection
-
-
-def _queries(ledger: sqlite3.Connection) -> list[str]:
-    tables = {row[0] for row in ledger.execute(_TABLES)}
-    whole = [f"SELECT * FROM {table}" for table in _GROWS if table in tables]  # noqa: S608  names of our own
-    return [*whole, "SELECT idx, source, kind, sequence, wished_utc_ns FROM shots", "SELECT key FROM facts"]
-
-
-def _added(earlier: bytes, later: bytes) -> dict[str, list[tuple[Column, ...]]]:
-    """The rows of a later state of a ledger that the earlier one lacks or has otherwise, by table."""
-    with closing(_opened(earlier)) as one, closing(_opened(later)) as other:
-        known, tables = ({row[0] for row in db.execute(_TABLES)} for db in (one, other))
-        found = {}
-        for table in (name for name in (*KEYS, "chain") if name in tables):
-            query = f"SELECT * FROM {table}"  # noqa: S608  names of our own
-            before = _rows(one, query) if table in known else set()
-            found[table] = [row for row in other.execute(query) if row not in before]
-        return {table: rows for table, rows in found.items() if rows}
-
-
-def _rows(ledger: sqlite3.Connection, query: str) -> set[tuple[Column, ...]]:
-    return set(ledger.execute(query))
+def _proved(source: Tree, there: Tree, name: str, image: bytes) -> Proved:
+    wrong = f"{there.path / name} reads back different from {source.path / name}: check that disk; nothing was removed"
+    return prove(there, name, hashlib.sha256(image).hexdigest(), wrong)

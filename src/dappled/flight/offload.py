@@ -7,9 +7,8 @@ frames by that manifest alone, one by one, each only while it is still the file 
 
 from __future__ import annotations
 
-import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,18 +16,18 @@ from pathlib import Path
 from dappled import durable
 from dappled.clock import Clock
 from dappled.findings import Code, Finding, Subject, finding, told
-from dappled.flight import later_copy, layout, ledger_copies, places, pruning, read_back, seals
+from dappled.flight import later_copy, layout, ledger_copies, places, pruning, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.later_copy import Added, Rows
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.ledger_copies import SealedStates
-from dappled.flight.pruning import Proved
 from dappled.flight.read_back import ReadBack
 from dappled.flight.records import Frame, Stray
 from dappled.flight.seal_key import SealKey
-from dappled.flight.trees import FileIdentity, Tree
+from dappled.flight.trees import Tree
+from dappled.flight.verified_copy import Proved, copy_of, copy_verified, hashed, prove
 
 PRUNES = "offload --prune"
 
@@ -90,6 +89,8 @@ class _Copying:
 
     def __init__(self, folder: FlightFolder, source: Tree, there: Tree, system: str) -> None:
         self._folder, self._source, self._there, self._system = folder, source, there, system
+        self._proved: dict[str, Proved] = {}  # what the copy has by now
+        self._written: set[str] = set()  # by this call
 
     def run(
         self,
@@ -100,39 +101,28 @@ class _Copying:
         key: SealKey | None,
         progress: Callable[[int], object],
     ) -> Offloaded:
-        """Copy, make durable, read back, check, and remove; see `offload`."""
+        """Copy, read back, make durable, check, and remove; see `offload`."""
         # What stands on another machine can't be told apart from the source: it is written anew, which shows.
         anew = prune and self._system in places.NETWORK
-        manifest: dict[str, Proved] = {}
-        fresh: set[str] = set()
         states = SealedStates(self._source, self._there, self._folder.seals.name)
         for name in names:
-            stands = self._there.stat(name) is not None
-            self._refuse_in_the_way(name)
-            known = self._look(name, states) if stands else None
-            if known is not None and anew and seals.never_changes(name):
-                self._refuse_different(name, known)
-                known = None
-            if known is None:
-                self._mark()
-                known = self._copy(name)
-                fresh.add(name)
-            manifest[name] = known
-            progress(manifest[name].identity.size)
-        later = self._bring_ledger(manifest, fresh)
+            self._proved[name] = self._bring(name, states, anew=anew and seals.never_changes(name))
+            progress(self._proved[name].identity.size)
+        later = self._bring_ledger()
         self._there.sync()
         self._unmark()
         self._there.sync_above()
-        ways, copies = self._prove(manifest, fresh)
         rows = self._acknowledged()
-        elsewhere = self._prove_removed(rows, manifest)
+        elsewhere = self._prove_removed(rows)
+        files = later_copy.written_by_work(self._there) if later or states.copy_is_later else {}
         self._check()
-        added = Added(later, self._prove_added(later, {**manifest, **rows}), states.copy_is_later)
-        elsewhere |= added.files
-        _write_sums(self._there, {**manifest, **elsewhere})
+        added = Added(later, self._prove_added({**self._proved, **rows}) if later else {}, files, states.copy_is_later)
+        elsewhere |= added.frames
+        _write_sums(self._there, {**self._proved, **elsewhere})
+        ways = tuple(sorted({one.how for one in self._proved.values()}))
         doubts = tuple(_doubts(self._there.path, self._system, ways))
-        size = sum(one.identity.size for one in manifest.values())
-        already = len(manifest) - len(fresh)
+        size = sum(one.identity.size for one in self._proved.values())
+        copied, already = len(self._written), len(self._proved) - len(self._written)
         pruned = 0
         if prune:
             if "page cache" in ways:
@@ -140,64 +130,71 @@ class _Copying:
                     f"{told(doubts[0])}: nothing was removed; offload without --prune, or to another disk"
                 )
             sure = {
-                name: manifest[name]
+                name: self._proved[name]
                 for name, row in rows.items()
-                if name.startswith("frames/") and name in manifest and manifest[name].sha256 == row.sha256
+                if name.startswith("frames/") and name in self._proved and self._proved[name].sha256 == row.sha256
             }
             if sure:
-                self._write_down(manifest, copies, sure, added, clock=clock, key=key)
-                _write_sums(self._there, {**manifest, **elsewhere})
-                pruned = pruning.remove(self._source, self._there, sure, copies)
+                self._write_down(sure, added, clock=clock, key=key)
+                _write_sums(self._there, {**self._proved, **elsewhere})
+                pruned = pruning.remove(self._source, self._there, sure)
             else:
                 self._source.remove_part(pruning.RECORD)  # of an attempt that was cut short
         brought = added.count if pruned else 0
         return Offloaded(
-            self._folder.name, self._there.path, len(fresh), already, size, pruned, brought, self._system, ways, doubts
+            self._folder.name, self._there.path, copied, already, size, pruned, brought, self._system, ways, doubts
         )
 
-    def _bring_ledger(self, manifest: dict[str, Proved], fresh: set[str]) -> Rows:
-        """Copy ledger and seals, add them to the manifest and, where they were written, to what is `fresh`. Returns the
-        rows that the copy's ledger has and ours lacks."""
+    def _bring(self, name: str, states: SealedStates, *, anew: bool) -> Proved:
+        """Copy a file, or prove that the copy has it. Of one that later work wrote anew the later one counts. `anew`:
+        write it also where it is there already. Raises FlightError where another file is there."""
+        self._refuse_in_the_way(name)
+        if self._there.stat(name) is not None:
+            before, sha256 = hashed(self._source, name)
+            theirs = hashed(self._there, name)[1] if anew or states.differ(name) else sha256
+            goal, origin = self._there.path / name, self._source.path / name
+            wrong = f"{goal} is there already and differs from {origin}: move it away first"
+            if anew and theirs != sha256:
+                raise FlightError(wrong)
+            if states.copy_is_later and states.has(name, sha256):
+                sha256 = theirs
+            if not anew and not (states.source_is_later and theirs != sha256 and states.has(name, theirs)):
+                return prove(self._there, name, sha256, wrong, before)
+        self._mark()
+        self._written.add(name)
+        return copy_verified(self._source, self._there, name)
+
+    def _bring_ledger(self) -> Rows:
+        """Copy ledger and seals. Returns the rows that the copy's ledger has and ours lacks."""
         ledger, seal_file = self._folder.ledger.name, self._folder.seals.name
         for name in (ledger, seal_file):
             self._refuse_in_the_way(name)
-        brought = ledger_copies.bring(self._source, self._there, ledger)
-        manifest[ledger] = brought.proved
-        fresh |= {ledger} if brought.written else set()
+        brought = {ledger: ledger_copies.bring(self._source, self._there, ledger)}
         if (seal := ledger_copies.bring_seals(self._source, self._there, seal_file)) is not None:
-            written, manifest[seal_file] = seal
-            fresh |= {seal_file} if written else set()
-        return brought.later
+            brought[seal_file] = seal
+        self._proved |= {name: one.proved for name, one in brought.items()}
+        self._written |= {name for name, one in brought.items() if one.written}
+        return brought[ledger].later
 
-    def _write_down(
-        self,
-        manifest: dict[str, Proved],
-        copies: Mapping[str, FileIdentity | None],
-        sure: Mapping[str, Proved],
-        added: Added,
-        *,
-        clock: Clock,
-        key: SealKey | None,
-    ) -> None:
+    def _write_down(self, sure: Mapping[str, Proved], added: Added, *, clock: Clock, key: SealKey | None) -> None:
         """Before anything is removed: bring home what was added at the copy, write down what will go, seal the flight
         here, and bring the copy its ledger again, so that work there goes on from it. Raises FlightError."""
         for name in (self._folder.ledger.name, self._folder.seals.name):
-            if pruning.copy_of(self._there, name) != copies.get(name):
+            held = self._proved.get(name)
+            if copy_of(self._there, name) != (held and held.copy):
                 raise FlightError(
                     f"{self._there.path / name} changed while it was checked: nothing was removed; try again"
                 )
         both = [self._folder, *([FlightFolder(self._there.path)] if added else [])]
         signs = key if key is not None and all(seals.is_signed(one, key) for one in both) else None
         if added:
-            added.bring_home(self._folder, self._source, self._there, manifest, clock)
-        known = {**manifest, **self._acknowledged()}
+            added.bring_home(self._folder, self._source, self._there, clock)
+        known = {**self._proved, **self._acknowledged()}
         with seals.opened_again(self._folder, clock, PRUNES, signs):
-            pruning.note(self._folder, self._there.path, sure, added.files, clock)
+            pruning.note(self._folder, self._there.path, sure, added.frames, clock)
         if self._acknowledged().keys() <= known.keys():  # else a file came meanwhile: the next offload brings both
-            fresh: set[str] = set()
-            self._bring_ledger(manifest, fresh)
+            self._bring_ledger()
             self._there.sync()
-            self._prove({name: manifest[name] for name in fresh}, fresh)
 
     def _refuse_in_the_way(self, name: str) -> None:
         """Raise FlightError where something in the copy is the source's own file, or no file."""
@@ -222,112 +219,37 @@ class _Copying:
             self._there.unlink(layout.UNFINISHED)
             self._there.sync()
 
-    def _copy(self, name: str) -> Proved:
-        """Copy a file; the hash is that of the bytes which were written."""
-        sha256 = hashlib.sha256()
-
-        def hashed(pieces: Iterator[memoryview]) -> Iterator[memoryview]:
-            for piece in pieces:
-                sha256.update(piece)
-                yield piece
-
-        with self._source.reading(name) as fd:
-            before = FileIdentity.of_fd(fd)
-            self._there.write(name, hashed(durable.pieces(fd, before.size)))
-            self._refuse_changed(name, before, FileIdentity.of_fd(fd))
-        return Proved(before, sha256.hexdigest())
-
-    def _look(self, name: str, states: SealedStates) -> Proved | None:
-        """The identity of a file that the copy has already, and the hash that it should have there. Of a file that
-        later work wrote anew the later one counts; None where that is ours."""
-        with self._source.reading(name) as fd:
-            before = FileIdentity.of_fd(fd)
-            sha256 = durable.hash_descriptor(fd, before.size)
-            self._refuse_changed(name, before, FileIdentity.of_fd(fd))
-        mine_counts = states.source_is_later and not seals.never_changes(name)
-        if mine_counts or (states.copy_is_later and states.has(name, sha256)):
-            with self._there.reading(name) as fd:
-                theirs = durable.hash_descriptor(fd, FileIdentity.of_fd(fd).size)
-            if states.copy_is_later:
-                return Proved(before, theirs)
-            if theirs != sha256 and states.has(name, theirs):
-                return None
-        return Proved(before, sha256)
-
-    def _refuse_different(self, name: str, known: Proved) -> None:
-        """Raise FlightError where the copy, as another machine gives it, is not what it should be."""
-        with self._there.reading(name) as fd:
-            if durable.hash_descriptor(fd, FileIdentity.of_fd(fd).size) != known.sha256:
-                goal, origin = self._there.path / name, self._source.path / name
-                raise FlightError(f"{goal} is there already and differs from {origin}: move it away first")
-
-    def _refuse_changed(self, name: str, before: FileIdentity, after: FileIdentity) -> None:
-        if before != after:
-            raise FlightError(f"{self._source.path / name} changed while it was copied; try again")
-
-    def _prove(
-        self, manifest: Mapping[str, Proved], fresh: set[str]
-    ) -> tuple[tuple[ReadBack, ...], dict[str, FileIdentity | None]]:
-        """Read every file of the copy back and compare it with the manifest. Returns in which ways they were read, and
-        which files they were before that."""
-        ways: set[ReadBack] = set()
-        copies: dict[str, FileIdentity | None] = {}
-        for name, one in manifest.items():
-            copies[name] = pruning.copy_of(self._there, name)
-            found, how = self._read_back(name)
-            ways.add(how)
-            if found == one.sha256:
-                continue
-            goal, origin = self._there.path / name, self._source.path / name
-            if name in fresh:
-                raise FlightError(f"{goal} reads back different from {origin}: check that disk; nothing was removed")
-            raise FlightError(f"{goal} is there already and differs from {origin}: move it away first")
-        return tuple(sorted(ways)), copies
-
-    def _read_back(self, name: str) -> tuple[str, ReadBack]:
-        folder, _, last = name.rpartition("/")
-        try:
-            return read_back.hash_on_disk(last, self._there.folders[folder])
-        except OSError as error:
-            raise disk_error("read back", self._there.path / name, error) from error
-
     def _acknowledged(self) -> dict[str, Frame | Stray]:
         with LedgerReader.open(self._folder.ledger) as ledger:
             return {row.name: row for row in ledger.files()}
 
-    def _prove_removed(self, rows: Mapping[str, Frame | Stray], manifest: Mapping[str, Proved]) -> dict[str, Proved]:
+    def _prove_removed(self, rows: Mapping[str, Frame | Stray]) -> dict[str, Proved]:
         """Read back the files that an earlier prune removed here. Raises FlightError where this copy lacks one."""
         gone = pruning.removed(self._folder)
         proved: dict[str, Proved] = {}
-        for name in (name for name in rows if name in gone and name not in manifest):
+        for name in (name for name in rows if name in gone and name not in self._proved):
             self._folder.file(name)  # confined
-            found = self._there.stat(name)
-            if found is None:
+            if self._there.stat(name) is None:
                 raise FlightError(
                     f"{name} was offloaded to {gone[name].destination} and removed here, and {self._there.path} lacks "
                     "it: nothing was removed; give that destination, or copy its frames here first"
                 )
-            sha256, _ = self._read_back(name)
-            if sha256 != rows[name].sha256:
-                raise FlightError(f"{self._there.path / name} differs from what the ledger says: nothing was removed")
-            proved[name] = Proved(FileIdentity.of(found), sha256)
+            wrong = f"{self._there.path / name} differs from what the ledger says: nothing was removed"
+            proved[name] = prove(self._there, name, rows[name].sha256, wrong)
         return proved
 
-    def _prove_added(self, later: Rows, known: Mapping[str, object]) -> dict[str, Proved]:
-        """Read back the files that came to the copy alone (a pickup there). Raises FlightError where one isn't what the
-        ledger of the copy says."""
+    def _prove_added(self, known: Mapping[str, object]) -> dict[str, Proved]:
+        """Read back the files that came to the copy alone (a pickup there), whose ledger was checked. Raises
+        FlightError where one isn't what that ledger says."""
         proved: dict[str, Proved] = {}
-        for row in (row for row in later_copy.files(later) if row.name not in known):
+        with LedgerReader.open(self._there.path / self._folder.ledger.name) as ledger:
+            rows = [row for row in ledger.files() if row.name not in known]
+        for row in rows:
             self._folder.file(row.name)  # confined
-            found = self._there.stat(row.name) if row.name.count("/") == 1 and row.name.startswith("frames/") else None
-            if found is None:
+            if row.name.count("/") != 1 or not row.name.startswith("frames/") or self._there.stat(row.name) is None:
                 raise FlightError(f"the ledger of {self._there.path} names {row.name}, which is no frame there")
-            sha256, _ = self._read_back(row.name)
-            if sha256 != row.sha256:
-                raise FlightError(
-                    f"{self._there.path / row.name} differs from what the ledger there says: nothing was removed"
-                )
-            proved[row.name] = Proved(FileIdentity.of(found), sha256)
+            wrong = f"{self._there.path / row.name} differs from what the ledger there says: nothing was removed"
+            proved[row.name] = prove(self._there, row.name, row.sha256, wrong)
         return proved
 
     def _check(self) -> None:

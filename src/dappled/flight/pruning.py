@@ -22,18 +22,11 @@ from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.trees import FileIdentity, Tree
+from dappled.flight.verified_copy import Proved, copy_of
 from dappled.shown import printable
 
 RECORD = "offloaded.jsonl"
 EVENT = "offloaded"
-
-
-@dataclass(frozen=True, slots=True)
-class Proved:
-    """A file that was copied: which file it was, and the SHA-256 of its bytes, which the copy has on its disk."""
-
-    identity: FileIdentity
-    sha256: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,19 +63,19 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     return {row.name: row for row in rows}
 
 
-def remove(source: Tree, there: Tree, sure: Mapping[str, Proved], copies: Mapping[str, FileIdentity | None]) -> int:
+def remove(source: Tree, there: Tree, sure: Mapping[str, Proved]) -> int:
     """Remove files that `note` has written down; how many. Each must still be the file that was copied, and its copy
-    the one of `copies`, which was read back from `there`.
+    the one that was read back from `there`.
 
     Raises FlightError where one isn't, a copy has vanished, or a disk refuses; the other files then stay.
     """
     for name, one in sure.items():
         with source.reading(name) as fd:
             _refuse_other(source, name, fd, one)
-            if copy_of(there, name) != copies[name]:
+            if copy_of(there, name) != one.copy:
                 raise FlightError(f"{there.path / name} is not the file any more that was read back: {name} stays here")
             source.unlink(name)
-            if copy_of(there, name) != copies[name]:  # one file under two names that nothing told apart
+            if copy_of(there, name) != one.copy:  # one file under two names that nothing told apart
                 source.write(name, durable.pieces(fd, one.identity.size))
                 source.sync()
                 raise FlightError(
@@ -132,9 +125,3 @@ def _refuse_other(source: Tree, name: str, fd: int, one: Proved) -> None:
         raise FlightError(
             f"{source.path / name} is not the file any more that was copied: it stays here; offload again"
         )
-
-
-def copy_of(there: Tree, name: str) -> FileIdentity | None:
-    """Which file a copy is now; None where there is none."""
-    found = there.stat(name)
-    return None if found is None else FileIdentity.of(found)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
-from dappled.flight.chain import Column
+from dappled.flight.chain import ChainLink, Column
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.tables import ROW_OF
 
 StoredRow = tuple[Column, ...]
 
@@ -38,6 +40,22 @@ class StoredRows(LedgerReader):
     def links(self) -> list[StoredRow]:
         """The chain: (number, subject, key, sha256, link)."""
         return self._rows("SELECT number, subject, key, sha256, link FROM chain ORDER BY number")
+
+    def link(self, number: int) -> ChainLink | None:
+        """One link of the chain."""
+        rows = self._rows("SELECT number, subject, key, sha256, link FROM chain WHERE number = ?", number)
+        return ChainLink(*rows[0]) if rows else None
+
+    def written_after(self, number: int) -> dict[str, list[StoredRow]]:
+        """The rows that have a link after this one, by table, and those links."""
+        links = self._rows("SELECT * FROM chain WHERE number > ? ORDER BY number", number)
+        found: dict[str, list[StoredRow]] = {}
+        for table, key in dict.fromkeys((link[1], link[2]) for link in links if link[1] in ROW_OF):
+            try:
+                found.setdefault(table, []).extend(self._rows(ROW_OF[table], *json.loads(key)))
+            except (ValueError, TypeError, ArithmeticError, RecursionError) as error:
+                raise FlightError(f"a link of {table} in the ledger {self.path} can't be read: {error}") from error
+        return found | ({"chain": links} if links else {})
 
 
 def ledger_damage(path: Path) -> str | None:

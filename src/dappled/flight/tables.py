@@ -59,6 +59,10 @@ KEYS: dict[str, tuple[str, ...]] = {  # the primary key of each table that the c
     "events": ("number",),
     "facts": ("key",),
 }
+ROW_OF = {  # SQL that reads one row by its key
+    table: f"SELECT * FROM {table} WHERE {' AND '.join(f'{column} = ?' for column in key)}"  # noqa: S608  constants
+    for table, key in KEYS.items()
+}
 CHANGED_LATER = frozenset({"shots", "facts"})  # tables whose rows are updated; rows of the others stay as they are
 TELEMETRY = "telemetry.tlog"  # the subject of its blocks
 DEFINITIONS = "sqlite_master"  # the subject of the tables' own definitions
