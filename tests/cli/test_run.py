@@ -65,6 +65,15 @@ def config(tmp_path: Path, port: int) -> Path:
     return path
 
 
+def test_in_flight_who_computes_gives_way_to_who_acknowledges(config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python's own 5 ms count for each call of the system on the way to an answer."""
+    found, before = [], sys.getswitchinterval()
+    monkeypatch.setattr(verb, "flights", lambda _settings, _fly: found.append(sys.getswitchinterval()))
+    main(["run", "--config", str(config)])
+    assert [one <= 0.001 for one in found] == [True]
+    assert sys.getswitchinterval() == before
+
+
 def test_what_is_loaded_before_a_flight_is_not_looked_at_for_cycles_in_flight(
     config: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ from dappled.mocks.simulation import free_port
 from tests.daemon.camera_protocol.rig import Peer
 
 ROOT = Path(__file__).parents[2]
+NICE = -5  # the unit's; who may not have it runs without
 ACK_MS = 50.0
 LATE_MS = 1000.0  # for one acknowledgement in 20, on a machine whose cores are all busy
 BYTES_A_MINUTE = 1_000_000
@@ -39,9 +40,13 @@ def daemon(folder: Path) -> Iterator[int]:
             '[record]\ndirectory = "flights"\nmin_free_mb = 0\n[pose]\nwait_ms = 0\n'
             f'[publish]\nslices = "ipc://{short}/s"\nask = "ipc://{short}/a"\n'
         )
-        run = [sys.executable, "-m", "dappled", "run", "--config", "dappled.toml"]
+        run = ["nice", "-n", str(NICE), sys.executable, "-m", "dappled", "run", "--config", "dappled.toml"]
         with (folder / "stderr").open("w") as errors:
-            process = subprocess.Popen(run, cwd=folder, stdout=subprocess.DEVNULL, stderr=errors, text=True)
+            process = subprocess.Popen(
+                run, cwd=folder, stdout=subprocess.DEVNULL, stderr=errors, text=True, start_new_session=True
+            )
+        with contextlib.suppress(OSError):  # the kernel weighs sessions first; in the unit CPUWeight does that
+            Path(f"/proc/{process.pid}/autogroup").write_text(str(NICE), encoding="ascii")
         try:
             yield port
         finally:
@@ -124,7 +129,8 @@ def test_strangers_cost_a_signed_station_no_message_and_no_disk(
         usual = waits[-1 - len(waits) // 20]
         print(  # noqa: T201  for people who run with -s
             f"{sent / (seconds + WARM_UP_S):.0f} datagrams a second: acknowledgements {waits[len(waits) // 2]:.1f} ms, "
-            f"95 % within {usual:.1f}, the slowest of {len(waits)} {waits[-1]:.1f}; "
+            f"95 % within {usual:.1f}, 99 % within {waits[-1 - len(waits) // 100]:.1f}, "
+            f"the slowest of {len(waits)} {waits[-1]:.1f}; "
             f"{grown / minutes / 1e6:.2f} MB a minute"
         )
         assert sent > a_second * seconds / (2 if timed else 20), "the flood was none"

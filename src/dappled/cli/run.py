@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import signal
+import sys
 import tempfile
 import threading
 import time
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 
 _ALL, _CAMERA = "all", "camera"
+_SWITCH_S = 0.0005  # a thread that computes gives Python to one that acknowledges; by itself after 5 ms, at each call
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -169,6 +171,8 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
         # now stays, and is left out: 7 ms.
         gc.freeze()
         stack.callback(gc.unfreeze)
+        stack.callback(sys.setswitchinterval, sys.getswitchinterval())
+        sys.setswitchinterval(_SWITCH_S)
         stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
         for number in (
             signal.SIGINT,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import socket
@@ -148,6 +149,28 @@ def test_a_receiving_thread_that_ended_is_named() -> None:
             time.sleep(0.01)
         open_one.close()
     assert side.links.dead_threads() == []  # it was asked to end
+
+
+def test_what_receives_goes_before_the_other_threads() -> None:
+    """Those that compute would keep an acknowledgement waiting."""
+    own, wanted = os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), list[int]()
+
+    def most() -> None:
+        me = threading.get_native_id()
+        with contextlib.suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, me, own - 5)
+        wanted.append(os.getpriority(os.PRIO_PROCESS, me))
+
+    allowed = threading.Thread(target=most)
+    allowed.start()
+    allowed.join()
+    before = set(threading.enumerate())
+    with Side("udpin:127.0.0.1:0") as server, Side(f"udpout:127.0.0.1:{server.links.port(0)}") as client:
+        send_until_received(client, server)
+        send_until_received(server, client)
+        new = set(threading.enumerate()) - before
+        found = [os.getpriority(os.PRIO_PROCESS, one.native_id or 0) for one in new if one.name == "mavlink 0"]
+        assert found == wanted * 2
 
 
 def test_a_channel_that_is_opened_after_the_end_is_closed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +41,7 @@ _FRAMERS = 8  # clients of a TCP server that are read in turn, and some that hav
 _STAMP_BYTES = 8  # before each packet in the telemetry log
 _POLL_S = 0.2
 _RETURNS_NS = 30 * 10**9  # a radio may hold packets for seconds
+_NICER = 5  # below the process' own niceness: it acknowledges, and the unit allows it (LimitNICE)
 
 
 # --- one packet
@@ -379,6 +382,7 @@ class MavlinkLinks:
     # --- the receiving threads
 
     def _receive(self, link: Link, receiver: PacketReceiver | None) -> None:
+        _go_first()
         framers = dict[int, Framer]()  # by origin
         while not self._stop.is_set():
             channel = link.channel
@@ -477,3 +481,10 @@ class MavlinkLinks:
     def _close_channels(self) -> None:
         for link in self._links:
             link.close()
+
+
+def _go_first() -> None:
+    """Let the kernel run this thread before the others, as far as this user may."""
+    me = threading.get_native_id()
+    with contextlib.suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) - _NICER)
