@@ -64,3 +64,29 @@ def test_what_is_no_plain_file_is_neither_waited_for_nor_read(
         DOORS[name](path)
     said = str(refused.value)
     assert "plain file" in said or "its content would take" in said or "longer than" in said, said
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_a_large_file_that_has_no_blocks_yet_is_read_and_one_of_holes_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, full: bool
+) -> None:
+    """ZFS tells a file's blocks seconds after it was written."""
+    path, piece, told = tmp_path / "a.bin", os.urandom(4 << 20), os.fstat
+    with path.open("wb") as file:
+        for _ in range(66):
+            file.write(piece) if full else file.seek(len(piece), os.SEEK_CUR)
+        file.write(b"end")
+
+    def without_blocks(fd: int) -> os.stat_result:
+        values = tuple(told(fd))
+        return os.stat_result(values, {"st_blocks": 1})
+
+    monkeypatch.setattr(os, "fstat", without_blocks)
+    try:
+        if full:
+            assert parsing.stored_size(path) == 66 * len(piece) + 3
+        else:
+            with pytest.raises(OSError, match="it has holes"):
+                parsing.stored_size(path)
+    finally:
+        path.unlink()

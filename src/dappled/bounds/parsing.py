@@ -61,10 +61,9 @@ def stored_size(path: Path) -> int:
 
 def check_stored(fd: int) -> int:
     """Return the size of an open plain file, where its disk bears that out. Raises ClaimError, OSError."""
-    found = os.fstat(fd)
-    stored = found.st_blocks * 512 if hasattr(found, "st_blocks") else found.st_size
-    check_size(found.st_size, stored, "content")
-    return found.st_size
+    size = os.fstat(fd).st_size
+    check_size(size, durable.stored_bytes(fd), "content")
+    return size
 
 
 def parse_json(data: bytes | memoryview | str, most: int = MOST_BYTES) -> Any:

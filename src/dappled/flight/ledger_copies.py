@@ -139,7 +139,7 @@ def _content(tree: Tree, name: str) -> bytes:
     with tree.reading(name) as fd:
         found = os.fstat(fd)
         try:
-            check_size(found.st_size, found.st_blocks * 512, "content")
+            check_size(found.st_size, durable.stored_bytes(fd), "content")
         except ClaimError as error:
             raise FlightError(f"{tree.path / name} can't be read: {error}") from error
         return b"".join(bytes(piece) for piece in durable.pieces(fd, found.st_size))
