@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 
 import dappled
-from dappled import findings
+from dappled import codec, findings
 from dappled.findings import WORDS, Code, Finding, Level, Subject, finding
 
 SOURCE = Path(dappled.__file__).parent
@@ -30,7 +30,7 @@ def test_the_words_of_all_codes_stand_in_one_order() -> None:
 
 def test_a_finding_survives_json_and_is_equal_by_code_and_subject() -> None:
     one = finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=5)
-    assert Finding.from_json(one.to_json()) == one
+    assert codec.read(Finding, codec.plain(one)) == one
     assert one.level is Level.CAUTION
     assert one.kind == finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=6).kind
     assert findings.first_of_each([one, finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 4), rival=6)]) == [one]
@@ -64,7 +64,7 @@ def test_a_number_that_no_format_takes_is_shown() -> None:
 
 
 def test_a_subject_that_is_no_name_is_refused() -> None:
-    row = finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=0.1).to_json()
+    row = codec.plain(finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=0.1))
     assert findings.of_json_text(json.dumps(row)) is not None
     row["subject"]["which"] = [1]
     assert findings.of_json_text(json.dumps(row)) is None

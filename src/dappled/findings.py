@@ -10,11 +10,13 @@ import json
 import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum, StrEnum
 from importlib import resources
 from types import MappingProxyType
 from typing import Any, Self, TypeAlias
+
+from dappled import codec
 
 Value: TypeAlias = str | int | float | bool | None
 # What a result was made with, beside its own frames: its findings are told with its name.
@@ -31,7 +33,7 @@ class Level(IntEnum):
 
     @property
     def word(self) -> str:
-        """The level as JSON holds it."""
+        """The level as JSON and people have it."""
         return self.name.lower()
 
 
@@ -350,39 +352,17 @@ class Finding:
         """What makes two findings the same, whatever their numbers."""
         return self.code, self.subject
 
-    def to_json(self) -> dict[str, Any]:
-        """The finding as ledger, wire and `--json` hold it."""
-        return {
-            "code": self.code.value,
-            "level": self.level.word,
-            "subject": {"kind": self.subject.kind, "which": self.subject.which},
-            "facts": dict(self.facts),
-        }
-
-    @classmethod
-    def from_json(cls, row: Mapping[str, Any]) -> Self:
-        """What `to_json` made. Raises KeyError, TypeError or ValueError where a part is missing or unknown."""
-        about = row["subject"]
-        if not isinstance(about["which"], str | int):
-            raise TypeError("a finding's subject is a name or a number")
-        return cls(
-            Code(row["code"]),
-            Subject(str(about["kind"]), about["which"]),
-            dict(row["facts"]),
-            Level[str(row["level"]).upper()],
-        )
-
 
 def json_text(one: Finding) -> str:
     """A finding as an event of the ledger holds it."""
-    return json.dumps(one.to_json(), ensure_ascii=False)
+    return json.dumps(codec.plain(one), ensure_ascii=False)
 
 
 def of_json_text(words: str) -> Finding | None:
     """The finding that a text holds as JSON, as an event of the ledger does; None for another text."""
     try:
-        return Finding.from_json(json.loads(words))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return codec.read_json(Finding, words)
+    except codec.CodecError:
         return None
 
 
@@ -459,27 +439,6 @@ def named(one: Finding, under: Subject | None = None) -> str:
 def told(one: Finding, under: Subject | None = None) -> str:
     """What was found, of what, and what to do."""
     return named(one, under) + (f": {todo}" if (todo := remedy(one)) else "")
-
-
-def to_rows(found: Iterable[Finding]) -> list[dict[str, Any]]:
-    """Findings as JSON holds them."""
-    return [one.to_json() for one in found]
-
-
-def from_rows(rows: Iterable[Mapping[str, Any]]) -> tuple[Finding, ...]:
-    """What `to_rows` made. Raises KeyError, TypeError or ValueError."""
-    return tuple(Finding.from_json(row) for row in rows)
-
-
-def plain(value: Any) -> Any:
-    """A record's values as JSON holds them, findings among them."""
-    if isinstance(value, Finding):
-        return value.to_json()
-    if is_dataclass(value):
-        return {one.name: plain(getattr(value, one.name)) for one in fields(value)}
-    if isinstance(value, Mapping):
-        return {name: plain(one) for name, one in value.items()}
-    return [plain(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def of_subject(found: Iterable[Finding], subject: Subject) -> list[Finding]:

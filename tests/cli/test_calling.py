@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from dappled import cli
+from dappled import cli, codec
 from dappled.cli import VERBS, calling
 from dappled.cli.command_line import verb_class
 from dappled.cli.verb import CallError, Doubtable, Report
@@ -52,4 +52,4 @@ def test_every_verb_ends_by_one_rule(
         assert ended(verb, monkeypatch, Report(findings=[DOUBT]), "--anyway") == 0
     capsys.readouterr()
     assert ended(verb, monkeypatch, Report({"a": 1}, findings=[DOUBT]), "--json") == 1
-    assert json.loads(capsys.readouterr().out) == {"a": 1, "findings": [DOUBT.to_json()]}
+    assert json.loads(capsys.readouterr().out) == {"a": 1, "findings": [codec.plain(DOUBT)]}

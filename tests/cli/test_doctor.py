@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 import tomli_w
 
+from dappled import codec
 from dappled.cli import main
 from dappled.config import settings as configuration
 from dappled.daemon.stream.publisher import Publisher
@@ -22,7 +23,7 @@ from dappled.findings import Code, Subject, finding
 from tests.daemon.health.test_go_no_go import WELL as FACTS
 from tests.system.conftest import dappled
 
-ABSENT = finding(Code.CAMERA_ABSENT, Subject("camera"), reason="no body").to_json() | {"age_s": 0.0}
+ABSENT = codec.plain(finding(Code.CAMERA_ABSENT, Subject("camera"), reason="no body")) | {"age_s": 0.0}
 WELL = {**FACTS, "camera": {"state": "ready", "reason": ""}, "findings": []}
 
 

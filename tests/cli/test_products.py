@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dappled import codec
 from dappled.cli import depth, main
 from dappled.clock import RecordedClock
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.geometry import camera_pose
-from dappled.findings import FRAME, Code, finding, to_rows, told
+from dappled.findings import FRAME, Code, finding, told
 from dappled.flight import recording
 from dappled.products import opened
 from dappled.products.exports import light_files
@@ -64,11 +65,11 @@ def test_what_is_made_of_a_light_field_in_doubt_is_in_doubt(
         light_field(),
         [finding(Code.FRAME_CLIPPED, FRAME, share=0.03), finding(Code.MASK_TURNED, FRAME, by_deg=0.1)],
     )
-    light_files.save(tmp_path / "f.npz", replace(plain, attributes={**plain.attributes, "doubts": to_rows(doubts)}))
+    light_files.save(tmp_path / "f.npz", replace(plain, attributes={**plain.attributes, "doubts": codec.plain(doubts)}))
     words = [verb, str(tmp_path / "f.npz"), "-o", str(tmp_path / name), *(["--as", "mat"] if verb == "export" else [])]
     assert main([*words, "--json"]) == 1
     said = capsys.readouterr()
-    assert json.loads(said.out)["doubts"] == to_rows(doubts)
+    assert json.loads(said.out)["doubts"] == codec.plain(doubts)
     lines = "".join(f"in doubt: light field {words[1]}: {told(doubt, FRAME)}\n" for doubt in reversed(doubts))
     assert said.err == f"{lines}dappled {verb}: written, but in doubt: see above; --anyway accepts that\n"
     (tmp_path / name).unlink()

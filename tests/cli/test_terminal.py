@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from dappled import codec
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, frame_line, waiting_for
 from dappled.clock import RecordedClock
 from dappled.daemon.health import systemd
@@ -71,7 +72,7 @@ def test_a_finding_is_said_once_each_time_it_begins() -> None:
 
     class Daemon:
         def health(self) -> Mapping[str, Any]:
-            return {**HEALTH, "findings": [{**one.to_json(), "age_s": 0.0} for one in here]}
+            return {**HEALTH, "findings": [{**codec.plain(one), "age_s": 0.0} for one in here]}
 
     class Manager:
         def status(self, text: str) -> None:

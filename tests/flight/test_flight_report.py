@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.cli import main
 from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import FlightFolder, Recording, Result, flight_report
@@ -75,7 +75,7 @@ def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys
         deliver(flight, index, bytes(1000))
     dark = finding(Code.FRAME_DARK, FRAME, share=0.01), finding(Code.FRAME_BLACK, FRAME, share=0.8)
     for index, state in enumerate(states):
-        details = {"verdict": {"state": state, "reasons": findings.to_rows(dark if state != "good" else ())}}
+        details = {"verdict": {"state": state, "reasons": codec.plain(dark if state != "good" else ())}}
         flight.ledger.add_result(Result(index, "ab", 12, 13, "geometric", "predicted", details=details))
     flight.close()
     assert main(["flight", "report", str(flight.folder.path)]) == 0

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 import dappled
+from dappled import codec
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.errors import DecodeError
 from dappled.errors import DappledError
@@ -27,8 +28,8 @@ from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFrame, OpenedLightField, OpenError
 from tests.products.fields import DISPARITY, light_field
 
-CLIPPED = finding(Code.FRAME_CLIPPED, FRAME, share=0.03).to_json()
-DEVELOPED = finding(Code.FRAME_DEVELOPED, FRAME, why="a <JPEG>").to_json()
+CLIPPED = codec.plain(finding(Code.FRAME_CLIPPED, FRAME, share=0.03))
+DEVELOPED = codec.plain(finding(Code.FRAME_DEVELOPED, FRAME, why="a <JPEG>"))
 
 
 @pytest.fixture(autouse=True)

@@ -8,11 +8,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from dappled import codec
 from dappled.cli.geotag import MarkArguments, geoid_or_none
 from dappled.cli.placing import Placing
 from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, argument, flag, option
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, Subject, first_by_name, to_rows
+from dappled.findings import Finding, Subject, first_by_name
 from dappled.flight import disk_error, layout
 from dappled.products.batch import batch, workers
 from dappled.products.batch.batch import KINDS, Done, Job, Manifest
@@ -127,7 +128,7 @@ def _tell(done: Done, output: Output) -> None:
         output.warn(text)
     said = {"flight": done.flight, "frame": done.frame, "error": done.error, "refused": dict(done.refused)}
     files = [one.name for one in done.outputs]
-    output.row({**said, "doubts": to_rows(done.doubts), "seconds": done.seconds, "files": files})
+    output.row({**said, "doubts": codec.plain(done.doubts), "seconds": done.seconds, "files": files})
 
 
 def _of_flight(flight: str, subject: Subject) -> Subject:

@@ -11,7 +11,7 @@ from typing import Any
 
 from PIL import Image
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.config import profiles
@@ -284,7 +284,7 @@ def _as_json(table: Table) -> dict[str, Any]:
         whole["rotation_rad"] = table.rotation_rad
     if table.search is not None:
         whole["observable"] = table.search.found is not None or table.search.expected
-        whole["reason"] = None if (why := table.doubt or table.search.unseen) is None else why.to_json()
+        whole["reason"] = codec.plain(table.doubt or table.search.unseen)
         whole["laws"] = [{"law": one.law, "odds_nats": one.nats} for one in table.search.odds]
     if table.found:
         whole["pitch_px"] = list(table.found.spacing_px)

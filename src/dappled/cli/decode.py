@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.cli.field_arguments import views_words
 from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, flag, option
@@ -89,7 +90,7 @@ def _facts(target: Path, made: DecodeResult) -> dict[str, Any]:
         "views_model": field.attributes.get("views_model"),
         "views_reason": field.attributes.get("views_reason") or None,
         "doubts": field.attributes["doubts"],
-        "contradiction": None if made.contradiction is None else made.contradiction.to_json(),
+        "contradiction": codec.plain(made.contradiction),
     }
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import codec
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
@@ -20,7 +21,6 @@ from dappled.decode import DecodeError
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.depth import estimate as depths
 from dappled.errors import counted
-from dappled.findings import to_rows
 from dappled.flight import layout
 from dappled.products.exports import exports, point_cloud, prints
 from dappled.products.maps import photographs, terrain
@@ -195,7 +195,7 @@ def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | No
         "disparity_px": _quartiles(made.disparity),
         "sigma_px": _quartiles(made.sigma),
         "distances_from": None if found.ranging is None else found.ranging.source,
-        "doubts": to_rows(found.doubts),
+        "doubts": codec.plain(found.doubts),
     }
     if distances is not None:
         report["distance_known"] = float(np.isfinite(distances.distance_m).mean())

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.cli import status
 from dappled.cli.status import is_listening, stream_endpoint
 from dappled.cli.verb import Output, Report, SettingsArgument, Verb, flag, option
@@ -25,7 +26,7 @@ from dappled.daemon.pipeline import recipes
 from dappled.daemon.test_shot import Latency
 from dappled.drivers import usb_bus
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, remedy, text, to_rows
+from dappled.findings import Code, Finding, Level, Subject, finding, remedy, text
 
 _WORDS = {Level.NOTE: "go", Level.CAUTION: "caution", Level.STOP: "NO GO"}
 _SETTINGS = Subject("settings")
@@ -75,7 +76,7 @@ def _examined(arguments: ExamineMachine, output: Output) -> Report:
         if arguments.simulate:
             settings, truth = stack.enter_context(_simulated(settings, arguments.seed, folder))
         checked = host_checks.run(settings)
-        report: dict[str, Any] = {"checks": to_rows(checked)}
+        report: dict[str, Any] = {"checks": codec.plain(checked)}
         ready = all(one.level < Level.STOP for one in checked if one.subject.kind in ("camera", "disk"))
         good = not host_checks.next_step(checked)
         lines = [*_lines(checked)]
@@ -115,7 +116,7 @@ def _beside(endpoint: str, settings: Settings, arguments: ExamineMachine) -> Rep
     whose = "a daemon runs here" if user is None else f"not your own daemon but that of user {user} runs here"
     lines = [f"{whose}, flight {report['flight']}; it reports", *_lines([*checks, *looked])]
     lines.append(f"{_VERDICTS[verdict]}{f'; next: {todo}' if todo else ''}")
-    rows = to_rows([*checks, *looked])
+    rows = codec.plain([*checks, *looked])
     found = {"flight": report["flight"], "user": user, "checks": rows, "verdict": verdict, "next": todo}
     return Report(found, lines, failed=verdict == "no-go")
 
@@ -198,7 +199,7 @@ def _shoot(
     lines = [*_lines(judged, remedies=True)]
     facts: dict[str, Any] = {"verdict": go_no_go.state(judged), "flight": flight}
     if arguments.test_shot:
-        facts["test_shot"] = to_rows(judged)
+        facts["test_shot"] = codec.plain(judged)
     if arguments.latency and latencies:
         timed = _timed(latencies, None if truth is None else _true_latencies(truth, len(latencies)))
         lines += timed.pop("lines")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, RangingArguments, doubts, opened_field, views_words
 from dappled.cli.verb import CallError, Output, OutputExistsError, Overwriting, Report, Verb, flag, option
-from dappled.findings import to_rows
 from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
@@ -58,7 +58,7 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
         words = views_words(found.field)
         if words and not self.json:
             output.remark(words)
-        facts = {"file": str(written), "as": self.kind, "views": words or None, "doubts": to_rows(found.doubts)}
+        facts = {"file": str(written), "as": self.kind, "views": words or None, "doubts": codec.plain(found.doubts)}
         return Report(facts, [str(written)], findings=doubts(found))
 
     def _write(self, found: OpenedLightField) -> Path:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.cli import sealing
 from dappled.cli.placing import Mounted
 from dappled.cli.verb import Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, of_setting, option
@@ -17,7 +18,7 @@ from dappled.daemon.replay import late_tags
 from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.decode.geometry import Vector3, camera_pose
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, to_rows
+from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import Tag, layout, seals
 from dappled.flight.layout import LockHeldError
 from dappled.flight.seal_key import SealKey
@@ -135,7 +136,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
             "copies": copied,
             "without_copy": without_copy,
             "geoid": geoid.name if geoid else None,
-            "doubts": to_rows(one for one in found if one.level > Level.NOTE),
+            "doubts": codec.plain([one for one in found if one.level > Level.NOTE]),
             "marks": _marks_json(marked) if marked else None,
         }
         words = f"{counted(written.placed, 'frame')} placed, {counted(len(written.files), 'file')} written"
@@ -187,8 +188,8 @@ def _marks_json(marked: marks.Marked) -> dict[str, Any]:
     return {
         "placed": sorted(marked.marks),
         "lost": list(marked.lost),
-        "extra": to_rows(marked.extra),
-        "doubts": to_rows(marked.doubts),
+        "extra": codec.plain(marked.extra),
+        "doubts": codec.plain(marked.doubts),
         "offset_s": marked.offset_s,
         "spread_s": marked.spread_s,
         "shift_m": None if marked.shift_m is None else dict(zip(("north", "east", "up"), marked.shift_m, strict=True)),

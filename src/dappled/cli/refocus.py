@@ -13,13 +13,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
 from dappled.decode.lightfield.refocus import StereoPair, all_in_focus, anaglyph, focal_stack, magnified, side_by_side
-from dappled.findings import to_rows
 from dappled.products.exports import prints
 from dappled.products.maps.georeference import Survey
 from dappled.products.opened import OpenedLightField
@@ -164,7 +163,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
             "file": str(self.output),
             "disparities_px": [d for _, d in planes],
             "notes": [dict(note.facts) for note in notes],
-            "doubts": to_rows(found.doubts),
+            "doubts": codec.plain(found.doubts),
         }
         said = f"{', '.join(c for c in captions if c) or 'one picture'}: {self.output}"
         return Report(values, [*(note.text for note in notes), said], findings=doubts(found))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.cli.verb import Doubtable, Report, Verb
 from dappled.findings import Level
 from dappled.shown import printable
@@ -117,7 +117,7 @@ def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
 def _with_findings(report: Report) -> Any:
     if not report.findings or not isinstance(report.values, dict) or {"doubts", "findings"} & set(report.values):
         return report.values
-    return {**report.values, "findings": [one.to_json() for one in findings.in_order(report.findings)]}
+    return {**report.values, "findings": [codec.plain(one) for one in findings.in_order(report.findings)]}
 
 
 def failed(path: str, sentences: Sequence[str], *, as_json: bool, usage: str = "") -> None:

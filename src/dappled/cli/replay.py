@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.cli import sealing
 from dappled.cli.terminal import frame_line, frame_values
 from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
@@ -27,7 +28,7 @@ from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
-from dappled.findings import Finding, first_of_each, in_order, to_rows
+from dappled.findings import Finding, first_of_each, in_order
 from dappled.flight import LIVE, TimeSource, layout
 from dappled.flight.checks import flight_check
 
@@ -162,7 +163,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         told = first_of_each(found)
         if not self.verify:
             if told:
-                output.row({"findings": to_rows(in_order(told))})
+                output.row({"findings": codec.plain(in_order(told))})
             return Report(findings=told, failed=bool(progress.bad))
         problems += writer.verdict(decoded=recipe is not None)
         for text in problems:
@@ -172,7 +173,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         left = f" ({undecoded} left undecoded in flight)" if undecoded else ""
         verdict = counted(len(problems), "difference") if problems else _same(writer)
         values = {"verified": count, "differences": problems, "left_undecoded": undecoded}
-        values["findings"] = to_rows(in_order(told))
+        values["findings"] = codec.plain(in_order(told))
         output.row(values, f"verified {counted(count, 'frame')}: {verdict}{left}")
         return Report(findings=told, failed=bool(problems))
 

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
+from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.health.record import line as status_line
 from dappled.daemon.health.standing import NewFindings, unasked
@@ -25,7 +26,7 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.errors import counted
-from dappled.findings import plain, told
+from dappled.findings import told
 from dappled.workers import Loop, Worker
 
 log = logging.getLogger("dappled.run")
@@ -249,7 +250,7 @@ def frame_values(pending: PendingShot) -> dict[str, Any]:
         "index": pending.shot.index,
         "cause": asdict(pending.shot.cause),
         "frame": asdict(pending.frame) if pending.frame else None,
-        "tag": plain(pending.tag),
+        "tag": codec.plain(pending.tag),
         "carriers_found": pending.decoded.carriers_found if pending.decoded else None,
         "carriers_predicted": pending.decoded.carriers_predicted if pending.decoded else None,
         "carriers_from": pending.decoded.carriers_from if pending.decoded else None,

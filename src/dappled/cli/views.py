@@ -7,13 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, doubts, opened_field, views_words
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
 from dappled.decode.depth.evidence import of_light_field
 from dappled.decode.depth.stereo import shifts_from_middle
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
-from dappled.findings import to_rows
 from dappled.products.exports import epi, prints
 from dappled.products.opened import OpenedLightField, OpenError
 
@@ -60,7 +60,7 @@ class DrawViews(Overwriting, FieldArguments, Verb):
         facts = {"file": str(self.output), "of": self.of, "views": list(found.views.shape[:4])}
         said = f"{count_v} × {count_u} views of {width} × {height} px; {self.output}"
         return Report(
-            {**facts, "doubts": to_rows(found.doubts), **({"note": note} if note else {})},
+            {**facts, "doubts": codec.plain(found.doubts), **({"note": note} if note else {})},
             [*([note] if note else []), said],
             findings=doubts(found),
         )

@@ -12,8 +12,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from dappled import codec
 from dappled.decode.geometry import Pose
-from dappled.findings import plain
 from dappled.flight.records import Tag
 
 Column = str | int | float | bytes | None
@@ -33,18 +33,9 @@ class ChainLink:
     link: str
 
 
-def canonical(value: Any) -> bytes:
-    """Encode a value so that equal values give equal bytes: JSON, sorted keys, no spaces, shortest round-trip floats.
-
-    Raises ValueError for NaN and infinities.
-    """
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
-
-
 def digest(record: Pose | Tag | Mapping[str, Any]) -> str:
     """SHA-256 (hex) of a record's canonical form."""
-    value = record if isinstance(record, Mapping) else plain(record)
-    return hashlib.sha256(canonical(value)).hexdigest()
+    return hashlib.sha256(codec.canonical(record)).hexdigest()
 
 
 def json_array(values: Sequence[Column]) -> str:

@@ -6,24 +6,23 @@ that was hashed, so that `sha256(record)` can be checked with SQLite and sha256s
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from dappled import findings
+from dappled import codec
 from dappled.clock import Clock
-from dappled.decode.geometry import Gnss, GroundHeight, Pose
-from dappled.findings import plain
+from dappled.codec import CodecError, canonical
+from dappled.decode.geometry import Pose
 from dappled.flight import chain
-from dappled.flight.chain import ChainLink, Column, canonical, digest
+from dappled.flight.chain import ChainLink, Column, digest
 from dappled.flight.errors import FlightError, ledger_error
 from dappled.flight.logs import TelemetryLog
-from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag, TimeSource
+from dappled.flight.records import Cause, Frame, LedgerEvent, Result, Shot, ShotRow, ShotState, Stray, Tag
 from dappled.flight.tables import (
     APPLICATION_ID,
     DEFINITIONS,
@@ -174,27 +173,27 @@ class LedgerReader(Database):
         return [Stray(*row) for row in self._rows("SELECT * FROM strays ORDER BY name")]
 
     def poses(self) -> dict[int, Pose]:
-        return {index: self._load(_pose, text) for index, text in self._rows("SELECT idx, record FROM poses")}
+        return {index: self._load(Pose, text) for index, text in self._rows("SELECT idx, record FROM poses")}
 
     def pose(self, index: int) -> Pose | None:
         rows = self._rows("SELECT record FROM poses WHERE idx = ?", index)
-        return self._load(_pose, rows[0][0]) if rows else None
+        return self._load(Pose, rows[0][0]) if rows else None
 
     def tags(self) -> dict[int, Tag]:
-        return {index: self._load(_tag, text) for index, text in self._rows("SELECT idx, record FROM tags")}
+        return {index: self._load(Tag, text) for index, text in self._rows("SELECT idx, record FROM tags")}
 
     def tag(self, index: int) -> Tag | None:
         rows = self._rows("SELECT record FROM tags WHERE idx = ?", index)
-        return self._load(_tag, rows[0][0]) if rows else None
+        return self._load(Tag, rows[0][0]) if rows else None
 
     def results(self, run: str = "live") -> dict[int, Result]:
         """The decoding results of one run, by index."""
         rows = self._rows("SELECT record FROM results WHERE run = ? ORDER BY idx", run)
-        return {result.index: result for result in (self._load(_result, row[0]) for row in rows)}
+        return {result.index: result for result in (self._load(Result, row[0]) for row in rows)}
 
     def result(self, index: int, run: str = "live") -> Result | None:
         rows = self._rows("SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
-        return self._load(_result, rows[0][0]) if rows else None
+        return self._load(Result, rows[0][0]) if rows else None
 
     def runs(self) -> dict[str, int]:
         """The number of results of each run; "live" is the flight itself."""
@@ -223,7 +222,7 @@ class LedgerReader(Database):
 
     def facts(self) -> dict[str, Any]:
         """Values that hold for the whole flight: telemetry_sha256, closed_utc_ns …"""
-        return {key: self._load(_anything, value) for key, value in self._rows("SELECT key, value FROM facts")}
+        return {key: self._load(Any, value) for key, value in self._rows("SELECT key, value FROM facts")}
 
     def utc_correction_ns(self) -> int | None:
         """What to add to every `utc_ns` of this flight to get UTC: 0 where the machine knew UTC, None where it never
@@ -238,10 +237,10 @@ class LedgerReader(Database):
         with self._lock, self._speaking():
             return self._db.serialize()
 
-    def _load(self, build: Callable[[Any], _Record], text: str) -> _Record:
+    def _load(self, kind: type[_Record], text: str) -> _Record:
         try:
-            return build(json.loads(text))
-        except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+            return codec.read_json(kind, text)
+        except CodecError as error:
             raise FlightError(f"a record in the ledger {self.path} can't be read: {error}") from error
 
     def _sentence(self, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
@@ -344,12 +343,12 @@ class Ledger(LedgerReader):
         """Add a frame's tag and, with a digest of its own, the pose in it."""
         with self._transaction():
             for table, record in (("poses", tag.pose), ("tags", tag)):
-                self._insert(table, (tag.index,), tag.index, digest(record), canonical(plain(record)).decode())
+                self._insert(table, (tag.index,), tag.index, digest(record), canonical(record).decode())
 
     def add_result(self, result: Result) -> None:
         """Add the result of decoding a frame; once for each run."""
         with self._transaction():
-            values = (result.index, result.run, result.slices_sha256, canonical(plain(result)).decode())
+            values = (result.index, result.run, result.slices_sha256, canonical(result).decode())
             self._insert("results", (result.index, result.run), *values)
 
     def add_event(self, kind: str, text: str, index: int | None = None) -> None:
@@ -461,30 +460,3 @@ def _shot_row(row: Sequence[Any]) -> ShotRow:
     index, source, kind, sequence, utc_ns, monotonic_ns, state, reason, called, returned = row
     shot = Shot(index, Cause(source, kind, sequence), utc_ns, monotonic_ns)
     return ShotRow(shot, cast(ShotState, state), reason, called, returned)
-
-
-def _anything(value: Any) -> Any:
-    """A value of `facts`."""
-    return value
-
-
-def _pose(value: dict[str, Any]) -> Pose:
-    """A record of `poses`. Raises TypeError for anything else."""
-    made: dict[str, Any] = {key: tuple(item) for key, item in value.items() if isinstance(item, list)}
-    for name, kind in (("gnss", Gnss), ("ground", GroundHeight)):
-        if value.get(name) is not None:
-            made[name] = kind(**value[name])
-    return Pose(**{**value, **made})
-
-
-def _tag(value: dict[str, Any]) -> Tag:
-    """A record of `tags`. Raises TypeError, ValueError or KeyError for anything else."""
-    made = {"pose": _pose(value["pose"]), "time_source": TimeSource(value["time_source"])}
-    return Tag(**{**value, **made, "doubts": findings.from_rows(value["doubts"])})
-
-
-def _result(value: dict[str, Any]) -> Result:
-    """A record of `results`. Raises KeyError, TypeError or ValueError for anything else."""
-    found = Result(**value)
-    found.verdict  # noqa: B018  # its findings are read from the same row
-    return found

@@ -9,16 +9,15 @@ import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored, parse_json, read_log
 from dappled.errors import counted
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
-from dappled.flight.records import Cause, Shot
+from dappled.flight.records import Shot
 
 _MOST_LISTED = 1000  # lines that are no shots: a file can have any number of them
 _LINE_BYTES = 1 << 16  # of the journal; a shot takes some 200
@@ -69,15 +68,10 @@ def read_journal(path: Path) -> JournalContents:
 
 def _parse(line: bytes) -> Shot | None:
     try:
-        value: Any = parse_json(line, _LINE_BYTES)
-        shot = Shot(**{**value, "cause": Cause(**value["cause"])})
-    except (ValueError, TypeError, KeyError):
+        shot = codec.read(Shot, parse_json(line, _LINE_BYTES))
+    except ValueError:
         return None
-    numbers = (shot.index, shot.wished_utc_ns, shot.wished_monotonic_ns)
-    words = (shot.cause.source, shot.cause.kind)
-    sequence = shot.cause.sequence
-    whole = all(type(number) is int for number in numbers) and all(type(word) is str for word in words)
-    return shot if whole and shot.index >= 0 and (sequence is None or type(sequence) is int) else None
+    return shot if shot.index >= 0 else None
 
 
 def read_telemetry(

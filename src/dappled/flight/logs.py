@@ -12,14 +12,14 @@ payload; MAVLink 2: 0xFD, 12 bytes, 13 more with a signature) without a dialect.
 from __future__ import annotations
 
 import hashlib
-import json
 import mmap
 import os
 import threading
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import Clock, SystemClock
+from dappled.codec import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.records import Shot
 from dappled.workers import Loop
@@ -154,7 +154,7 @@ class ShotJournal:
     def note(self, shot: Shot) -> None:
         """Append one shot. Raises FlightError when it could not be written whole, or the journal is closed: then the
         camera must not be fired."""
-        line = json.dumps(asdict(shot), sort_keys=True, separators=(",", ":")).encode() + b"\n"
+        line = canonical(shot) + b"\n"
         with self._lock:
             line = b"\n" + line if self._torn else line
             written = self._file.append(line, f"note shot {shot.index} in")

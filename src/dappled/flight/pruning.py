@@ -7,17 +7,16 @@ an event. Both are durable before the first file is removed.
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
+from dappled.codec import canonical
 from dappled.findings import Code, Subject, finding, json_text
-from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
@@ -57,8 +56,8 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     if hashlib.sha256(data).hexdigest() not in [one.facts.get("sha256") for one in noted]:
         raise FlightError(f"{path} was changed: the ledger has no event with its SHA-256; use another copy of it")
     try:
-        rows = [Removed(**json.loads(line)) for line in data.decode().splitlines()]
-    except (ValueError, TypeError) as error:
+        rows = [codec.read_json(Removed, line) for line in data.splitlines()]
+    except codec.CodecError as error:
         raise FlightError(f"{path} can't be read: {error}") from error
     return {row.name: row for row in rows}
 
@@ -96,12 +95,7 @@ def note(
         name: Removed(name, one.identity.size, one.sha256, str(there), now)
         for name, one in {**elsewhere, **sure}.items()
     }
-    lines = [
-        canonical({"name": row.name, "size": row.size, "sha256": row.sha256, "destination": row.destination,
-                   "utc_ns": row.utc_ns}) + b"\n"
-        for _, row in sorted(rows.items())
-    ]  # fmt: skip
-    data = b"".join(lines)
+    data = b"".join(canonical(row) + b"\n" for _, row in sorted(rows.items()))
     sha256 = hashlib.sha256(data).hexdigest()
     names = sorted(sure)
     which = names[0] if len(names) == 1 else f"{names[0]} to {names[-1]}"

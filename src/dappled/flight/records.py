@@ -9,9 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from functools import cached_property
 from typing import Any, Literal
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.decode.geometry import Pose
 from dappled.findings import Finding
 
@@ -117,7 +118,7 @@ class ShotRow:
     fired_returned_monotonic_ns: int | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Result:
     """The result of decoding a frame. `run` is "live" for the flight itself; later runs have names of their own.
 
@@ -135,13 +136,17 @@ class Result:
     run: str = "live"
     details: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
+    def __post_init__(self) -> None:
+        """Raises CodecError for a verdict with other reasons than findings."""
+        self.verdict  # noqa: B018  kept
+
+    @cached_property
     def verdict(self) -> tuple[str, tuple[Finding, ...]] | None:
         """How the frame was judged in flight, and why; None where it was not."""
         found = self.details.get("verdict")
         if not isinstance(found, Mapping) or not isinstance(found.get("reasons"), list):
             return None
-        return str(found.get("state")), findings.from_rows(found["reasons"])
+        return str(found.get("state")), codec.read(tuple[Finding, ...], found["reasons"])
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,15 +11,15 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from dappled import durable, file_lock
+from dappled import codec, durable, file_lock
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
+from dappled.codec import canonical
 from dappled.flight import layout, pruning
-from dappled.flight.chain import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
@@ -56,11 +56,11 @@ class Seal:
 
     def signed_part(self) -> bytes:
         """What `mac` covers."""
-        return canonical({name: value for name, value in asdict(self).items() if name != _MAC})
+        return canonical({name: value for name, value in codec.plain(self).items() if name != _MAC})
 
     def line(self) -> bytes:
         """As it stands in the file, with a digest of itself."""
-        values = asdict(self)
+        values = codec.plain(self)
         return canonical({**values, _DIGEST: hashlib.sha256(canonical(values)).hexdigest()})
 
 
@@ -318,11 +318,10 @@ def _parse(line: bytes) -> Seal | None:
     try:
         values = json.loads(line)
         del values[_DIGEST]
-        found = Seal(**{**values, "files": {name: (size, sha256) for name, (size, sha256) in values["files"].items()}})
-        whole = type(found.seal) is int and type(found.links) is int and found.line() == line
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        found = codec.read(Seal, values)
+    except (ValueError, TypeError, KeyError, RecursionError):
         return None
-    return found if whole else None
+    return found if found.line() == line else None
 
 
 def _content(folder: FlightFolder) -> bytes:

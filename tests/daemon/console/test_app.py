@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 import uvicorn
 
+from dappled import codec
 from dappled.daemon.console import feed as feeds
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
@@ -40,7 +41,7 @@ POSE = {
     "source": "interpolated", "utc_ns": 1, "latitude_deg": 41.6, "longitude_deg": -91.5, "altitude_msl_m": 223.0,
     "height_above_home_m": 20.0, "attitude": [1.0, 0.0, 0.0, 0.0], "position_sigma_m": 0.1, "attitude_sigma_deg": 1.0,
 }  # fmt: skip
-NO_ATTITUDE = {**finding(Code.POSITION_NO_ATTITUDE, Subject("vehicle")).to_json(), "age_s": 7.0}
+NO_ATTITUDE = {**codec.plain(finding(Code.POSITION_NO_ATTITUDE, Subject("vehicle"))), "age_s": 7.0}
 HEALTH = {
     "utc_ns": 1_800_000_000_000_000_000, "camera": {"state": "ready", "reason": ""},
     "link": {"urls": 1, "silent": 0, "packets": 5, "positions": 5}, "disk": {"free_bytes": 10**11, "folder": "/x"},
@@ -218,7 +219,9 @@ def test_frames_close_the_holes_of_the_planned_area_and_a_bad_one_opens_them_aga
 
         eventually(decoded, "the area is seen")
         judged = {
-            "last": [{"frame": 0, "state": "bad", "reasons": [finding(Code.FRAME_DARK, FRAME, share=0.01).to_json()]}]
+            "last": [
+                {"frame": 0, "state": "bad", "reasons": [codec.plain(finding(Code.FRAME_DARK, FRAME, share=0.01))]}
+            ]
         }
         decode = {"mask": "m", "calibration": "c", "running": True, "judged": judged}
         rig.publisher.publish("health", {**HEALTH, "decode": decode})

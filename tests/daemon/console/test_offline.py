@@ -12,6 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
+from dappled import codec
 from dappled.clock import RecordedClock
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
@@ -149,7 +150,7 @@ def flight(tmp_path: Path) -> Path:
         frame = deliver(begun, index, b"raw", f"IMG_{index}.CR2")
         if index < 2:
             begun.ledger.add_tag(tag(frame))
-    verdict = {"verdict": {"state": "usable", "reasons": [BLACK.to_json()]}}
+    verdict = {"verdict": {"state": "usable", "reasons": [codec.plain(BLACK)]}}
     begun.ledger.add_result(Result(1, "00", 24, 24, "law", "calibrated", details=verdict))
     begun.close()
     return begun.folder.path

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from dappled import codec
 from dappled.cli import status
 from dappled.config.settings import RecordSettings
 from dappled.daemon.body_plan import BodyReport
@@ -73,7 +74,7 @@ def test_a_fault_is_the_same_code_on_every_face_and_says_what_to_do(tmp_path: Pa
         "NO-GO" if found.level is Level.STOP else "CAUTION",
         f"{found.level.word:9} {told(found)}",
     ]
-    ((said, severity),) = Alarms().lines({"findings": [{**found.to_json(), "age_s": 60.0}]})
+    ((said, severity),) = Alarms().lines({"findings": [{**codec.plain(found), "age_s": 60.0}]})
     assert (said, severity <= mavlink.MAV_SEVERITY_WARNING) == (told(found), True)
     assert f'dappled_finding{{code="{code}"}} {float(found.level)}' in metrics.text(made).decode()
     assert told(found) in health.line(made)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from dappled import codec
 from dappled.daemon.health.status_text import AGAIN_NS, AWAY_NS, PIECE_BYTES, Alarms, GroundStations, PilotMessages
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.findings import Code, Finding, Level, Subject, finding, told
@@ -16,7 +17,7 @@ def disk(left_mb: int) -> Finding:
 
 
 def health(*found: Finding, age_s: float = 60.0) -> dict[str, Any]:
-    return {"findings": [{**one.to_json(), "age_s": age_s} for one in found]}
+    return {"findings": [{**codec.plain(one), "age_s": age_s} for one in found]}
 
 
 def test_a_finding_is_told_once_though_its_numbers_change_and_its_end_too() -> None:

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.config.settings import DecodeSettings, MaskSettings, Settings
 from dappled.daemon.health import record as health
 from dappled.daemon.health.record import DecodingState
@@ -435,7 +435,9 @@ def test_a_shot_in_doubt_teaches_no_time(tmp_path: Path, doubt: Finding | None, 
     taken = time.strftime("%Y:%m:%d %H:%M:%S", time.gmtime())
 
     def script(shot: int) -> list[CameraEvent | Exception]:
-        came = replace(arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": doubt.to_json()} if doubt else {})
+        came = replace(
+            arrival(shot, jpeg_at(10.0, taken), "A.JPG"), facts={"doubt": codec.plain(doubt)} if doubt else {}
+        )
         return [fired(shot), came] if shot < 3 else [came]
 
     with rig(tmp_path, script) as one:
@@ -488,10 +490,10 @@ def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_pa
         pending = one.ended(0)
         row = one.flight.ledger.result(0)
         assert row is not None
-        assert row.details["doubts"] == [DOUBT.to_json()]
+        assert row.details["doubts"] == [codec.plain(DOUBT)]
         assert pending.tag is not None
         assert pending.decoded is not None
-        assert wire.slices_header(pending.tag, pending.decoded)["doubts"] == [DOUBT.to_json()]
+        assert wire.slices_header(pending.tag, pending.decoded)["doubts"] == [codec.plain(DOUBT)]
         assert any(text(DOUBT) in words for words in judged(one))
         one.decoder.doubts = ()
         one.request(2)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled import codec
 from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
@@ -98,7 +99,7 @@ def test_what_was_told_of_a_shot_in_flight_is_no_difference(tmp_path: Path) -> N
         (_, arrival) = good(shot)
         assert isinstance(arrival, Arrival)
         rival = finding(Code.FRAME_RIVAL_PICTURE, Subject("frame", 0), picture="IMG_0007.CR2")
-        return [dataclasses.replace(arrival, facts={"doubt": LATE.to_json()}), Noticed(rival, 5)]
+        return [dataclasses.replace(arrival, facts={"doubt": codec.plain(LATE)}), Noticed(rival, 5)]
 
     with rig(tmp_path, untold) as one:
         one.request(0)

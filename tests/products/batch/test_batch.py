@@ -18,7 +18,7 @@ from typing import Any
 
 import pytest
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.cli import main
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
@@ -240,7 +240,7 @@ def test_what_one_form_refuses_the_others_keep(
     rows = [json.loads(line) for line in said.out.splitlines()]
     assert [sorted(row["refused"]) for row in rows] == [["stac"], [], ["stac"], []]
     assert [len(row["files"]) for row in rows] == [2, 3, 2, 3]
-    assert [row["doubts"] for row in rows] == [[CLIPPED.to_json()]] * 4
+    assert [row["doubts"] for row in rows] == [[codec.plain(CLIPPED)]] * 4
 
 
 def test_files_of_other_positions_are_made_again(

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import zarr
 
+from dappled import codec
 from dappled.decode.lightfield.light_field import LightField
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, finding
@@ -250,7 +251,7 @@ def test_the_pages_programs_read_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = (Path(__file__).parents[3] / "docs" / "lightfield.md").read_text(encoding="utf-8")
-    said = {**ATTRIBUTES, "doubts": [finding(Code.MASK_TURNED, FRAME, by_deg=0.1).to_json()]}
+    said = {**ATTRIBUTES, "doubts": [codec.plain(finding(Code.MASK_TURNED, FRAME, by_deg=0.1))]}
     carriers = np.array([[0, 0, 0, 0], [0, 1, 0, 0.1], [1, 0, 0.1, 0], [1, 1, 0.1, 0.1], [1, -1, 0.1, -0.1]])
     one = replace(light_field(), carriers=carriers, slices=np.ones((5, 4, 6), dtype=np.complex64), attributes=said)
     save(tmp_path / "frame.npz", one)

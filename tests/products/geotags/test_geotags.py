@@ -24,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Gnss, Pose, camera_pose, from_euler
@@ -189,7 +189,7 @@ def test_a_doubt_that_came_after_the_tag_is_in_the_sidecar_and_decides_the_exit_
     assert main(["geotag", str(flight), "--vehicle", "1"]) == 1
     (sidecar,) = (flight / "frames").glob("*.xmp")
     (told,) = re.findall(r"dappled:Doubts='([^']*)'", sidecar.read_text())
-    assert json.loads(html.unescape(told)) == [doubt.to_json()]
+    assert json.loads(html.unescape(told)) == [codec.plain(doubt)]
     assert main(["geotag", str(flight), "--vehicle", "1", "--anyway"]) == 0
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from dappled import codec
 from dappled.cli import main
 from dappled.clock import SystemClock
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
@@ -379,7 +380,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
         details = {
             "verdict": {
                 "state": state,
-                "reasons": [finding(Code.FRAME_DARK, FRAME, share=0.01).to_json()] * (state == "bad"),
+                "reasons": [codec.plain(finding(Code.FRAME_DARK, FRAME, share=0.01))] * (state == "bad"),
                 "facts": {},
             }
         }

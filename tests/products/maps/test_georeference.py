@@ -16,7 +16,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
@@ -62,7 +62,7 @@ def test_maps_of_light_fields_in_doubt_say_so(
         made = decode(*given, **named)
         attributes = {
             **made.light_field.attributes,
-            "doubts": [finding(Code.FRAME_CLIPPED, FRAME, share=0.03).to_json()],
+            "doubts": [codec.plain(finding(Code.FRAME_CLIPPED, FRAME, share=0.03))],
         }
         return replace(made, light_field=replace(made.light_field, attributes=attributes))
 

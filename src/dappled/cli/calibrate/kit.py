@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dappled import codec
 from dappled.cli.calibrate.frames import Given, fit_views, view_of, views_of
 from dappled.cli.frame_arguments import frames
 from dappled.cli.mask.kit import KIT
@@ -22,7 +23,7 @@ from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.raw_file import exposure
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, to_rows
+from dappled.findings import Code, Finding, Level, Subject, finding
 
 BARE = Subject("bare frames")
 _MASKS = ("diagonal", "full")
@@ -289,7 +290,7 @@ def _values(
             "print_scale_sigma": None if fit is None else fit.print_scale_sigma,
             "pupil_mm": None if fit is None else fit.pupil_mm,
             "rotation_rad": None if found is None else float(np.mean([length.rotation_rad for length in found.fits])),
-            "verdict": None if found is None or found.verdict is None else found.verdict.to_json(),
+            "verdict": codec.plain(found and found.verdict),
         }
 
     return {
@@ -297,7 +298,7 @@ def _values(
         "masks": {name: of(one) for name, one in results.items()},
         "bare_clean": bare,
         "agree": agree,
-        "doubts": to_rows(doubts),
+        "doubts": codec.plain(doubts),
     }
 
 

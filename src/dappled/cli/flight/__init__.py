@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
-from dappled import findings
+from dappled import codec
 from dappled.cli import sealing
 from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
@@ -32,7 +30,7 @@ class ListFlights(SettingsArgument, Verb):
         found = flight_report.list_flights(folder)
         if not found and not self.json:
             output.remark(f"no flights in {folder}")
-        return Report([_plain(one) for one in found], [flight_lines.of_list(one) for one in found])
+        return Report([codec.plain(one) for one in found], [flight_lines.of_list(one) for one in found])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +42,8 @@ class ShowFlight(FlightArgument, Verb):
     def run(self, output: Output) -> Report:
         """See Verb."""
         found = flight_report.show(self.chosen(output))
-        events = [
-            {**_plain(one), "text": one.words, "finding": one.finding and one.finding.to_json()} for one in found.events
-        ]
-        return Report({**_plain(found), "events": events}, list(flight_lines.of_flight(found)))
+        events = [{**codec.plain(one), "text": one.words, "finding": codec.plain(one.finding)} for one in found.events]
+        return Report({**codec.plain(found), "events": events}, list(flight_lines.of_flight(found)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,7 +84,7 @@ class SealFlight(FlightArgument, Verb):
 
 def _of_check(found: CheckReport, *, signed: bool) -> Report:
     """A report that has failed where the flight isn't intact, or is to be `signed` and isn't."""
-    values = {**_plain(found), "intact": found.intact}
+    values = {**codec.plain(found), "intact": found.intact}
     good = found.intact and (not signed or found.vouched == "signed")
     return Report(values, list(flight_lines.of_check(found)), failed=not good)
 
@@ -109,7 +105,7 @@ class ReportFlight(FlightArgument, Verb):
         flight = self.chosen(output)
         found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
         sources = [asdict(one) for one in by_source]
-        values = {**_plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
+        values = {**codec.plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
         agree = found.balanced and found.wishes > 0 and not found.doubts
         said = [*flight_lines.of_report(found, by_source)]
         if self.log:
@@ -147,7 +143,7 @@ class OffloadFlight(FlightArgument, Verb):
                 key=sealing.key_of(self.config),
                 progress=add,
             )
-        return Report(_plain(done), list(flight_lines.of_offload(done)))
+        return Report(codec.plain(done), list(flight_lines.of_offload(done)))
 
 
 CLASSES: dict[str, type[Verb]] = {
@@ -158,9 +154,3 @@ CLASSES: dict[str, type[Verb]] = {
     "flight seal": SealFlight,
     "flight offload": OffloadFlight,
 }
-
-
-def _plain(value: Any) -> dict[str, Any]:
-    """A record as JSON values, with paths as text."""
-    plain: dict[str, Any] = json.loads(json.dumps(findings.plain(value), default=str))
-    return plain

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled import codec
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.decode.geometry import area as areas
 from dappled.errors import counted
-from dappled.findings import to_rows, told
+from dappled.findings import told
 from dappled.products.maps import coverage, coverage_files
 from dappled.products.maps import refly as reflying
 
@@ -92,7 +93,7 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         values = {
             "flight": seen.flight,
             "frames": len(seen.eyes),
-            "left_out": to_rows(seen.left),
+            "left_out": codec.plain(seen.left),
             "ground": seen.ground.name,
             "cell_m": covered.grid.step_x,
             "area_m2": round(planned * covered.cell_m2, 1),

@@ -7,13 +7,13 @@ from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, option
 from dappled.drivers.gnss import recorded
 from dappled.drivers.gnss.ubx import RXM_RAWX, TIM_TM2, UbxStream
 from dappled.errors import counted
-from dappled.findings import Code, Finding, Subject, finding, to_rows
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import FlightError, disk_error, layout, log_reading
 
 
@@ -60,7 +60,7 @@ class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
         values = {"bytes": size, "messages": kinds.total(), "raw": kinds[RXM_RAWX], "marks": kinds[TIM_TM2]}
         size_mb = f"{size / 1e6:.2f} MB, {counted(kinds.total(), 'UBX message')}"
         line = f"{to}: {size_mb}, {kinds[RXM_RAWX]} of raw measurements, {kinds[TIM_TM2]} of time marks"
-        return Report({"file": str(to), **values, "doubts": to_rows(doubts)}, [line], findings=doubts)
+        return Report({"file": str(to), **values, "doubts": codec.plain(doubts)}, [line], findings=doubts)
 
 
 CLASSES = {"flight gnss": WriteReceiverStream}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.cli import sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
 from dappled.cli.verb import Doubtable, Output, Report, Verb, flag, option
@@ -100,8 +100,8 @@ def _values(flight: str, proposal: Proposal, picked: Picked | None) -> dict[str,
             }
             for index, group in proposal.pairs
         ],
-        "findings": [one.to_json() for one in findings.in_order(proposal.findings)],
-        "doubts": findings.to_rows(findings.in_order(proposal.doubts)),
+        "findings": [codec.plain(one) for one in findings.in_order(proposal.findings)],
+        "doubts": codec.plain(findings.in_order(proposal.doubts)),
         "missing": list(proposal.missing),
         "strangers": list(proposal.strangers),
         "there_already": proposal.there_already,

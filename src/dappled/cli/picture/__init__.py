@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled import durable, findings
+from dappled import codec, durable, findings
 from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
 from dappled.cli.picture import places
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, flag, option
@@ -83,7 +83,7 @@ def _facts(target: Path, made: MadePicture) -> dict[str, Any]:
         "dark_share": made.picture.dark_share,
         "soft_share": made.picture.soft_share,
         "trusted_share": float(made.picture.trusted.mean()),
-        "findings": [one.to_json() for one in findings.in_order(made.findings)],
+        "findings": [codec.plain(one) for one in findings.in_order(made.findings)],
     }
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import codec
 from dappled.daemon.console.requests import token
 from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
@@ -24,7 +25,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.subscriber import AsyncSubscriber
 from dappled.daemon.stream.wire import Message
 from dappled.errors import DappledError, report
-from dappled.findings import FRAME, Finding, from_rows, named, remedy, told
+from dappled.findings import FRAME, Finding, named, remedy, told
 
 log = logging.getLogger(__name__)
 FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
@@ -272,7 +273,7 @@ class Feed:
             if seen is not None and seen.verdict is None:
                 seen.verdict = {
                     "state": one["state"],
-                    "reasons": [told(why, FRAME) for why in from_rows(one["reasons"])],
+                    "reasons": [told(why, FRAME) for why in codec.read(tuple[Finding, ...], one["reasons"])],
                 }
                 self._count(one["frame"], seen)
                 self.hub.send(self.frame_event(one["frame"]))
@@ -342,7 +343,7 @@ def _facts(message: Message) -> dict[str, Any]:
     shape = header["arrays"][0]["shape"]
     return {
         "shape": shape,
-        "doubts": [told(one, FRAME) for one in from_rows(header.get("doubts") or ())],
+        "doubts": [told(one, FRAME) for one in codec.read(tuple[Finding, ...], header.get("doubts") or ())],
         **{
             name: header.get(name)
             for name in (

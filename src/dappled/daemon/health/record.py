@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.config.settings import RecordSettings, Settings
 from dappled.daemon.body_plan import BodyReport
 from dappled.daemon.health import go_no_go
@@ -23,7 +24,7 @@ from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.daemon.vehicle_battery import VehicleBattery
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import LinkStatistics
-from dappled.findings import Code, Finding, Level, Subject, above_note, finding, to_rows, told
+from dappled.findings import Code, Finding, Level, Subject, above_note, finding, told
 from dappled.flight import FlightError, layout
 from dappled.workers import Statistics
 
@@ -44,7 +45,9 @@ class DecodingState:
     def judged(self) -> dict[str, Any]:
         """The verdicts, as JSON values."""
         counts = self.verdicts
-        last = [{"frame": frame, "state": state, "reasons": to_rows(reasons)} for frame, state, reasons in counts.last]
+        last = [
+            {"frame": frame, "state": state, "reasons": codec.plain(reasons)} for frame, state, reasons in counts.last
+        ]
         return {
             **{state: counts.by_state.get(state, 0) for state in STATES},
             "bad_in_a_row": counts.bad_in_a_row,

@@ -6,9 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dappled import codec
 from dappled.findings import WORDS, Code, Finding, Level, Subject, above_note, in_order
 
 ALL_IS_WELL = "all is well"
+_AGE = "age_s"  # beside a finding in the record
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +22,7 @@ class StandingFinding:
 
     def to_json(self, now_ns: int) -> dict[str, Any]:
         """As the health record has it, with its age."""
-        return {**self.finding.to_json(), "age_s": round((now_ns - self.began_ns) / 1e9, 1)}
+        return {**codec.plain(self.finding), _AGE: round((now_ns - self.began_ns) / 1e9, 1)}
 
 
 class StandingFindings:
@@ -44,13 +46,14 @@ class StandingFindings:
 
 def in_record(health: Mapping[str, Any]) -> list[Finding]:
     """The findings of a health record, in their order."""
-    return [Finding.from_json(row) for row in health["findings"]]
+    rows = ({name: one for name, one in row.items() if name != _AGE} for row in health["findings"])
+    return [codec.read(Finding, row) for row in rows]
 
 
 def unasked(health: Mapping[str, Any]) -> list[Finding]:
     """Those of a health record that a person is told without asking: what usually ends by itself may settle first."""
     rows = zip(in_record(health), health["findings"], strict=True)
-    return [one for one, row in rows if row["age_s"] >= WORDS[one.code].settles_s]
+    return [one for one, row in rows if row[_AGE] >= WORDS[one.code].settles_s]
 
 
 class NewFindings:

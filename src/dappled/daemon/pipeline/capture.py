@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.decode_process import DecodedFrame
@@ -415,7 +415,7 @@ class Capture:
             return
         pending = self._ends.safe(pending, frame, arrival.name)
         if doubt := arrival.facts.get("doubt"):
-            pending.doubt = Finding.from_json(doubt)
+            pending.doubt = codec.read(Finding, doubt)
             self._ends.note(DOUBT, findings.json_text(pending.doubt), frame.index)
         if pending.fired:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
 
-from dappled import findings
+from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.drivers.child_process import (
@@ -79,7 +79,7 @@ class DecodedFrame:
         """The row of the ledger; `judged` are the values of the frame's verdict."""
         details: dict[str, Any] = {"ms": dict(self.ms)}
         if self.doubts:
-            details["doubts"] = findings.to_rows(self.doubts)
+            details["doubts"] = codec.plain(self.doubts)
         if self.fingerprint is not None:
             details["fingerprint"] = dict(self.fingerprint)
         if judged is not None:
@@ -200,7 +200,7 @@ class DecodeProcess:
             depth["grid"],
             depth["law"],
             pair,
-            findings.from_rows(depth["doubts"]),
+            codec.read(tuple[Finding, ...], depth["doubts"]),
         )
 
     def close(self) -> None:
@@ -296,7 +296,7 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
         preview_size=(facts["preview_size"][0], facts["preview_size"][1]),
         ms=facts["ms"],
         seen=facts["seen"],
-        doubts=findings.from_rows(facts["doubts"]),
+        doubts=codec.read(tuple[Finding, ...], facts["doubts"]),
         decision=None if facts["decision"] is None else LawDecision.of_values(facts["decision"]),
         fingerprint=facts["fingerprint"],
         picture=_picture(facts["picture"]),

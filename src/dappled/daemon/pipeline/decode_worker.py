@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled import findings
+from dappled import codec
 from dappled.config.profiles import VerdictBounds
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
 from dappled.daemon.pipeline.verdicts import PictureFacts, detail, noise_of
@@ -124,7 +124,7 @@ class DecodeWorker:
             "law": field.attributes["law"],
             "grid": field.grid.tolist(),
             "seen": _seen(done),
-            "doubts": findings.to_rows(doubts),
+            "doubts": codec.plain(doubts),
             "preview_size": list(size),
             "picture": None if picture is None else asdict(picture),
             "ms": ms,
@@ -266,7 +266,7 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         "range_px": [float(edge) for edge in np.quantile(known, [0.02, 0.98])] if known.size else None,
         "grid": field.grid.tolist(),
         "law": field.attributes["law"],
-        "doubts": findings.to_rows(done.doubts),
+        "doubts": codec.plain(done.doubts),
     }
     return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
 

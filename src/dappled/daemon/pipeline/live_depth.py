@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from dappled import findings
+from dappled import codec
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import FrameDepth
@@ -88,7 +88,7 @@ class LiveDepth:
             "range_px": found.range_px,
             "grid": found.grid,
             "arrays": found.arrays,
-            "doubts": findings.to_rows(found.doubts),
+            "doubts": codec.plain(found.doubts),
         }
         self._publisher.publish("depth", header, found.body)
         if found.nearest_m is not None and self._nearest is not None:

@@ -12,10 +12,11 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import codec
 from dappled.config.profiles import VerdictBounds
 from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
-from dappled.findings import FRAME, Code, Finding, Level, Subject, Value, finding, plain, text, to_rows, told
+from dappled.findings import FRAME, Code, Finding, Level, Subject, Value, finding, text, told
 from dappled.flight import Tag
 
 VerdictState = Literal["good", "usable", "bad", "unknown"]
@@ -116,9 +117,9 @@ class Verdict:
 
     def values(self) -> dict[str, Any]:
         """As ledger and stream have it."""
-        facts = {} if self.facts is None else plain(self.facts)
+        facts = {} if self.facts is None else codec.plain(self.facts)
         numbers = {name: _plain(one) for name, one in facts.items()}
-        return {"state": self.state, "reasons": to_rows(self.reasons), "facts": numbers}
+        return {"state": self.state, "reasons": codec.plain(self.reasons), "facts": numbers}
 
 
 def _plain(value: Any) -> Any:

@@ -12,7 +12,7 @@ from pathlib import Path
 from time import sleep
 from typing import Self
 
-from dappled import __version__, confined, durable, picture_order
+from dappled import __version__, codec, confined, durable, picture_order
 from dappled.clock import RecordedClock, TimeOfDayClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
@@ -400,7 +400,7 @@ def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: Findin
     if frame is None:
         return RecordedShot(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
-    facts = {} if doubt is None else {"doubt": doubt.to_json()}
+    facts = {} if doubt is None else {"doubt": codec.plain(doubt)}
     return RecordedShot(row.shot.index, folder.file(frame.name), frame.camera_name, fired, arrived_ns, facts=facts)
 
 

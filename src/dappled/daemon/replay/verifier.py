@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.decode.lightfield.light_field import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
-from dappled.findings import plain
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
 MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platform does to slices, with room
@@ -116,8 +115,8 @@ class ReplayVerifier:
         """See FlightWriter."""
         one = self._expected[tag.index]
         self._tags[tag.index] = tag
-        recorded = None if one.tag is None else plain(one.tag)
-        found = plain(tag)
+        recorded = codec.plain(one.tag)
+        found = codec.plain(tag)
         near = recorded is not None and _near(recorded["pose"], found["pose"])
         self._compare(tag.index, "pose", (one.pose_sha256, digest(tag.pose)), near=near)
         near = recorded is not None and _near(recorded, found)

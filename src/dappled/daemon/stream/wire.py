@@ -16,7 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import __version__, findings
+from dappled import __version__, codec
 from dappled.bounds import claims
 from dappled.bounds.parsing import parse_json
 from dappled.config.settings import PublishSettings
@@ -136,7 +136,7 @@ def slices_header(tag: Tag, decoded: DecodedSlices) -> dict[str, object]:
         "carriers_found": decoded.carriers_found,
         "grid": decoded.grid,
         **decoded.seen,
-        "doubts": findings.to_rows(decoded.doubts),
+        "doubts": codec.plain(decoded.doubts),
         "slices_sha256": decoded.sha256,
         "arrays": decoded.arrays,
     }
@@ -148,7 +148,7 @@ def frame_header(tag: Tag, frame: Frame, law: str | None) -> dict[str, object]:
         **frame_facts(tag, law),
         "utc_sigma_ns": tag.utc_sigma_ns,
         "time_source": tag.time_source,
-        "time_doubts": findings.to_rows(tag.doubts),
+        "time_doubts": codec.plain(tag.doubts),
         "exposure_s": tag.exposure_s,
         "iso": tag.iso,
         "name": frame.name,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import findings
+from dappled import codec
 from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
@@ -180,10 +180,10 @@ class Calibration:
             "shape": list(self.shape),
             "law": self.law,
             "pupil_mm": self.pupil_mm,
-            **({"verdict": self.verdict.to_json()} if self.verdict is not None else {}),
+            **({"verdict": codec.plain(self.verdict)} if self.verdict is not None else {}),
             **({"swept": _swept_values(self.swept)} if self.swept is not None else {}),
             "focal_sigma_mm": self.focal_sigma_mm,
-            "overridden": findings.to_rows(self.overridden),
+            "overridden": codec.plain(self.overridden),
             "mask": {
                 "frequency_per_mm": self.mask.frequency_per_mm,
                 "p": self.mask.p,
@@ -234,10 +234,10 @@ class Calibration:
                 for entry in values["fits"]
             )
             law, pupil = values["law"], float(values.get("pupil_mm", 0.0))
-            verdict = Finding.from_json(values["verdict"]) if "verdict" in values else None
+            verdict = codec.read(Finding, values["verdict"]) if "verdict" in values else None
             swept = _swept_of(values["swept"]) if "swept" in values else None
             focal_sigma = float(values.get("focal_sigma_mm", 0.0))
-            overridden = findings.from_rows(values.get("overridden", ()))
+            overridden = codec.read(tuple[Finding, ...], values.get("overridden", ()))
             known_law = law in LAWS
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise DecodeError(f"the calibration is incomplete or wrong ({error}): calibrate again") from error

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
+from dappled import codec
 from dappled.decode.calibration.calibration import Calibration, LatticeFit
 from dappled.decode.calibration.law_choice import LawFit, judge, steps_bins
 from dappled.decode.optics import LAWS, Carrier, MaskedOptics, Order
-from dappled.findings import text, to_rows
+from dappled.findings import text
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +79,8 @@ def as_values(found: Calibration, mask_distance_mm: float) -> dict[str, Any]:
     """All of it in plain values for JSON."""
     return {
         "law": found.law,
-        "verdict": None if found.verdict is None else found.verdict.to_json(),
-        "doubts": to_rows(found.doubts),
+        "verdict": codec.plain(found.verdict),
+        "doubts": codec.plain(found.doubts),
         "laws": [
             {
                 "law": fit.law,

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import findings
+from dappled import codec
 from dappled.decode.errors import DecodeError
 from dappled.findings import Finding
 
@@ -49,7 +49,7 @@ class LightField:
     @property
     def doubts(self) -> tuple[Finding, ...]:
         """What may be wrong with it; the attribute `doubts` has them as JSON."""
-        return findings.from_rows(self.attributes.get("doubts") or ())
+        return codec.read(tuple[Finding, ...], self.attributes.get("doubts") or ())
 
 
 @dataclass(frozen=True, slots=True, eq=False)

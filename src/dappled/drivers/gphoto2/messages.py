@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from dappled import codec
 from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
@@ -140,7 +141,7 @@ def event_message(event: CameraEvent) -> ChannelMessage:
             kind = "failed" if isinstance(event, ShotFailed) else "deferred"
             return ChannelMessage({"is": kind, "shot": shot, "reason": reason, "ns": at_ns})
         case Noticed(found, at_ns):
-            return ChannelMessage({"is": "noticed", "finding": found.to_json(), "ns": at_ns})
+            return ChannelMessage({"is": "noticed", "finding": codec.plain(found), "ns": at_ns})
         case SettingsChanged(settings, at_ns, refused):
             each = [asdict(one) for one in settings]
             return ChannelMessage({"is": "settings", "settings": each, "ns": at_ns, "refused": refused})
@@ -189,7 +190,7 @@ def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> CameraEvent:
             read = tuple(Setting(each["name"], each["value"], tuple(each["choices"])) for each in body["settings"])
             return SettingsChanged(read, body["ns"], body["refused"])
         case "noticed":
-            return Noticed(Finding.from_json(body["finding"]), body["ns"])
+            return Noticed(codec.read(Finding, body["finding"]), body["ns"])
         case "arrival" | "companion" as kind:
             (fd,) = fds
             made = Arrival if kind == "arrival" else Companion

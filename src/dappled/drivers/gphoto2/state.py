@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from dappled import picture_order
+from dappled import codec, picture_order
 from dappled.drivers.attribution import BodyClock, Claim, FileClue, FramedShot, attribute, rivals
 from dappled.drivers.camera import (
     Arrival,
@@ -395,7 +395,7 @@ class CameraState:
         self._late = deque(left, LATE_LIMIT)
         if found.shot is not None and found.doubt is None:
             self._card.made(file, found.shot, taken_s)
-        facts = {**arrival.facts, **({"doubt": found.doubt.to_json()} if found.doubt else {})}
+        facts = {**arrival.facts, **({"doubt": codec.plain(found.doubt)} if found.doubt else {})}
         facts["body_offsets_s"] = list(self._clock.offsets_s)
         return Arrival(found.shot, arrival.name, arrival.blob, arrival.monotonic_ns, facts)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import findings
+from dappled import codec
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode import DecodeError
@@ -266,7 +266,7 @@ class Darkroom:
             bent.append(vignetted)
         attributes["falloff"] = None if lost is None else [lost.lost, lost.sigma]
         made = DecodeResult(light_field, report, raw, exposed, ms, checked, doubts_of(decoder), tuple(bent))
-        attributes["doubts"] = findings.to_rows(made.doubts)
+        attributes["doubts"] = codec.plain(made.doubts)
         if self._checks and not made.observable:
             attributes["carriers_found"] = None
         return replace(made, light_field=replace(light_field, attributes=attributes))

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from dappled import durable, picture_order
+from dappled import codec, durable, picture_order
 from dappled.clock import Clock
 from dappled.drivers.attribution import BodyClock, Claim, FileClue, FramedShot, attribute, rivals
 from dappled.drivers.camera import Arrival, Blob, CameraError, Companion, Noticed, ShotFailed
@@ -248,7 +248,7 @@ class FileWatch:
         with self._lock:
             waiting = [one for one in self._claims if one.fired_ns > self._past_ns]
         made = attribute(clue, self._late, waiting, self._body_clock)
-        facts = {"doubt": made.doubt.to_json()} if made.doubt else {}
+        facts = {"doubt": codec.plain(made.doubt)} if made.doubt else {}
         if (yield from self._bring(made.shot, group, facts)):
             self._body_clock = made.clock
             framed = (one for one in (*self._late, *waiting) if one.shot == made.shot)

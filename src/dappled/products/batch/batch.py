@@ -20,12 +20,12 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
-from dappled import __version__, confined, durable, file_lock, findings
+from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError, sentence
-from dappled.findings import Finding, plain
-from dappled.flight import Frame, Tag, canonical
+from dappled.findings import Finding
+from dappled.flight import Frame, Tag
 from dappled.products.exports import light_files
 from dappled.products.extras import need
 from dappled.products.geotags.geotags import Placed
@@ -155,10 +155,10 @@ def plan(
         tag = tags.get(frame.index)
         utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
         said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
-                "tag": plain(tag)}  # fmt: skip
+                "tag": codec.plain(tag)}  # fmt: skip
         if frame.index in stations and stations[frame.index].camera.height_ellipsoid_m is not None:
             said["height_ellipsoid_m"] = stations[frame.index].camera.height_ellipsoid_m
-        key = hashlib.sha256(canonical(said)).hexdigest()
+        key = hashlib.sha256(codec.canonical(said)).hexdigest()
         jobs.append(
             Job(
                 str(flight.absolute()), frame, tag, stations.get(frame.index), reasons.get(frame.index, ""), level,
@@ -383,7 +383,7 @@ class Manifest:
         """Append a result, durably."""
         os.write(
             self._fd,
-            json.dumps(plain(done), sort_keys=True).encode() + b"\n",
+            json.dumps(codec.plain(done), sort_keys=True).encode() + b"\n",
         )
         os.fsync(self._fd)
         self._note(done)
@@ -433,7 +433,7 @@ class Manifest:
 def _done(row: dict[str, Any]) -> Done:
     """Raises ValueError, TypeError and KeyError."""
     outputs = tuple(BatchOutput(**one) for one in row["outputs"])
-    done = Done(**{**row, "outputs": outputs, "doubts": findings.from_rows(row.get("doubts", ()))})
+    done = Done(**{**row, "outputs": outputs, "doubts": codec.read(tuple[Finding, ...], row.get("doubts", ()))})
     if not all(isinstance(name, str) for name in (done.key, *(one.name for one in done.outputs))):
         raise TypeError("a name is not text")
     if not isinstance(done.refused, dict):

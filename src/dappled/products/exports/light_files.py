@@ -20,12 +20,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import confined, durable, findings
+from dappled import codec, confined, durable
 from dappled.bounds.arrays import read_npz
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError, first_line, install_extra
+from dappled.findings import Finding
 from dappled.products.exports import h5_reader, packed_arrays
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
@@ -153,7 +154,7 @@ def _check_attributes(path: Path, attributes: Any) -> None:
             what = "a text" if kind == (str,) else "a number"
             raise DappledError(f"{path}: its attribute {name} is not {what}; decode the frame again")
     try:
-        findings.from_rows(attributes.get("doubts") or [])
+        codec.read(tuple[Finding, ...], attributes.get("doubts") or [])
     except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise DappledError(f"{path}: its attribute doubts is not a list of findings; decode it again") from error
     shape = attributes.get("shape", [1, 1])

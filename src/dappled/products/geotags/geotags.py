@@ -12,10 +12,10 @@ from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
-from dappled.findings import Finding, Subject, to_rows
+from dappled.findings import Finding, Subject
 from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, layout
 from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.products.geotags import exif_gps, sidecars
@@ -246,7 +246,7 @@ def geojson(placed: Sequence[Placed]) -> str:
                     "index": one.frame.index,
                     "utc_ns": one.utc_ns,
                     "time_source": one.tag.time_source,
-                    "doubts": to_rows(one.tag.doubts),
+                    "doubts": codec.plain(one.tag.doubts),
                     "pose_source": one.tag.pose.source,
                     "altitude_msl_m": camera.altitude_msl_m,
                     "height_above_home_m": camera.height_above_home_m,

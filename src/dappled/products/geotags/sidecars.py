@@ -7,10 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
-from dappled.findings import to_rows
 from dappled.flight import Tag, disk_error
 
 _HEAD_BYTES = 1 << 16
@@ -75,7 +74,7 @@ def _of_tag(tag: Tag, utc_ns: int | None) -> dict[str, str | None]:
         "dappled:MidExposureUtcNs": None if utc_ns is None else str(utc_ns),
         "dappled:MidExposureSigmaNs": str(tag.utc_sigma_ns),
         "dappled:TimeSource": tag.time_source,
-        "dappled:Doubts": json.dumps(to_rows(tag.doubts)) if tag.doubts else None,
+        "dappled:Doubts": json.dumps(codec.plain(tag.doubts)) if tag.doubts else None,
         "dappled:PoseSource": pose.source,
         "dappled:VehicleAttitudeWxyz": None if pose.attitude is None else " ".join(f"{q:.9f}" for q in pose.attitude),
         "dappled:GimbalAttitudeWxyz": None

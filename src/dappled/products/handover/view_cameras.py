@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from dappled import findings
+from dappled import codec
 from dappled.bounds.parsing import parse_json
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import camera_pose
@@ -70,7 +70,7 @@ class FrameCameras:
 
     def encoded(self) -> bytes:
         """The record as JSON."""
-        return (json.dumps(findings.plain(self), indent=1, allow_nan=False) + "\n").encode()
+        return (json.dumps(codec.plain(self), indent=1, allow_nan=False) + "\n").encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,7 +180,7 @@ def decoded(data: bytes, where: str) -> FrameCameras:
         )
         rows, columns = row.pop("shape")
         turn, distortion = row.pop("camera_to_ned"), row.pop("distortion")
-        doubts = findings.from_rows(row.pop("doubts", ()))
+        doubts = codec.read(tuple[Finding, ...], row.pop("doubts", ()))
         made = FrameCameras(
             **row,
             camera_to_ned=tuple(map(float, turn)),

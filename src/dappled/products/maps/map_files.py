@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.decode.array_types import Floats
-from dappled.findings import to_rows
 from dappled.products.maps import cog, kmz, map_grid
 from dappled.products.maps.earth import GEODETIC, Projection
 from dappled.products.maps.georeference import Survey
@@ -107,7 +106,7 @@ def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
         "frames": [{"name": one.name, **made.facts.get(one.name, {})} for one in made.photographs],
         "left_out": [{"name": name, "why": why} for name, why in made.left],
         "notes": list(made.notes),
-        "doubts": to_rows(made.doubts),
+        "doubts": codec.plain(made.doubts),
         "lens": None if made.lens is None else made.lens.facts(),
         "files": [path.name for path in files],
     }

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from dappled import codec
 from dappled.config.profiles import Lens
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Subject, finding, to_rows
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.products.maps import lens_solution, matching
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.lens_solution import NAMES, LensSolution, Sightings
@@ -77,7 +78,7 @@ class FlightLens:
             "control_points": self.control,
             "scatter_px": self.solution.sigma_px,
             "scatter_before_px": self.solution.before_px,
-            "doubts": to_rows(self.doubts),
+            "doubts": codec.plain(self.doubts),
         }
 
 
