@@ -10,13 +10,24 @@ from typing import Any
 
 from dappled import codec
 from dappled.cli import sealing
-from dappled.cli.placing import Mounted
-from dappled.cli.verb import Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, of_setting, option
+from dappled.cli.placing import Mounted, check_geoid
+from dappled.cli.verb import (
+    CallError,
+    Doubtable,
+    Output,
+    Report,
+    SettingsArgument,
+    Verb,
+    argument,
+    flag,
+    of_setting,
+    option,
+)
 from dappled.clock import TimeOfDayClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.replay import late_tags
 from dappled.daemon.replay.vehicle_choice import VehicleError
-from dappled.decode.geometry import Vector3, camera_pose
+from dappled.decode.geometry import Vector3
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import Tag, layout, seals
@@ -85,13 +96,23 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         otherwise="the one that the flight followed",
     )  # fmt: skip
 
+    def check(self) -> None:
+        """See Verb."""
+        self.check_mounted()
+        check_geoid(self.geoid)
+        if self.mark_lever_arm is not None and self.pos is None:
+            raise CallError("--mark-lever-arm goes with --pos: leave it out, or give the positions of the marks")
+
     def run(self, output: Output) -> Report:
         """See Verb."""
         facts = layout.read_facts(layout.open_folder(self.flight))
         key = sealing.key_of(self.config)
         into_flight = self.output is None
-        tagged_late = _tag_late(self.flight, key, self.vehicle, output, into_flight=into_flight)
-        tags, found = self._vehicle()
+        try:
+            tagged_late = _tag_late(self.flight, key, self.vehicle, output, into_flight=into_flight)
+            tags, found = self._vehicle()
+        except VehicleError as error:
+            raise CallError(str(error)) from None
         mounting, geoid = self.mounting(facts), geoid_or_none(self.geoid, output)
         marked = None
         if self.pos:
@@ -147,10 +168,8 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         return Report(values, [words], findings=found)
 
     def mounting(self, facts: Mapping[str, Any]) -> Mounting:
-        """See Mounted. Raises DappledError for a wrong mount."""
+        """See Mounted."""
         made = super().mounting(facts)
-        if self.mount is not None:
-            camera_pose.mount(self.mount)
         return made if self.on_gimbal is None else replace(made, on_gimbal=self.on_gimbal)
 
     def _vehicle(self) -> tuple[dict[int, Tag] | None, list[Finding]]:
@@ -171,11 +190,11 @@ def _tag_late(
     flight: Path, key: SealKey | None, vehicle: int | None, output: Output, *, into_flight: bool
 ) -> list[int]:
     """Tag the frames that a crash left untagged. If that fails, print why, and go on with the others. Raises
-    LockHeldError, which no sidecar could be written under either."""
+    LockHeldError, which no sidecar could be written under either, and VehicleError where one was named."""
     try:
         added = late_tags.add_missing(flight, TimeOfDayClock(), key, vehicle)
     except DappledError as error:
-        if into_flight and isinstance(error, LockHeldError):
+        if (into_flight and isinstance(error, LockHeldError)) or (vehicle and isinstance(error, VehicleError)):
             raise
         output.remark(f"frames without a tag stay without one: {error}")
         return []

@@ -14,11 +14,12 @@ from dappled.cli.verb import CallError, Doubtable, Output, argument, flag, of_se
 from dappled.config import profiles
 from dappled.config.settings import PoseSettings
 from dappled.daemon.pipeline import recipes
-from dappled.decode.geometry import Vector3
+from dappled.decode.geometry import Vector3, camera_pose
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import layout
 from dappled.products.maps import earth, georeference
+from dappled.products.maps.earth import EarthError
 from dappled.products.maps.georeference import Options, Survey, Watch
 from dappled.products.maps.references import BaseMapError
 from dappled.products.mounting import Mounting
@@ -38,6 +39,15 @@ def numbers(text: str) -> frozenset[int]:
     return frozenset(found)
 
 
+def check_geoid(given: str | None) -> None:
+    """Refuse a grid that isn't there. Raises CallError."""
+    if given is not None:
+        try:
+            earth.geoid(given)
+        except EarthError as error:
+            raise CallError(f"--geoid: {error}") from None
+
+
 @dataclass(frozen=True, kw_only=True)
 class Mounted:
     """Where the camera sits, where it isn't as the flight has it."""
@@ -49,6 +59,14 @@ class Mounted:
     mount: Matrix9 | None = option(
         "--mount", of_setting(PoseSettings, "mount"), None, metavar="R", group="camera", otherwise="the flight's",
     )  # fmt: skip
+
+    def check_mounted(self) -> None:
+        """Refuse a mount that is no rotation. Raises CallError."""
+        if self.mount is not None:
+            try:
+                camera_pose.mount(self.mount)
+            except DappledError as error:
+                raise CallError(f"--mount: {error}") from None
 
     def mounting(self, facts: Mapping[str, Any]) -> Mounting:
         """The flight's mounting, with the values that the arguments replace."""
@@ -105,7 +123,9 @@ class Placing(Mounted):
     )  # fmt: skip
 
     def check_profiles(self) -> None:
-        """Refuse profiles that there are not. Raises ConfigError."""
+        """Refuse profiles that there are not, and what can't be a mount or a geoid. Raises ConfigError, CallError."""
+        self.check_mounted()
+        check_geoid(self.geoid)
         if self.camera:
             profiles.camera(self.camera)
         if self.mask and self.mask != profiles.LENSLET:

@@ -25,6 +25,7 @@ from dappled.daemon.replay import playback, replay, runs
 from dappled.daemon.replay.playback import FlownWith
 from dappled.daemon.replay.replay import ReplayError, ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
+from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import counted
@@ -193,14 +194,19 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
     def _recording(self) -> replay.RecordedFlight:
         if self._is_flight:
             return replay.of_flight(self.flight, (self.verify and self.run_name) or LIVE)
-        return replay.of_folder(
-            self.flight,
-            self.match or "*",
-            telemetry=self.telemetry,
-            start_utc_ns=self.start,
-            interval_s=1.0 if self.interval is None else self.interval,
-            vehicle=self.vehicle,
-        )
+        try:
+            return replay.of_folder(
+                self.flight,
+                self.match or "*",
+                telemetry=self.telemetry,
+                start_utc_ns=self.start,
+                interval_s=1.0 if self.interval is None else self.interval,
+                vehicle=self.vehicle,
+            )
+        except VehicleError as error:
+            if self.vehicle is None:
+                raise
+            raise CallError(str(error)) from None
 
     def _as_recorded(self, facts: Mapping[str, Any], recipe: Recipe | None) -> FlownWith:
         """Names, body latency and settings of the flight. The frames of a folder begin to expose at their times."""

@@ -133,8 +133,29 @@ def test_a_renamed_copy_is_there_already_and_no_other_shot_s(tmp_path: Path, cap
     (card / "DSCF0001.RAF").rename(card / "COPY.RAF")
     assert flight.pickup(card) == 1
     assert "0 frames brought, 1 already there, 1 missing" in capfd.readouterr().out
-    assert flight.pickup(card, "--pair", "1=COPY.RAF") == 1
+    assert flight.pickup(card, "--pair", "1=COPY.RAF") == 2
     assert "its bytes are the frame of shot 0 already" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--pair", "0=A.RAF", "--pair", "1=A.RAF"], "the same file is named for shot 0"),
+        (["--pair", "0=A.RAF", "--pair", "0=B.RAF"], "2 files are named for shot 0"),
+        (["--pair", "9=A.RAF"], "shot 9 is not in the flight"),
+        (["--pair", "0=C.RAF"], "0 new files have this name"),
+        (["--by-order"], "needs as many files as shots: 3 shots, 2 files"),
+        (["--from", "none"], "there is no such folder"),
+    ],
+)
+def test_a_choice_that_contradicts_the_flight_is_a_wrong_call(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    flight = Landed(tmp_path, [0, 7, 19])
+    card = flight.card("card", {"A.RAF": None, "B.RAF": None})
+    assert flight.pickup(card, *words) == 2
+    assert said in capfd.readouterr().err.splitlines()[-1]
+    assert flight.frames() == {}
 
 
 def test_a_clock_that_was_set_between_two_cards_is_a_doubt_of_each_frame(

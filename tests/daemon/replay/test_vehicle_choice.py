@@ -54,7 +54,7 @@ def test_of_two_vehicles_that_nothing_tells_apart_none_is_taken(
     for vehicle in (1, 2):
         assert main(["replay", str(frames), "--telemetry", str(log), "--vehicle", str(vehicle), "--json"]) == 0
         assert north_deg(capsys) == vehicle * 10.0
-    assert main(["replay", str(frames), "--telemetry", str(log), "--vehicle", "3"]) == 1
+    assert main(["replay", str(frames), "--telemetry", str(log), "--vehicle", "3"]) == 2
     assert "no positions of vehicle 3: it holds vehicles 1 and 2" in capsys.readouterr().err
 
 
@@ -80,7 +80,7 @@ def test_evidence_says_which_vehicle_counts(
 
 
 def test_a_vehicle_can_t_be_chosen_without_telemetry(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["replay", str(frames), "--vehicle", "2"]) == 1
+    assert main(["replay", str(frames), "--vehicle", "2"]) == 2
     assert "there is no telemetry; leave it out" in capsys.readouterr().err
 
 

@@ -208,17 +208,36 @@ def test_the_vehicle_is_chosen_where_the_flight_never_knew_whose_the_camera_was(
     for vehicle in (2, 1):
         assert main(["geotag", str(flight), "--vehicle", str(vehicle)]) == 0
         assert tagged_north(flight) == pytest.approx(10.0 * vehicle)
-    assert main(["geotag", str(flight), "--vehicle", "9"]) == 1
+    assert main(["geotag", str(flight), "--vehicle", "9"]) == 2
     assert "it holds vehicles 1 and 2" in capsys.readouterr().err
 
 
 def test_a_vehicle_can_t_be_chosen_without_its_telemetry(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = flown_by_two(tmp_path)
     (flight / "telemetry.tlog").unlink()
-    assert main(["geotag", str(flight), "--vehicle", "2"]) == 1
+    assert main(["geotag", str(flight), "--vehicle", "2"]) == 2
     assert "no positions of vehicle 2: leave out --vehicle" in capsys.readouterr().err
     assert not (flight / "geotags").exists()
     assert main(["geotag", str(flight)]) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--mark-lever-arm", "0", "0", "1"], "goes with --pos"),
+        (["--mount", *"110010001"], "is not a rotation"),
+        (["--vehicle", "7"], "no positions of vehicle 7"),
+    ],
+)
+def test_a_wrong_call_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], said: str
+) -> None:
+    flight = flown_by_two(tmp_path)
+    assert main(["geotag", str(flight), *words]) == 2
+    told = capsys.readouterr().err
+    assert said in told.splitlines()[-1]
+    assert "usage: dappled geotag" in told
+    assert not (flight / "geotags").exists()
 
 
 def test_the_vehicle_that_reports_a_camera_is_taken_and_told(
@@ -531,7 +550,7 @@ def test_the_command_makes_copies_and_says_what_it_could_not(
     assert "no copy of frames/000000.cr2: it is not a TIFF-like raw" in said.err
     assert main(["geotag", str(flight), "--copies", str(flight / "frames")]) == 1
     assert "into the flight itself" in capsys.readouterr().err
-    assert main(["geotag", str(flight), "--geoid", str(tmp_path / "none.gtx")]) == 1
+    assert main(["geotag", str(flight), "--geoid", str(tmp_path / "none.gtx")]) == 2
     assert "there is no geoid grid" in capsys.readouterr().err
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from typing import Any
 
 from dappled import codec, findings
 from dappled.cli import sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
-from dappled.cli.verb import Doubtable, Output, Report, Verb, flag, option
+from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, flag, option
 from dappled.clock import TimeOfDayClock
 from dappled.daemon.replay import pickup
 from dappled.daemon.replay.pickup import Choice, Picked, Proposal
 from dappled.drivers.wired.ptp_source import PtpSource
-from dappled.drivers.wired.sources import parse_source
+from dappled.drivers.wired.sources import FolderSource, parse_source
 from dappled.errors import counted
 
 
@@ -41,6 +42,15 @@ class PickUpFiles(Doubtable, FlightArgument, Verb):
         "--pair", "this file belongs to this shot", (), append=True, parse=_pair, metavar="INDEX=NAME",
     )  # fmt: skip
     dry_run: bool = flag("--dry-run", "only say what would be done")
+
+    def check(self) -> None:
+        """See Verb."""
+        source = parse_source(self.source, PtpSource)
+        if isinstance(source, FolderSource) and not source.removable and not source.folder.is_dir():
+            raise CallError(f"--from {self.source}: there is no such folder; check the path, or mount the card")
+        for index, count in Counter(index for index, _ in self.pair).items():
+            if count > 1:
+                raise CallError(f"--pair {index}=…: {count} files are named for shot {index}; name one")
 
     def run(self, output: Output) -> Report:
         """See Verb."""

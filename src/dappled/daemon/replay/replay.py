@@ -18,7 +18,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
-from dappled.daemon.replay.vehicle_choice import vehicle_of
+from dappled.daemon.replay.vehicle_choice import VehicleError, vehicle_of
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
@@ -185,7 +185,7 @@ def _vehicle(telemetry: Path | None, vehicle: int | None) -> tuple[int | None, l
         return vehicle_of(telemetry, vehicle)
     if vehicle is not None:
         why = "there is no telemetry" if telemetry is None else "there is no other vehicle in an autopilot's own log"
-        raise ReplayError(f"--vehicle is for a .tlog: {why}; leave it out")
+        raise VehicleError(f"--vehicle is for a .tlog: {why}; leave it out")
     return None, []
 
 
