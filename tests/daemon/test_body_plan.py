@@ -74,6 +74,21 @@ class Rig:
         return [told(one) for one in above_note(self.report().findings())]
 
 
+def test_a_setting_that_was_wrong_is_not_over_because_the_camera_was_unplugged() -> None:
+    """A pilot read "over: ISO" when the cable had come off."""
+    rig = Rig(Body("iso", iso="400"), PlannedBody(iso="100"))
+    (wrong,) = rig.report().wrong
+    assert (wrong.subject.which, rig.plan.unseen()) == ("ISO", ())
+    for state in ("absent", "starting"):
+        rig.plan.take(StateChanged(state, "", 0))
+        assert rig.plan.unseen() == (wrong,)
+    rig.plan.take(StateChanged("ready", "", 0))
+    assert rig.plan.unseen() == (wrong,)  # its settings are not read yet
+    rig.body.now = AS_PLANNED
+    rig.read()
+    assert (rig.plan.unseen(), rig.report().wrong) == ((), ())
+
+
 def tag(index: int, **values: float | None) -> Tag:
     given = {"focal_length_mm": 35.0, "f_number": 5.6, "exposure_s": 1 / 1000, "iso": 100.0} | values
     lens = given["focal_length_mm"], given["f_number"], given["exposure_s"], given["iso"]

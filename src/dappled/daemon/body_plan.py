@@ -96,10 +96,7 @@ class BodyReport:
         yield from self.wrong
         if self.drift is not None:
             yield self.drift
-        if self.card_frames == 0:
-            yield finding(Code.BODY_CARD_FULL, about)
-        elif self.card_frames is not None and self.card_frames <= CARD_FRAMES:
-            yield finding(Code.BODY_CARD_FILLING, about, frames=self.card_frames)
+        yield from self.of_card()
         if self.battery_low:
             yield finding(Code.BODY_BATTERY_LOW, about, battery=self.battery)
         if self.temperature_c is not None and self.temperature_c >= HOT_C:
@@ -108,6 +105,13 @@ class BodyReport:
             yield finding(Code.BODY_UNCHECKED, about)
         elif settings:
             yield finding(Code.BODY_UNREPORTED if self.read else Code.BODY_UNREAD, about, settings=settings)
+
+    def of_card(self) -> Iterator[Finding]:
+        """What is wrong with the room on its card."""
+        if self.card_frames == 0:
+            yield finding(Code.BODY_CARD_FULL, Subject("camera"))
+        elif self.card_frames is not None and self.card_frames <= CARD_FRAMES:
+            yield finding(Code.BODY_CARD_FILLING, Subject("camera"), frames=self.card_frames)
 
     def values(self) -> dict[str, Any]:
         """As the health record has it."""
@@ -142,6 +146,7 @@ class BodyPlan:
         self._manual = planned.exposure_mode == "manual"
         self._last: dict[SettingName, tuple[float, int]] = {}
         self._drift: Finding | None = None
+        self._left: tuple[Finding, ...] = ()  # what was found when the camera went, until another one is read
         self._temperature_c: float | None = None
 
     # what a ground station uses
@@ -173,7 +178,9 @@ class BodyPlan:
 
     def camera_changed(self, change: StateChanged) -> None:
         """The camera has come or gone. One that has gone is compared, and set, when it is opened again."""
-        self._ready = change.state in ("ready", "busy")  # the settings are read before
+        before, self._ready = self.report(), change.state in ("ready", "busy")  # the settings are read before
+        if before is not None and not self._ready:
+            self._left = (*before.wrong, *before.of_card())
         if change.state in ("absent", "faulted"):
             self._found, self._may_set, self._temperature_c = (), True, None
 
@@ -202,6 +209,11 @@ class BodyPlan:
         return self._drift
 
     # what others ask
+
+    def unseen(self) -> tuple[Finding, ...]:
+        """What was not as it should be when the camera went: nothing shows that it is over, until one is read again."""
+        now = self.report()
+        return () if now is not None and now.read else self._left
 
     def report(self) -> BodyReport | None:
         """The body against the plan, now; None while no camera is ready."""

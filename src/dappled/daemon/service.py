@@ -398,10 +398,11 @@ class Service:
         found = (
             *self.component.findings(),
             navigation.utc.doubt(),
-            *navigation.telemetry.doubts(self._clock.utc_ns()),
+            *navigation.telemetry.doubts(),
             self._control.shortage,
             *self.links.findings(),
             None if self._gnss is None else self._gnss.problem(),
+            *self._body.unseen(),
             *(task.failing for task in self._tasks),
         )
         return health.record(

@@ -71,7 +71,7 @@ def test_a_step_ahead_without_answers_to_timesync_is_seen_as_well(by_s: float) -
         assert (pose.source, bool(doubts), sigmas < 1.2) == ("interpolated", False, True), t_s
     doubts, pose, sigmas = vehicle.locate(20.07)
     assert (pose.source, bool(doubts), sigmas < 1.2) == ("nearest", True, True)
-    told = vehicle.telemetry.doubts(START_NS + 30 * 10**9)[0]
+    told = vehicle.telemetry.doubts()[0]
     assert told.code is Code.CLOCK_STEPPED
     assert float(str(told.facts["by_s"])) < 0
 
@@ -91,7 +91,7 @@ def test_telemetry_that_was_late_for_a_while_is_no_step(late_s: float) -> None:
 
     vehicle.feed = late  # type: ignore[method-assign]  # the link between
     vehicle.fly(boot, 0, 30)
-    assert vehicle.telemetry.doubts(START_NS + 30 * 10**9) == ()
+    assert vehicle.telemetry.doubts() == ()
     assert vehicle.locate(25.0)[2] < 1.2
 
 
@@ -113,10 +113,11 @@ def test_a_pose_next_to_a_step_is_in_doubt_and_those_around_it_are_right(by_s: f
         assert [(one.code, one.facts["steps"]) for one in doubts] == [(Code.CLOCK_STEPPED, 1)]
         assert doubts[0].facts["by_s"] == pytest.approx(abs(by_s), abs=0.001)
         assert sigmas <= 1.2, t_s
-    (told,) = vehicle.telemetry.doubts(START_NS + 30 * 10**9)
+    (told,) = vehicle.telemetry.doubts()
     assert told.code is Code.CLOCK_STEPPED
     assert told.facts["by_s"] == pytest.approx(-by_s, abs=0.001)
-    assert vehicle.telemetry.doubts(START_NS + 90 * 10**9) == ()
+    vehicle.fly(boot, 30, 82)  # a minute of telemetry without another step ends it, not the time that passes
+    assert vehicle.telemetry.doubts() == ()
 
 
 def test_a_pose_waits_for_the_answer_that_may_show_a_step_before_it() -> None:
@@ -142,14 +143,14 @@ def test_a_clock_that_runs_fast_gives_no_confident_pose(drift: float) -> None:
         assert [one.code for one in doubts] == [Code.CLOCK_STEPPED]
         worst = max(worst, sigmas)
     assert worst < 3
-    assert [one.code for one in vehicle.telemetry.doubts(START_NS + 30 * 10**9)] == [Code.CLOCK_UNSTEADY]
+    assert [one.code for one in vehicle.telemetry.doubts()] == [Code.CLOCK_UNSTEADY]
 
 
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -400e-6])
 def test_a_steady_clock_has_no_steps(drift: float) -> None:
     vehicle = Vehicle()
     vehicle.fly(BootTime(drift=drift), 0, 60)
-    assert vehicle.telemetry.doubts(START_NS + 60 * 10**9) == ()
+    assert vehicle.telemetry.doubts() == ()
     assert vehicle.locate(59.0)[1].source == "interpolated"
 
 

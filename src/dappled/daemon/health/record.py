@@ -87,7 +87,7 @@ def record(
     `found` are those of other parts; `standing` knows since when each stands. `dead_threads` have ended without being
     asked to. `parameters` are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames,
     None before the first. `lost` counts the autopilot's triggers that became no request. `body` is how the camera's
-    settings stand to the plan; None where nothing is compared.
+    settings stand to the plan; None while no camera is ready.
     `series` are photographs by distance, while they run. `battery` is the vehicle's; None while the autopilot doesn't
     report it.
     """
@@ -144,7 +144,7 @@ def record(
         *shortages,
         *go_no_go.judge(facts),
         *decoding.failures.found,
-        *decoding.verdicts.findings(monotonic_ns),
+        *decoding.verdicts.findings(),
     ]
     opened = (standing or StandingFindings()).refresh(now, monotonic_ns)
     return facts | {"findings": [one.to_json(monotonic_ns) for one in opened]}

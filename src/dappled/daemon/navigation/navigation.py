@@ -250,10 +250,10 @@ class Telemetry:
             return None
         return turn_rates((a.attitude, b.attitude), rates, span_ns / 1e9, (boot_ns - a.boot_ns) / span_ns)
 
-    def doubts(self, utc_ns: int) -> tuple[Finding, ...]:
-        """What was in the telemetry of the last minute, for which poses are in doubt."""
+    def doubts(self) -> tuple[Finding, ...]:
+        """What was in the last minute of telemetry, for which poses are in doubt."""
         with self._lock:
-            return tuple(doubts(self._history, utc_ns))
+            return tuple(doubts(self._history))
 
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""

@@ -140,6 +140,11 @@ class AutopilotTime:
         last_ns = self._answers[-1].stamp_ns if self._answers else 0
         return last_ns < utc_ns <= last_ns + _ANSWERS_COME_NS
 
+    @property
+    def heard_ns(self) -> int:
+        """When the last message came that shows how the clock runs; 0: none did."""
+        return max(self._answers[-1].stamp_ns if self._answers else 0, self._arrivals.last_ns)
+
     def last_step(self) -> Epoch | None:
         """The last step of the clock that is remembered."""
         return next((one for one in reversed(self._epochs) if one.step_ns is not None), None)
@@ -370,6 +375,11 @@ class VehicleHistory:
     def has_fix(self) -> bool:
         """Whether a receiver's last message says a fix: then UTC is the satellites'."""
         return any(_fixed(history[-1]) for history in (self._receiver, self._second) if history)
+
+    @property
+    def placed_ns(self) -> int:
+        """When the last position came; 0: none did."""
+        return self._positions[-1].stamp_ns if self._positions else 0
 
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five

@@ -191,12 +191,12 @@ class Decoding:
         except Exception as error:  # noqa: BLE001  # a decoded frame must not be lost with its verdict
             report(log, "verdict", error)
             found = unjudged(f"it could not be judged: {sentence(error)}")
-        return self.judge.count(tag.index, found, self._clock.monotonic_ns(), (tag.focal_length_mm, tag.f_number))
+        return self.judge.count(tag.index, found, (tag.focal_length_mm, tag.f_number))
 
     def _unjudged(self, pending: PendingShot, why: str) -> None:
         if pending.verdict is None:
             found = unjudged(why)
-            pending.verdict = self.judge.count(pending.shot.index, found, self._clock.monotonic_ns())
+            pending.verdict = self.judge.count(pending.shot.index, found)
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         before = self.failures

@@ -30,7 +30,7 @@ _NOISY = 0.5  # of the finest detail: more noise than this, and its detail says 
 _LOW_M = 2.0  # a barometer's height is no better
 _LATE_NS = 50_000_000  # a time that is known less well may be that of another turn and speed
 _SILENT_MS = 2000.0
-_LAPSED_NS = 60 * 10**9
+_STAYS = 10  # frames with the lens as it is: a change of its settings is over
 _SAME = 0.01  # lens settings that differ by less are equal, but for rounding
 _STEPS = (1, 2, 4)  # pixels
 DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}
@@ -211,21 +211,22 @@ def _worse(value: float, usable: float, bad: float) -> VerdictState | None:
 class VerdictCounts:
     """How a flight's frames were judged: by state, how many bad ones since the last good or usable one and why the
     first of them, and the last `LAST` as (frame, state, reasons).
-    `drift` says how the lens' settings last changed from one frame to a newer one, at `drift_ns`."""
+    `drift` says how the lens' settings last changed from one frame to a newer one; `held` counts the frames since that
+    they are known to be the same in."""
 
     by_state: Mapping[VerdictState, int] = field(default_factory=dict)
     bad_in_a_row: int = 0
     reason: Finding | None = None
     last: tuple[tuple[int, VerdictState, tuple[Finding, ...]], ...] = ()
     drift: Finding | None = None
-    drift_ns: int = 0
+    held: int = 0
 
-    def findings(self, now_ns: int) -> Iterator[Finding]:
+    def findings(self) -> Iterator[Finding]:
         """Three or more frames that were bad without a good or usable one between them; a change of the lens' settings,
-        for a minute."""
+        until so many frames show that it stays."""
         if self.bad_in_a_row >= BAD_IN_A_ROW and self.reason is not None:
             yield finding(Code.FRAMES_BAD, Subject("flight"), in_a_row=self.bad_in_a_row, why=text(self.reason))
-        if self.drift is not None and now_ns - self.drift_ns <= _LAPSED_NS:
+        if self.drift is not None and self.held < _STAYS:
             yield self.drift
 
 
@@ -283,7 +284,7 @@ class Judge:
         )
         return verdict(facts, seen.bounds)
 
-    def count(self, frame: int, found: Verdict, now_ns: int, lens: LensSettings = (None, None)) -> Verdict:
+    def count(self, frame: int, found: Verdict, lens: LensSettings = (None, None)) -> Verdict:
         """Count a verdict, also one that can't be given. An unknown frame proves nothing: it neither ends a row of bad
         ones nor adds to it; nor does one that comes late, behind a newer frame. `lens` is what it was taken with."""
         self._states[found.state] += 1
@@ -295,12 +296,12 @@ class Judge:
         elif found.state != "unknown" and not late:
             in_a_row, reason = 0, None
         last = (*before.last, (frame, found.state, found.reasons))[-LAST:]
-        drift, drift_ns = before.drift, before.drift_ns
+        drift, held = before.drift, before.held + (not late and lens != (None, None))
         if not late:
             if moved := _moved(self._lens, lens):
-                drift, drift_ns = finding(Code.FRAMES_LENS_MOVED, Subject("flight"), moved=moved, frame=frame), now_ns
+                drift, held = finding(Code.FRAMES_LENS_MOVED, Subject("flight"), moved=moved, frame=frame), 0
             self._lens = (lens[0] or self._lens[0], lens[1] or self._lens[1])
-        self.counts = VerdictCounts(dict(self._states), in_a_row, reason, last, drift, drift_ns)
+        self.counts = VerdictCounts(dict(self._states), in_a_row, reason, last, drift, held)
         return found
 
     def _defocus(self, lens: LensSettings, seen: PictureFacts) -> tuple[float | None, str]:
