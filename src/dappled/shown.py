@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from typing import Any, TextIO, cast
 
@@ -15,6 +16,19 @@ def printable(text: str) -> str:
     if text.isprintable():
         return text
     return "".join(one if one.isprintable() else one.encode("unicode_escape").decode() for one in text)
+
+
+def say(text: str, *, error: bool = False, end: str = "\n") -> None:
+    """Print one line, on standard error where that is wished: nothing else in dappled prints, and no name begins a line
+    of its own."""
+    print(printable(text), end=end, file=sys.stderr if error else sys.stdout, flush=True)
+
+
+class LineFormatter(logging.Formatter):
+    """Formats a record as one line; a traceback follows it."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:  # noqa: N802  # logging's name
+        return printable(super().formatMessage(record))
 
 
 class ShownStream:
@@ -35,6 +49,8 @@ class ShownStream:
 def guard_output() -> None:
     """From now on all that this process prints or logs is shown so. A progress bar, which moves the cursor, writes to
     `sys.__stderr__`."""
+    if logging.lastResort is not None:  # what logs in a process that sets no log up
+        logging.lastResort.setFormatter(LineFormatter())
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is not None and not isinstance(stream, ShownStream):

@@ -174,14 +174,15 @@ def test_a_narrow_terminal_without_colour_and_a_reader_that_has_gone(forks: Fork
     assert told.startswith("usage: dappled")
 
 
-HOSTILE = "none\x1b[2J\x9b2J\u202e\u2028\rFORGED"
+HOSTILE = "none\x1b[2J\x9b2J\u202e\u2028\r\nFORGED"
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_names_of_files_move_no_cursor(forks: Forks, name: str) -> None:
+def test_names_of_files_move_no_cursor_and_begin_no_line(forks: Forks, name: str) -> None:
     words = [*name.split(), *(word.replace("none", HOSTILE) for word in CALLS[name])]
     _, out, err = forks.call(words)
-    assert all(one.isprintable() for one in (out + err).split("\n")), (out, err)
+    lines = (out + err).split("\n")
+    assert all(one.isprintable() and not one.startswith("FORGED") for one in lines), (out, err)
 
 
 SIGINT, SIGTERM = 2, 15

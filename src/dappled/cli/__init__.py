@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 
 import dappled
 from dappled.cli.table import VERBS
+from dappled.shown import say
 
 __all__ = ["VERBS", "main"]
 
@@ -19,7 +20,7 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if words == ["--version"]:
-        print(f"dappled {dappled.__version__}")
+        say(f"dappled {dappled.__version__}")
         return 0
     from dappled.cli import calling  # noqa: PLC0415  # --version waits for nothing
 

@@ -16,6 +16,7 @@ import dappled
 from dappled.cli.table import GROUPS, VERBS
 from dappled.cli.verb import Argument, CallError, Verb
 from dappled.errors import DappledError
+from dappled.shown import printable
 
 _LAST = {"anyway": 1, "overwrite": 2, "json": 3}
 
@@ -33,7 +34,7 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print usage and what is wrong, and exit with 2."""
-        self.exit(2, f"{self.short_usage()}\n{self.prog}: {message}\n")
+        self.exit(2, f"{self.short_usage()}\n{self.prog}: {printable(message)}\n")
 
     def refuse_unknown(self, word: str) -> NoReturn:
         """End a call with an option or word that this verb hasn't."""

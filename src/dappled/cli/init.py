@@ -18,6 +18,7 @@ from dappled.daemon import settings_check
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import UsbBody
 from dappled.errors import DappledError
+from dappled.shown import say
 
 ANY, NONE = "auto", "none"
 FLIGHTS = RecordSettings().directory
@@ -111,10 +112,10 @@ def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]
 def ask(question: Question, answer: Callable[[str], str]) -> str:
     """The person's answer, or what was proposed for an empty one. Asks again where there is neither."""
     if question.choices:
-        print(f"  {', '.join(question.choices)}", file=sys.stderr)
+        say(f"  {', '.join(question.choices)}", error=True)
     proposed = f" [{question.proposed}]" if question.proposed else ""
     while True:
-        print(f"{question.words}{proposed}: ", end="", file=sys.stderr, flush=True)
+        say(f"{question.words}{proposed}: ", error=True, end="")
         try:
             said = answer("").strip()
         except EOFError:

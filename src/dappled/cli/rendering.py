@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from dappled import codec, findings
 from dappled.cli.verb import Doubtable, Report, Verb
 from dappled.findings import Level
-from dappled.shown import printable
+from dappled.shown import say
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -92,7 +92,7 @@ class TerminalOutput:
         if self._bar is not None:
             self._bar.clear()
         for line in lines:
-            print(printable(line), file=sys.stderr if error else sys.stdout, flush=True)
+            say(line, error=error)
 
 
 def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
@@ -100,10 +100,11 @@ def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
     output.close()
     if verb.json:
         if report.values is not None:
-            print(json.dumps(_with_findings(report), indent=2))
+            for line in json.dumps(_with_findings(report), indent=2).split("\n"):
+                say(line)
     else:
         for line in report.lines:
-            print(printable(line))
+            say(line)
     for one in findings.in_order(report.findings):
         output.remark(f"{'in doubt' if one.level > Level.NOTE else one.level.word}: {findings.told(one)}")
     if findings.worst(report.findings) > Level.NOTE and not getattr(verb, "anyway", False):
@@ -124,8 +125,8 @@ def failed(path: str, sentences: Sequence[str], *, as_json: bool, usage: str = "
     """Say what went wrong, a line for each sentence: a person on standard error, and with --json a program too, as
     {"error": …}; a wrong call with the verb's usage."""
     if usage:
-        print(usage, file=sys.stderr)
-    shown = "\n".join(map(printable, sentences))
-    print(f"dappled {path}: {shown}", file=sys.stderr)
+        say(usage, error=True)
+    for before, one in zip([f"dappled {path}: ", *[""] * len(sentences)], sentences or [""], strict=False):
+        say(before + one, error=True)
     if as_json:
-        print(json.dumps({"error": "\n".join(sentences)}))
+        say(json.dumps({"error": "\n".join(sentences)}))

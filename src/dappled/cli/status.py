@@ -43,7 +43,7 @@ class ShowStatus(Verb):
     def run(self, output: Output) -> Report:
         """See Verb."""
         record = health(self.endpoint or stream_endpoint(self.config), self.timeout, unit(self.config))
-        return Report(record, screen(record).splitlines())
+        return Report(record, screen(record))
 
 
 CLASSES = {"status": ShowStatus}
@@ -127,8 +127,8 @@ def health(endpoint: str, timeout_s: float, name: str = "dappled") -> Mapping[st
     )
 
 
-def screen(record: Mapping[str, Any]) -> str:
-    """The record in words."""
+def screen(record: Mapping[str, Any]) -> list[str]:
+    """The record in words, line by line."""
     camera, link, disk, shots = record["camera"], record["link"], record["disk"], record["shots"]
     free = "unknown" if disk["free_bytes"] is None else f"{disk['free_bytes'] / 1e9:.1f} GB free"
     reason = f": {camera['reason']}" if camera["reason"] else ""
@@ -146,7 +146,7 @@ def screen(record: Mapping[str, Any]) -> str:
     found = in_record(record)
     lines.append(f"{state(found).upper() if above_note(found) else ALL_IS_WELL}")
     lines += [f"{one.level.word:9} {told(one)}{_for(row)}" for one, row in zip(found, record["findings"], strict=True)]
-    return "\n".join(lines)
+    return lines
 
 
 def _for(row: Mapping[str, Any]) -> str:

@@ -27,6 +27,7 @@ from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.errors import counted
 from dappled.findings import told
+from dappled.shown import say
 from dappled.workers import Loop, Worker
 
 log = logging.getLogger("dappled.run")
@@ -47,7 +48,7 @@ def waiting_for(what: str, silence_s: float = SILENCE_S) -> Iterator[None]:
 
     def wait() -> None:
         if not over.wait(silence_s):
-            print(f"waiting for {what}", file=sys.stderr, flush=True)
+            say(f"waiting for {what}", error=True)
 
     loop = Loop("waiting", wait, over)
     loop.start()
@@ -62,7 +63,7 @@ def remark(text: str, level: int = logging.INFO, **fields: object) -> None:
     if _journalled():
         log.log(level, "%s", text, extra={"dappled": fields})
     else:
-        print(text, file=sys.stderr)
+        say(text, error=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ class FrameLines:
             remark(line.text, line.level, **line.fields)
             return
         try:
-            print(line.text, flush=True)
+            say(line.text)
         except OSError:  # the reader is gone; the record goes on
             sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # for the rest of the process
 

@@ -24,10 +24,14 @@ class ConfigError(DappledError):
 
     exit_code = 2
 
+    def __init__(self, *sentences: str) -> None:
+        super().__init__("\n".join(sentences))
+        self._sentences = list(sentences)  # a name in one may hold a line break
+
     @property
     def sentences(self) -> list[str]:
         """See DappledError."""
-        return str(self).split("\n")
+        return self._sentences
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -42,7 +46,7 @@ class BadSetting:
 def refuse(findings: Sequence[BadSetting]) -> None:
     """Raise ConfigError with all sentences where there are any."""
     if findings:
-        raise ConfigError("\n".join(finding.text for finding in findings))
+        raise ConfigError(*(finding.text for finding in findings))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

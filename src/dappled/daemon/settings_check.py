@@ -111,7 +111,7 @@ def _links(settings: Settings) -> None:
         if settings.mavlink.url.count(url) > 1:
             wrong.append(f"mavlink.url names {url!r} twice; remove one")
     if wrong:
-        raise ConfigError("\n".join(wrong))
+        raise ConfigError(*wrong)
 
 
 def _feedback(settings: Settings) -> None:

@@ -70,7 +70,7 @@ def test_a_fault_is_the_same_code_on_every_face_and_says_what_to_do(tmp_path: Pa
     assert found.code is code
     assert go_no_go.state([found]) == ("no-go" if found.level is Level.STOP else "caution")
     assert remedy(found)
-    assert status.screen(made).splitlines()[-2:] == [
+    assert status.screen(made)[-2:] == [
         "NO-GO" if found.level is Level.STOP else "CAUTION",
         f"{found.level.word:9} {told(found)}",
     ]

@@ -98,7 +98,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
         written = calibration_files.save(to, found)
         if bad:
             output.remark(f"{len(bad)} of {counted(len(paths), 'frame')} could not be used")
-        lines = report.as_text(found, camera.mask_distance_mm).splitlines()
+        lines = report.as_lines(found, camera.mask_distance_mm)
         return Report(
             report.as_values(found, camera.mask_distance_mm),
             [*lines, f"written to {written[0]} and {written[1]}"],

@@ -18,6 +18,7 @@ from dappled.config.settings import PublishSettings
 from dappled.daemon import settings_check
 from dappled.errors import DappledError
 from dappled.flight import layout
+from dappled.shown import say
 
 _FRAMES, _PATIENCE_S = 3, 120.0
 _SCALE = 0.25  # of the reference camera's sensor: all of it in 5 MB
@@ -30,7 +31,7 @@ def flight() -> Path:
     if not folder.is_dir():
         from dappled.mocks.simulation import Simulation, World  # noqa: PLC0415  # loaded to fly the example only
 
-        print(f"making the example flight in {folder}, once", file=sys.stderr)
+        say(f"making the example flight in {folder}, once", error=True)
         cache.mkdir(parents=True, exist_ok=True)
         with (
             tempfile.TemporaryDirectory(prefix=".example-", dir=cache) as kept,

@@ -13,6 +13,8 @@ import struct
 import sys
 from collections.abc import Mapping
 
+from dappled.shown import LineFormatter, printable
+
 JOURNAL = "/run/systemd/journal/socket"
 _PATIENCE_S = 0.05  # a journal that hangs must not delay the shutter, which logs too
 log = logging.getLogger(__name__)
@@ -49,7 +51,7 @@ class JournalHandler(logging.Handler):
 def fields(record: logging.LogRecord) -> dict[str, str]:
     """A record's journal fields."""
     found = {
-        "MESSAGE": record.getMessage(),
+        "MESSAGE": printable(record.getMessage()),
         "PRIORITY": str(_PRIORITY.get(record.levelno, 5)),
         "SYSLOG_IDENTIFIER": "dappled",
         "DAPPLED_PART": record.name.removeprefix("dappled."),
@@ -84,7 +86,7 @@ def handler(environment: Mapping[str, str] = os.environ, address: str = JOURNAL)
         except OSError:  # no such socket: plain lines reach the journal too
             pass
     plain = logging.StreamHandler(sys.stderr)
-    plain.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    plain.setFormatter(LineFormatter("%(levelname)s %(name)s: %(message)s"))
     return plain
 
 

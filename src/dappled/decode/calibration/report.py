@@ -127,7 +127,7 @@ def as_values(found: Calibration, mask_distance_mm: float) -> dict[str, Any]:
     }
 
 
-def as_text(found: Calibration, mask_distance_mm: float) -> str:
+def as_lines(found: Calibration, mask_distance_mm: float) -> list[str]:
     """The tables for a person, one each focal length, and the verdict."""
     lines: list[str] = []
     for fit, (length, pupil) in zip(found.fits, pupils_mm(found, mask_distance_mm), strict=True):
@@ -149,7 +149,7 @@ def as_text(found: Calibration, mask_distance_mm: float) -> str:
         if law.pupil_mm is not None:
             words += f", exit pupil at the focal length {law.pupil_mm:+.2f} mm"
         lines.append(f"{words}; {law.rms_bins:.2f} bins rms are left")
-    return "\n".join([*lines, *([] if found.verdict is None else [text(found.verdict)])])
+    return [*lines, *([] if found.verdict is None else [text(found.verdict)])]
 
 
 def _table(table: Sequence[Row]) -> list[str]:
