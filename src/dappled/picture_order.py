@@ -15,7 +15,8 @@ from typing import Generic, TypeVar
 
 T = TypeVar("T")
 _NUMBER = re.compile("([0-9]+)")
-_FILE = re.compile(r"([A-Z_][A-Z0-9_]{3}|.*[^0-9]|)([0-9]{4})(\.[^.]*)?", re.DOTALL)
+_FILE = re.compile(r"((?=[0-9]{0,3}[A-Z_])[A-Z0-9_]{4}|.*[^0-9]|)([0-9]{4})(\.[^.]*)?", re.DOTALL | re.IGNORECASE)
+_SHORTER = {"dji_": 999}  # the last number of those that don't count to 9999
 _FOLDER = re.compile(r"()([1-9][0-9]{2})(?=[^0-9]|$)(.*)", re.DOTALL)
 _STEP_S = 1.0  # times have whole seconds
 _JOIN = 0.05  # of the counter: at most so much is lost where it rolls over
@@ -75,7 +76,9 @@ def _keys(names: Iterable[str], counter: re.Pattern[str], first: int, last: int)
             counted.setdefault(found[1].casefold(), []).append(int(found[2]))
         elif more := re.match(r"(.*[^0-9]|)[0-9]{5,}(\.[^.]*)?$", name, re.DOTALL):
             longer.add(more[1].casefold())  # frame_9999 goes on as frame_10000
-    after = {text: _rolled_over(numbers, first, last) for text, numbers in counted.items() if text not in longer}
+    ends = {text: _SHORTER.get(text, last) for text in counted}
+    ends = {text: end if max(counted[text]) <= end else last for text, end in ends.items()}
+    after = {text: _rolled_over(numbers, first, ends[text]) for text, numbers in counted.items() if text not in longer}
     return {name: _key(name, counter.fullmatch(name), after, last - first + 1) for name in names}
 
 

@@ -27,7 +27,7 @@ _LATE = 64
 _ENOUGH = 3
 """This many pairs, and no shot without one, identify a card that was not seen before the flight as this camera's."""
 _BESIDE_S = 2.0
-_COUNTED = re.compile(r"(?:.*/)?([A-Z0-9_]{4})[0-9]{4}\.[^./]*")
+_COUNTED = re.compile(r"(?:.*/)?([A-Z0-9_]{4})[0-9]{4}\.[^./]*", re.IGNORECASE)
 
 FileEvents = Iterator[Arrival | Companion | Noticed]
 
