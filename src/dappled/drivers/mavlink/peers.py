@@ -6,6 +6,8 @@ brought first): it is sent at most as many bytes as it sent, so that a station w
 It is *proven* by a new packet that is obeyed, and is sent everything: for a minute where the packet was signed, else
 for 5 s. At most 16 peers of a port are proven; one that was heard in the last 5 s is never displaced, and a silent one
 only by who signs: a script's calls have a port each. Without a signature the last four are for hosts that have none.
+Whoever finds no place is only heard: it gets the answer to what it asks, and not what is sent to all. Of those that
+are only heard the newest are kept.
 Over a serial line the one at the other end can't be another one; a TCP server with a key serves who has proven itself
 (`TcpServer`).
 """
@@ -64,11 +66,11 @@ class Peers:
             if now_ns - self._proven[longest].heard_ns > _LIVING_NS:
                 del self._proven[longest]
         crowded = len(self._proven) >= MOST - _FOR_OTHER_HOSTS and evidence == "sound"
-        if crowded and any(host == source[0] for host, _ in self._proven):
+        if len(self._proven) >= MOST or (crowded and any(host == source[0] for host, _ in self._proven)):
+            self._hear(source, size, now_ns)  # it is answered, whoever fills the port
             return
-        if len(self._proven) < MOST:
-            self._proven[source] = Peer(until_ns, heard_ns=now_ns)
-            self._heard.pop(source, None)
+        self._proven[source] = Peer(until_ns, heard_ns=now_ns)
+        self._heard.pop(source, None)
 
     def receivers(self, size: int, now_ns: int) -> list[Source]:
         """Whom to send a packet of so many bytes; those that are only heard pay for it."""
@@ -85,8 +87,8 @@ class Peers:
             return
         if source not in self._heard and len(self._heard) >= MOST:
             _forget_gone(self._heard, now_ns)
-            if len(self._heard) >= MOST:
-                return
+            if len(self._heard) >= MOST:  # the newest waits for an answer
+                del self._heard[min(self._heard, key=lambda one: self._heard[one].until_ns)]
         peer = self._heard.setdefault(source, Peer(0))
         peer.until_ns, peer.credit = now_ns + _HEARD_NS, min(peer.credit + size, CREDIT_BYTES)
 
