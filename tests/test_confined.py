@@ -20,7 +20,7 @@ from dappled.confined import OutsideError
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.replay import replay, runs
 from dappled.decode.lightfield import LightField
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.flight import (
     FlightFolder,
@@ -37,8 +37,7 @@ from dappled.products import opened
 from dappled.products.batch.batch import BatchOutput, Done, Manifest
 from dappled.products.exports import light_files
 from dappled.products.geotags import geotags
-from dappled.products.maps import georeference
-from dappled.products.maps.georeference import Options
+from dappled.products.maps.laboratory import Laboratory
 from dappled.products.mounting import Mounting
 from dappled.products.opened import OpenedFlight
 from tests.flight.conftest import START_UTC_NS
@@ -104,7 +103,7 @@ DOORS: dict[str, Callable[[Path, Path], object]] = {
     "copies": lambda flight, out: list(geotags.copies(flight, out, Mounting())),
     "replay": lambda flight, out: replay.of_flight(flight),
     "open": lambda flight, out: list(cast(OpenedFlight, opened.open(flight, camera=RECIPE.camera, mask=RECIPE.mask))),
-    "decode": lambda flight, out: georeference.decode(Darkroom(RECIPE), flight, _first(flight), None, Options()),
+    "decode": lambda flight, out: Laboratory(RECIPE).frame(flight, _first(flight), None),
 }
 
 

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -31,8 +30,9 @@ from dappled.products.geotags import geotags
 from dappled.products.geotags.geotags import Placed
 from dappled.products.handover import forms
 from dappled.products.handover.forms import HandedFrame
-from dappled.products.maps import georeference, photographs
+from dappled.products.maps import photographs
 from dappled.products.maps.georeference import Options
+from dappled.products.maps.laboratory import FlightFrame
 from tests import globe
 from tests.products.flown import Flown
 
@@ -211,7 +211,7 @@ def listed(monkeypatch: pytest.MonkeyPatch) -> dict[str, list[str]]:
         named[f"{flight}/{form}"] = list(names)
         return []
 
-    monkeypatch.setattr(georeference, "decode", lambda *_: SimpleNamespace(doubts=(CLIPPED,)))
+    monkeypatch.setattr(FlightFrame, "doubts", property(lambda _: (CLIPPED,)))
     monkeypatch.setattr(workers, "in_processes", lambda jobs, make, _: map(make, jobs))
     monkeypatch.setattr(forms, "write_frame", written)
     monkeypatch.setattr(forms, "finish", finished)

@@ -17,7 +17,7 @@ from dappled.decode.geometry import camera_pose
 from dappled.findings import Code
 from dappled.products.batch import batch
 from dappled.products.exports import light_files
-from dappled.products.handover import view_files
+from dappled.products.handover import forms, view_files
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Options
 from tests.products.flown import START_NS, Flown
@@ -42,6 +42,25 @@ def test_nerfstudio_s_transforms_are_the_poses(handed: Path, short_flight: Flown
             assert picture.size == (one["w"], one["h"])
 
 
+@pytest.mark.parametrize("form", ["colmap", "nerfstudio"])
+def test_a_frame_is_one_camera_with_the_sensors_own_pixels(short_flight: Flown, tmp_path: Path, form: str) -> None:
+    """Unless views are asked for: no light field is decoded, and the camera is that of the sensor."""
+    (job,) = batch.plan(short_flight.folder, short_flight.recipe, Options(frames=frozenset({0})), [form], tmp_path)
+    assert batch.make(job).error is None
+    folder = tmp_path / short_flight.folder.name / form
+    forms.finish(form, folder, short_flight.folder.name, NAMES[:1])
+    with Image.open(folder / "images" / "picture" / f"{NAMES[0]}.jpg") as picture:
+        assert picture.size == (1844, 1388)
+    if form == "colmap":
+        (line,) = (one for one in (folder / "sparse/0/cameras.txt").read_text().splitlines() if one[0] != "#")
+        size, lens = line.split()[2:4], [float(word) for word in line.split()[4:]]
+    else:
+        (one,) = json.loads((folder / "transforms.json").read_text())["frames"]
+        size, lens = [str(one["w"]), str(one["h"])], [one[key] for key in ("fl_x", "fl_y", "cx", "cy")]
+    assert size == ["1844", "1388"]
+    assert lens == pytest.approx([5000, 5000, 922, 694], abs=1e-6)  # 50 mm, 10 µm; from the first pixel's corner
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("fitted", [True, False])
 def test_views_stand_as_the_frame_shows(short_flight: Flown, tmp_path: Path, fitted: bool) -> None:
@@ -50,7 +69,7 @@ def test_views_stand_as_the_frame_shows(short_flight: Flown, tmp_path: Path, fit
     words = Path(short_flight.recipe.calibration).read_text()
     told.write_text(words.replace("distance_fitted = false", f"distance_fitted = {str(fitted).lower()}"))
     recipe = replace(short_flight.recipe, calibration=str(told))
-    options = Options(f_number=12.0, frames=frozenset({0}))
+    options = Options(f_number=12.0, view="ground", frames=frozenset({0}))
     (job,) = batch.plan(short_flight.folder, recipe, options, ["colmap"], tmp_path)
     assert batch.make(job).error is None
     (made,) = view_files.read_frames(tmp_path / short_flight.folder.name / "colmap", NAMES[:1])
@@ -122,7 +141,7 @@ def test_the_mcap_file_holds_the_flight(handed: Path, short_flight: Flown) -> No
         assert np.array_equal(values, made.slices)
         assert list(slices.carriers) == made.carriers.ravel().tolist()
         info, picture = found["/camera/camera_info"][n], found["/camera/image/compressed"][n]
-        assert bytes(picture.data) == (handed / "mcap" / "images" / "mean" / f"{NAMES[n]}.jpg").read_bytes()
+        assert bytes(picture.data) == (handed / "mcap" / "images" / "picture" / f"{NAMES[n]}.jpg").read_bytes()
         assert info.k[0] / info.width == pytest.approx(50.0 / 18.44, rel=0.01)
         stamp = picture.header.stamp
         assert stamp.sec * 10**9 + stamp.nanosec == START_NS + round(truth.pose.t_s * 1e9)

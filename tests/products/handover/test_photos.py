@@ -60,7 +60,7 @@ def test_each_frame_is_a_tiff_and_a_jpeg_and_geo_txt_names_them(photos: Path, sh
 
 
 @pytest.mark.slow
-def test_pictures_hold_the_view_and_its_exif(photos: Path, short_flight: Flown) -> None:
+def test_photos_are_the_picture_at_full_size_and_its_exif(photos: Path, short_flight: Flown) -> None:
     truth = short_flight.truths[1]
     assert truth.pose is not None
     sixteen = tifffile.imread(photos / "tiff" / "000001.tif")
@@ -70,16 +70,17 @@ def test_pictures_hold_the_view_and_its_exif(photos: Path, short_flight: Flown) 
         gps, inner = exif.get_ifd(GPS), exif.get_ifd(EXIF)
         xmp = picture.info["xmp"]
     assert sixteen.dtype == np.uint16
-    assert eight.shape == sixteen.shape
+    assert eight.shape == sixteen.shape == (1388, 1844)  # the sensor's own pixels
+    assert (inner[0xA002], inner[0xA003]) == (1844, 1388)
     assert abs(sixteen / 257.0 - eight).mean() < 2.0
     assert degrees(gps[2], gps[1]) == pytest.approx(truth.pose.latitude_deg, abs=1e-9)
     assert degrees(gps[4], gps[3]) == pytest.approx(truth.pose.longitude_deg, abs=1e-9)
     assert float(gps[6]) == pytest.approx(truth.pose.altitude_msl_m, abs=1e-3)
     assert (float(inner[0x829A]), float(inner[0x829D]), inner[0x8827]) == (0.001, 14.8, 100)
     assert float(inner[0x920A]) == 50.0
-    # 694 × 922 px of 0.01 mm; the picture covers them with fewer samples
+    assert float(inner[0xA20E]) == 1000.0  # px a centimetre
     width_mm = eight.shape[1] / (float(inner[0xA20E]) / 10)
-    assert width_mm == pytest.approx(0.01 * 1844, rel=0.02)
+    assert width_mm == pytest.approx(0.01 * 1844)
     assert inner[0xA405] == round(36 * 50 / width_mm)
     assert inner[0x9003] == "2026:11:21 10:15:04"
     assert b"drone-dji:GimbalPitchDegree" in xmp

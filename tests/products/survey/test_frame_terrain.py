@@ -21,7 +21,7 @@ from dappled.products.maps.ground import Flat, Raster
 from dappled.products.survey import frame_terrain
 from dappled.products.survey.frame_depths import InverseDepth
 from dappled.products.survey.frame_terrain import FrameTerrain, FrameTerrainError
-from tests.products.maps.test_eye import eye_at
+from tests.products.maps.test_eye import GRID, eye_at
 from tests.products.maps.test_map_grid import photograph, survey
 from tests.products.survey import hills
 
@@ -51,7 +51,7 @@ def told(eye: Eye, ground: Raster, sigma: float, rng: np.random.Generator | None
     if rng is not None:
         errors = rng.normal(0, sigma, (rows // BLOCK + 1, columns // BLOCK + 1))
         inverse = inverse + np.kron(errors, np.ones((BLOCK, BLOCK)))[:rows, :columns]
-    return InverseDepth(inverse.astype(np.float32), np.full((rows, columns), sigma, np.float32), 0.0, "a test")
+    return InverseDepth(inverse.astype(np.float32), np.full((rows, columns), sigma, np.float32), 0.0, "a test", GRID)
 
 
 def flight(count: int, ground: Flat | Raster | None = None, height_m: float = 40.0) -> Survey:

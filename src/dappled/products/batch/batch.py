@@ -22,7 +22,7 @@ from typing import Any, Self
 
 from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, sentence
 from dappled.findings import Finding
 from dappled.flight import Frame, Tag
@@ -34,7 +34,8 @@ from dappled.products.handover.forms import FORMS, HandedFrame
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
-from dappled.products.maps.photographs import Station
+from dappled.products.maps.laboratory import FlightFrame, Laboratory
+from dappled.products.maps.photographs import Photograph, Station
 
 KINDS = {
     "npz": ".npz",
@@ -85,7 +86,8 @@ class BatchOutput:
 @dataclass(frozen=True, slots=True)
 class Done:
     """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'.
-    `refused` says why a kind was not made where others were or could have been; `doubts` are the light field's."""
+    `refused` says why a kind was not made where others were or could have been; `doubts` are those of the frame's
+    picture and light field, whichever were made."""
 
     key: str
     flight: str
@@ -174,10 +176,9 @@ def make(job: Job) -> Done:
     began, cpu = time.monotonic(), time.process_time()
     outputs: list[BatchOutput] = []
     refused: dict[str, str] = {}
-    doubts: tuple[Finding, ...] = ()
+    making: _Making | None = None
     try:
         making = _making(job)
-        doubts = making.decoded.doubts
         for kind in job.kinds:
             try:
                 outputs += making.made(kind)
@@ -187,7 +188,7 @@ def make(job: Job) -> Done:
     except Exception as caught:  # noqa: BLE001  one bad frame must not end the flight: its words go into the manifest
         error = _why(job, caught)
     seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
-    name = Path(job.flight).name
+    name, doubts = Path(job.flight).name, () if making is None else making.frame.doubts
     return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused, doubts)
 
 
@@ -199,11 +200,10 @@ def _why(job: Job, error: Exception) -> str:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Making:
-    """A frame, decoded, of which one kind after the other is made."""
+    """A frame, of which one kind after the other is made."""
 
     job: Job
-    darkroom: Darkroom
-    decoded: DecodeResult
+    frame: FlightFrame
 
     def made(self, kind: str) -> list[BatchOutput]:
         """Make one kind. Raises DappledError and OSError."""
@@ -216,16 +216,14 @@ class _Making:
         projection = _projection(job.options.crs)
         folder = Path(job.output) / Path(job.flight).name
         if kind == "photos":
-            one = georeference.place(job.station, self.decoded, self.darkroom, projection, job.options)
+            one = self._photograph(job.station, projection)
             pictures = photo_files.encoded(one, job.station, job.utc_ns)
             paths = photo_files.paths(folder / "photos", job.frame)
             for path, data in zip(paths, pictures.values(), strict=True):
                 durable.make_folder(path.parent)
                 durable.write_file(path, data)
         elif kind in FORMS:
-            frame = HandedFrame(
-                folder.name, job.station, self.decoded, self.darkroom, projection, job.options, job.level_m, job.utc_ns
-            )
+            frame = HandedFrame(folder.name, job.station, self.frame, projection, job.options, job.level_m, job.utc_ns)
             paths = forms.write_frame(kind, folder / kind, frame)
         else:
             paths = [self._map(kind, job.station, projection)]
@@ -234,14 +232,18 @@ class _Making:
     def _light_field(self, kind: str) -> BatchOutput:
         job = self.job
         pose = {} if job.tag is None else {"pose": asdict(job.tag.pose)}
-        made = self.decoded.light_field
+        made = self.frame.decoded.light_field
         light_files.save(_beside(job, kind), replace(made, attributes={**made.attributes, **pose}), overwrite=True)
         return _output(_beside(job, kind), job, kind)
+
+    def _photograph(self, station: Station, projection: Projection) -> Photograph:
+        options = self.job.options
+        return self.frame.photograph(station, projection, view=options.view, focus_m=options.focus_m)
 
     def _map(self, kind: str, station: Station, projection: Projection) -> Path:
         job, path = self.job, _beside(self.job, kind)
         assert job.level_m is not None
-        one = georeference.place(station, self.decoded, self.darkroom, projection, job.options)
+        one = self._photograph(station, projection)
         survey = georeference.on_ground(
             Path(job.flight).name, [one], [], projection=projection, level_m=job.level_m, options=job.options
         )
@@ -251,12 +253,12 @@ class _Making:
 
 
 def _making(job: Job) -> _Making:
-    """Decode a job's frame. Raises DappledError, also where nothing that is wanted could be made of it."""
+    """A job's frame. Raises DappledError where nothing that is wanted could be made of it."""
     durable.make_folder(Path(job.output) / Path(job.flight).name)
     if job.station is None and set(job.kinds) <= set(PLACED):
         raise DappledError(job.why)
-    darkroom = _darkroom(job.recipe)
-    return _Making(job, darkroom, georeference.decode(darkroom, Path(job.flight), job.frame, job.tag, job.options))
+    given = {"focal_length_mm": job.options.focal_length_mm, "f_number": job.options.f_number}
+    return _Making(job, _laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given))
 
 
 def _beside(job: Job, kind: str) -> Path:
@@ -313,12 +315,12 @@ def _plain(options: Options) -> dict[str, object]:
 _here = threading.local()  # a decoder keeps buffers: one for each working thread
 
 
-def _darkroom(recipe: Recipe) -> Darkroom:
-    """This thread's darkroom for a recipe, kept from job to job."""
-    kept: dict[Recipe, Darkroom] = _here.__dict__.setdefault("darkrooms", {})
+def _laboratory(recipe: Recipe) -> Laboratory:
+    """This thread's laboratory for a recipe, kept from job to job."""
+    kept: dict[Recipe, Laboratory] = _here.__dict__.setdefault("laboratories", {})
     if recipe not in kept:
         kept.clear()
-        kept[recipe] = Darkroom(recipe)
+        kept[recipe] = Laboratory(recipe)
     return kept[recipe]
 
 

@@ -6,14 +6,14 @@ A frame's files may be written by any process, again and again; a flight's are w
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.products.handover import colmap, mcap_file, nerfstudio, stac, view_files
 from dappled.products.maps import cog, georeference
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Options
+from dappled.products.maps.laboratory import MEAN, FlightFrame
 from dappled.products.maps.photographs import Station
 
 FORMS = ("colmap", "nerfstudio", "stac", "mcap")
@@ -23,13 +23,12 @@ _RIGS = ("colmap", "nerfstudio")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class HandedFrame:
-    """One frame, decoded, with its place and what it is drawn with. `level_m` is the height of flat ground, needed for
+    """One frame with its place and what it is drawn with. `level_m` is the height of flat ground, needed for
     maps; `utc_ns` mid-exposure, corrected, None where UTC was never known."""
 
     flight: str
     station: Station
-    made: DecodeResult
-    darkroom: Darkroom
+    frame: FlightFrame
     projection: Projection
     options: Options
     level_m: float | None
@@ -38,16 +37,14 @@ class HandedFrame:
 
 def write_frame(form: str, folder: Path, frame: HandedFrame) -> list[Path]:
     """Write the files of one frame into the form's folder; returns their paths. Raises DappledError and OSError."""
-    station, options = frame.station, frame.options
+    station, options, made = frame.station, frame.options, frame.frame
+    view = "ground" if form in _RIGS and (options.view != MEAN or made.laboratory.pictures is None) else MEAN
+    one = made.photograph(station, frame.projection, view=view, focus_m=options.focus_m)
     if form in _RIGS:
-        one = georeference.place(station, frame.made, frame.darkroom, frame.projection, replace(options, view="ground"))
-        grid = frame.made.light_field.views.shape[:2]
-        return view_files.write_frame(
-            folder, one, (grid[0], grid[1]), station, focus_m=options.focus_m, utc_ns=frame.utc_ns
-        )
-    one = georeference.place(station, frame.made, frame.darkroom, frame.projection, replace(options, view="mean"))
+        grid = None if view == MEAN else made.decoded.light_field.views.shape[:2]
+        return view_files.write_frame(folder, one, grid, station, focus_m=options.focus_m, utc_ns=frame.utc_ns)
     if form == "mcap":
-        return mcap_file.write_parts(folder, one, frame.made.light_field, station, frame.utc_ns)
+        return mcap_file.write_parts(folder, one, made.decoded.light_field, station, frame.utc_ns)
     assert frame.level_m is not None
     survey = georeference.on_ground(
         frame.flight, [one], [], projection=frame.projection, level_m=frame.level_m, options=options

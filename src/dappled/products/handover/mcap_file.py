@@ -59,8 +59,8 @@ def write_parts(folder: Path, one: Photograph, field: LightField, station: Stati
 
     Raises DappledError, DappledError and OSError."""
     need("mcap_ros2.writer")
-    record = view_cameras.of_photograph(one, ["mean"], station, float("inf"), utc_ns)
-    picture = folder / view_files.picture("mean", record.name)
+    record = view_cameras.of_photograph(one, [view_files.PICTURE], station, float("inf"), utc_ns)
+    picture = folder / view_files.picture(view_files.PICTURE, record.name)
     durable.make_folder(picture.parent)
     durable.write_file(picture, photo_files.jpeg(one, station, utc_ns, cog.gain_of([one.image])))
     slices = folder / "slices" / f"{record.name}.npz"

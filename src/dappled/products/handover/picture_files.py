@@ -13,31 +13,21 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import rawpy
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
 from dappled import __version__, durable
-from dappled.decode import srgb
-from dappled.decode.array_types import Floats, Singles
-from dappled.decode.picture.picture import interpolated
+from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.products.geotags import exif_gps
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
 
 SUFFIXES = (".dng", ".tif", ".tiff", ".jpg", ".jpeg", ".png")
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_BYTE, _ASCII, _SHORT, _LONG, _UNDEFINED, _SRATIONAL = 1, 2, 3, 4, 7, 10
-_RATIONAL = 5
-_CFA, _LINEAR_RAW = 32803, 34892  # photometric interpretations
-_BLACK, _WHITE = 1024, 1024 + 16384  # almost two stops of room above white
+_SHORT, _LONG, _UNDEFINED = 3, 4, 7
 _QUALITY = 95
-_D65 = 21
 _FILM_MM = 36.0
-_SRGB_OF_XYZ = np.array(
-    [[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560], [0.0556434, -0.2040259, 1.0572252]]
-)
 
 
 def encoded(made: MadePicture, suffix: str, where: exif_gps.Place | None) -> bytes:
@@ -46,10 +36,10 @@ def encoded(made: MadePicture, suffix: str, where: exif_gps.Place | None) -> byt
     first, inner = _settings(made)
     if kind == ".dng":
         if made.raw.cfa is None:
-            first.append((0x0106, _SHORT, 1, struct.pack("<H", _LINEAR_RAW)))
-        data = exif_gps.with_directory(_dng(made), _EXIF_IFD, inner, first)
+            first.append((0x0106, _SHORT, 1, struct.pack("<H", developing.LINEAR_RAW)))
+        data = exif_gps.with_directory(developing.dng(made), _EXIF_IFD, inner, first)
         return data if where is None else exif_gps.tagged(data, where)
-    shown = _developed(made)
+    shown = developing.developed(made)
     buffer = io.BytesIO()
     if kind in (".tif", ".tiff"):
         colours = "rgb" if shown.ndim == 3 else "minisblack"
@@ -78,112 +68,6 @@ def sigma_file(made: MadePicture) -> bytes:
 
 def _eight(shown: NDArray[np.uint16]) -> NDArray[np.uint8]:
     return np.asarray((shown.astype(np.uint32) * 255 + 32767) // 65535, dtype=np.uint8)
-
-
-def _developed(made: MadePicture) -> NDArray[np.uint16]:
-    """uint16 (H, W) or (H, W, 3) in sRGB's curve."""
-    if _bayer(made) is None:
-        image = interpolated(made.picture)
-        if image.ndim == 3:
-            image = np.asarray(_in_srgb(image[..., _rgb(made)], made), dtype=np.float32)
-        return np.asarray(np.round(srgb.encoded(np.clip(image, 0, 1)) * 65535), dtype=np.uint16)
-    with rawpy.imread(io.BytesIO(_dng(made))) as raw:
-        return np.asarray(
-            raw.postprocess(
-                use_camera_wb=True,
-                no_auto_bright=True,
-                adjust_maximum_thr=0,
-                output_bps=16,
-                gamma=(2.4, 12.92),
-                user_flip=0,
-            )
-        )
-
-
-def _in_srgb(image: Singles, made: MadePicture) -> Floats:
-    """Balanced, and by the camera's matrix, to linear sRGB."""
-    matrix = _matrix(made) @ np.linalg.inv(_SRGB_OF_XYZ)  # from sRGB to the camera
-    matrix /= matrix.sum(axis=1, keepdims=True)
-    return np.asarray((image / _neutral(made)) @ np.linalg.inv(matrix).T)
-
-
-def _rgb(made: MadePicture) -> list[int]:
-    """The indices of red, green and blue."""
-    names = made.raw.colour_names
-    return [names.index(name) for name in "RGB"]
-
-
-def _bayer(made: MadePicture) -> bytes | None:
-    """The pattern as DNG has it, 0 red, 1 green, 2 blue; None for other chips."""
-    pattern, names = made.picture.pattern, made.raw.colour_names
-    if pattern.shape != (2, 2) or set(names) != set("RGB") or pattern.min() < 0:
-        return None
-    return bytes("RGB".index(names[index]) for index in pattern.ravel())
-
-
-def _matrix(made: MadePicture) -> Floats:
-    return _SRGB_OF_XYZ if made.colour_matrix is None else made.colour_matrix
-
-
-def _neutral(made: MadePicture) -> Floats:
-    """Red, green and blue of something white: by the file's own balance, else as grey as the whole frame."""
-    rgb = _rgb(made)
-    if made.raw.balance is not None:
-        return 1 / np.array(made.raw.balance)[rgb]
-    plane, pattern = made.picture.plane, made.picture.pattern
-    first = [made.raw.colour_names.index(name) for name in made.raw.colour_names]
-    means = []
-    for colour in rgb:
-        places = [place for place, index in np.ndenumerate(pattern) if index >= 0 and first[index] == colour]
-        a, b = pattern.shape
-        means.append(float(np.mean([plane[row::a, column::b].mean() for row, column in places])))
-    return np.maximum(means, 1e-6) / max(*means, 1e-6)
-
-
-def _dng(made: MadePicture) -> bytes:
-    """The linear values as DNG, without EXIF."""
-    pattern = _bayer(made)
-    image = made.picture.plane if pattern is not None else interpolated(made.picture)
-    colours = pattern is not None or image.ndim == 3
-    if image.ndim == 3:
-        image = image[..., _rgb(made)]
-    values = np.clip(np.round(image * (_WHITE - _BLACK) + _BLACK), 0, 65535).astype(np.uint16)
-    samples = 1 if values.ndim == 2 else values.shape[2]
-    tags: list[tuple[int, int, int, object, bool]] = [
-        (50706, _BYTE, 4, bytes((1, 4, 0, 0)), True),
-        (50707, _BYTE, 4, bytes((1, 2, 0, 0)), True),
-        (50708, _ASCII, 0, made.raw.camera_model or "dappled", True),
-        (50714, _SHORT, samples, (_BLACK,) * samples if samples > 1 else _BLACK, True),
-        (50717, _SHORT, samples, (_WHITE,) * samples if samples > 1 else _WHITE, True),
-    ]
-    if colours:
-        matrix = [part for value in _matrix(made).ravel() for part in (round(value * 10000), 10000)]
-        neutral = [part for value in _neutral(made) for part in (round(value * 10**6), 10**6)]
-        tags += [
-            (50721, _SRATIONAL, 9, tuple(matrix), True),
-            (50728, _RATIONAL, 3, tuple(neutral), True),
-            (50778, _SHORT, 1, _D65, True),
-        ]
-    if pattern is not None:
-        tags += [
-            (33421, _SHORT, 2, (2, 2), True),
-            (33422, _BYTE, 4, pattern, True),
-            (50710, _BYTE, 3, bytes((0, 1, 2)), True),
-            (50711, _SHORT, 1, 1, True),
-        ]
-    buffer = io.BytesIO()
-    grey = samples == 1 and pattern is None  # tifffile wants three samples of LinearRaw
-    tifffile.imwrite(
-        buffer,
-        values,
-        byteorder="<",
-        photometric="minisblack" if grey else _LINEAR_RAW if pattern is None else _CFA,
-        planarconfig="contig" if samples > 1 else None,
-        metadata=None,
-        software=False,
-        extratags=tags,
-    )
-    return buffer.getvalue()
 
 
 def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:

@@ -251,7 +251,7 @@ def provisos(frames: Sequence[FrameCameras]) -> list[str]:
                 f"views stand as far apart as {words}, in {len(those)} of {len(frames)} frames: to ±{max(shares):.1%} "
                 "(1 standard deviation)"
             )
-    if any(one.focus_m is None for one in frames):
+    if any(one.focus_m is None and len(one.views) > 1 for one in frames):
         said.append(
             "the lens was taken as focused at infinity: focused at F metres, each view's principal point is off by its "
             "distance from the middle view (m) times the focal length (px) / F (give it with --focus)"

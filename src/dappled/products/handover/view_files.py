@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
@@ -14,31 +16,31 @@ from dappled.errors import DappledError
 from dappled.products.handover import photo_files, view_cameras
 from dappled.products.handover.view_cameras import FrameCameras
 from dappled.products.maps import cog
-from dappled.products.maps.eye import through
 from dappled.products.maps.photographs import Photograph, Station
 
 RECORDS = "frames"
-_VIEW = re.compile(r"mean|v\d+u\d+")
+PICTURE = "picture"  # its name among the views: the frame as a whole, at the sensor's own resolution
+_VIEW = re.compile(rf"{PICTURE}|v\d+u\d+")
 
 
 def write_frame(
-    folder: Path, one: Photograph, grid: tuple[int, int], station: Station, *, focus_m: float, utc_ns: int | None
+    folder: Path, one: Photograph, grid: tuple[int, ...] | None, station: Station, *, focus_m: float, utc_ns: int | None
 ) -> list[Path]:
-    """Write images/<view>/<frame>.jpg for each view, then frames/<frame>.json; returns their paths.
+    """Write images/<view>/<frame>.jpg for each view, or the one picture, then frames/<frame>.json; returns their paths.
 
-    `one` has the views, `grid` is how many stand below and beside each other in the aperture. Raises DappledError,
-    also for a frame without views, and OSError.
+    `grid` is how many views of `one` stand below and beside each other in the aperture; None: its picture is wanted.
+    Raises DappledError, also for a frame without views, and OSError.
     """
-    if one.views is None or one.apertures_m is None:
+    if grid is not None and one.views is None:
         raise DappledError(
             f"{station.frame.name} has no views, only slices: decode it with a calibration (--calibration)"
         )
-    names = [f"v{v}u{u}" for v in range(grid[0]) for u in range(grid[1])]
+    names = [PICTURE] if grid is None else [f"v{v}u{u}" for v, u in np.ndindex(*grid)]
     record = view_cameras.of_photograph(one, names, station, focus_m, utc_ns)
     gain = cog.gain_of([one.image])
     written = []
-    for name, image, (y, x) in zip(names, one.views, one.apertures_m, strict=True):
-        view = replace(one, image=image, eye=through(one.eye, (float(y), float(x)), focus_m))
+    for name, (image, eye) in zip(names, one.layers(focus_m), strict=True):
+        view = replace(one, image=image, eye=eye)
         path = folder / picture(name, record.name)
         durable.make_folder(path.parent)
         durable.write_file(path, photo_files.jpeg(view, station, utc_ns, gain))

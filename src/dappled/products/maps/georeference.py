@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -12,20 +13,23 @@ from typing import Any, Protocol
 import numpy as np
 
 from dappled.decode.lightfield import LightField
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Finding, first_by_name
-from dappled.flight import FlightFolder, Frame, Tag
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
 from dappled.products.maps.ground import Flat, Ground, Raster
 from dappled.products.maps.ground import load as load_ground
+from dappled.products.maps.laboratory import MEAN, Laboratory
 from dappled.products.maps.map_grid import MapError
 from dappled.products.maps.photographs import Photograph, Station
 from dappled.products.maps.references import BaseMap
 from dappled.products.maps.self_calibration import FlightLens
 from dappled.products.mounting import Mounting
+
+_SWEPT_PX = 60_000  # of a picture: heights come from windows of many pixels
+_CHOSEN = 1.5  # of the pictures' own ground sample: a map that is coarser was chosen to be
 
 Progress = Callable[[str, int, int], None]  # what, done, of
 
@@ -41,9 +45,9 @@ class Options:
     """How a flight is mapped; None takes the flight's own value.
 
     `ground_m` is the ground's height above sea level (default: home's); `terrain` a raster file, with ellipsoidal
-    heights where `terrain_geoid` is given. `gsd_m` defaults to the finest of the frames'. `view` is "mean", "ground"
-    (all views, refocused on the ground) or "v,u". `focus_m` is the distance at which the lens was focused. `frames`
-    holds the frames' numbers.
+    heights where `terrain_geoid` is given. `gsd_m` defaults to the finest of the frames'. `view` is "mean" (the picture
+    at the sensor's own resolution), "ground" (all views, refocused on the ground) or "v,u". `focus_m` is the distance
+    at which the lens was focused. `frames` holds the frames' numbers.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -52,7 +56,7 @@ class Options:
     terrain_geoid: Geoid | None = None
     crs: str | None = None
     gsd_m: float | None = None
-    view: str = "mean"
+    view: str = MEAN
     focus_m: float = float("inf")
     focal_length_mm: float | None = None
     f_number: float | None = None
@@ -80,6 +84,18 @@ class Survey:
         """What is in doubt about the photographs' light fields, and what their lens was not told."""
         of_lens = self.lens.doubts if self.lens else ()
         return [*first_by_name((one.name, one.doubts) for one in self.photographs), *of_lens]
+
+    def coarse(self) -> Survey:
+        """The survey in pictures that heights are searched in: as fine as its own map where that was chosen coarser
+        than the pictures, else of `_SWEPT_PX`: what a search takes grows with the cube of their fineness."""
+        finest = min(one.eye.gsd_m(_below(one, self.ground)) for one in self.photographs)
+        chosen = self.gsd_m / finest
+        largest = max(math.prod(one.eye.shape) for one in self.photographs)
+        step = int(chosen) if chosen > _CHOSEN else round(math.sqrt(largest / _SWEPT_PX))
+        if step < 2:
+            return self
+        gsd_m = self.gsd_m if chosen > _CHOSEN else _two_digits(step * self.gsd_m)
+        return replace(self, photographs=tuple(one.reduced(step) for one in self.photographs), gsd_m=gsd_m)
 
     def tags(self) -> dict[str, str]:
         """The metadata of map files."""
@@ -114,21 +130,23 @@ def survey(
     projection.at(first.latitude_deg, first.longitude_deg)
     level = level_of(stations, options)
     scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
-    darkroom = Darkroom(recipe)
-    darkroom.check()
+    laboratory = Laboratory(recipe)
+    laboratory.darkroom.check()
     taken: list[Photograph] = []
     for number, station in enumerate(stations):
-        progress("decode", number, len(stations))
+        progress("develop", number, len(stations))
         try:
-            made = decode(darkroom, flight, station.frame, station.tag, options)
-            one = place(station, made, darkroom, projection, options)
+            frame = laboratory.frame(
+                flight, station.frame, station.tag, focal_length_mm=options.focal_length_mm, f_number=options.f_number
+            )
+            one = frame.photograph(station, projection, view=options.view, focus_m=options.focus_m)
+            if watch is not None:
+                watch.measure(one, frame.decoded.light_field)
         except DappledError as error:
             left.append((station.frame.name, str(error)))
             continue
-        if watch is not None:
-            watch.measure(one, made.light_field)
         taken.append(_shelved(one, scratch))
-    progress("decode", len(stations), len(stations))
+    progress("develop", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
 
 
@@ -221,26 +239,6 @@ def with_own_lens(
     found = self_calibration.find(made.photographs, made.ground, control=points, sigmas=sigmas, progress=progress)
     photos = self_calibration.with_lens(made.photographs, found)
     return replace(made, photographs=tuple(photos), notes=(*made.notes, *unseen), lens=found)
-
-
-def decode(darkroom: Darkroom, flight: Path, frame: Frame, tag: Tag | None, options: Options) -> DecodeResult:
-    """Decode one frame of a flight. Raises DappledError."""
-    return darkroom.decode(
-        FlightFolder(flight).file(frame.name),
-        focal_length_mm=options.focal_length_mm or (tag.focal_length_mm if tag else None),
-        f_number=options.f_number or (tag.f_number if tag else None),
-    )
-
-
-def place(
-    station: Station, made: DecodeResult, darkroom: Darkroom, projection: Projection, options: Options
-) -> Photograph:
-    """Place a decoded frame on the map. Raises DappledError."""
-    field, gains = made.light_field, photographs.true_colours(made.raw)
-    if gains is not None and field.views.ndim == 5:
-        field = replace(field, views=field.views * gains.astype(np.float32))
-    profile = darkroom.camera(made.raw.camera_model or "")
-    return photographs.photograph(station, field, profile, projection, view=options.view, focus_m=options.focus_m)
 
 
 def _shelved(one: Photograph, scratch: Path) -> Photograph:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,11 @@ from dappled.decode.array_types import Singles
 from dappled.decode.geometry import Pose, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
 from dappled.decode.lightfield import LightField
+from dappled.drivers.raw import developing
+from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
-from dappled.findings import Finding
+from dappled.findings import FRAME, Finding, Level
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye, intrinsics, look, through
@@ -86,6 +88,24 @@ class Photograph:
     doubts: tuple[Finding, ...] = ()
     lens: Lens | None = None
 
+    def eye_on(self, grid: Matrix, shape: tuple[int, int]) -> Eye:
+        """The same eye for samples that lie elsewhere on the sensor: `grid` (2, 3) and their `shape`, as in
+        `LightField`."""
+        mine, theirs = (np.vstack([one[::-1, [1, 0, 2]], [0, 0, 1]]) for one in (self.grid, grid))
+        return replace(self.eye, matrix=np.linalg.inv(theirs) @ mine @ self.eye.matrix, shape=shape)
+
+    def reduced(self, step: int) -> Photograph:
+        """The photograph with means of `step` × `step` pixels in place of each, without views."""
+        rows, columns = (side // step for side in self.eye.shape)
+        blocks = self.image[: rows * step, : columns * step].reshape(rows, step, columns, step, -1)
+        image = blocks.mean(axis=(1, 3), dtype=np.float32)
+        coarser = np.array([[step, 0, (step - 1) / 2], [0, step, (step - 1) / 2], [0, 0, 1]])
+        grid = self.grid[:, :3] @ coarser
+        return replace(
+            self, image=image[..., 0] if self.image.ndim == 2 else image, eye=self.eye_on(grid, (rows, columns)),
+            grid=grid, views=None, apertures_m=None,
+        )  # fmt: skip
+
     def layers(self, focus_m: float = math.inf) -> list[tuple[Singles, Eye]]:
         """The images that make up the map, each with its eye."""
         if self.views is None or self.apertures_m is None:
@@ -149,20 +169,46 @@ def eye_of(
     Raises PhotographError, ConfigError, EarthError.
     """
     rows, columns = field.attributes["shape"]
-    lens = lens_of(profile, _focal_length_mm(station, field), focus_m)
+    lens = lens_of(profile, _focal_length_mm(station, field.attributes.get("focal_length_mm")), focus_m)
+    sensor, shape = profile.sensor((int(rows), int(columns))), (field.slices.shape[1], field.slices.shape[2])
+    return _eye(station, lens, intrinsics(sensor, lens, field.grid), shape, projection)
+
+
+def _eye(station: Station, lens: Lens, matrix: Matrix, shape: tuple[int, int], projection: Projection) -> Eye:
     camera = station.camera
     return look(
-        intrinsics(profile.sensor((int(rows), int(columns))), lens, field.grid),
+        matrix,
         lens,
-        shape=(field.slices.shape[1], field.slices.shape[2]),
+        shape=shape,
         at=projection.at(camera.latitude_deg, camera.longitude_deg),
         height_m=camera.altitude_msl_m,
         camera_to_ned=station.camera_to_ned,
     )
 
 
-def _focal_length_mm(station: Station, field: LightField) -> float:
-    known = field.attributes.get("focal_length_mm") or station.tag.focal_length_mm
+def of_picture(
+    station: Station,
+    made: MadePicture,
+    profile: CameraProfile,
+    projection: Projection,
+    *,
+    focus_m: float = math.inf,
+    colour: bool = True,
+) -> Photograph:
+    """The photograph of a frame's picture at the sensor's own resolution. Raises as `eye_of`."""
+    lens = lens_of(profile, _focal_length_mm(station, made.focal_length_mm), focus_m)
+    shape = made.picture.shadow.shape
+    grid: Matrix = np.eye(2, 3)
+    eye = _eye(station, lens, intrinsics(made.sensor, lens, grid), shape, projection)
+    doubts = tuple(replace(one, subject=FRAME) for one in made.findings if one.level > Level.NOTE)
+    return Photograph(
+        station.name, station.tag.utc_ns, developing.linear(made, colour=colour), eye, *_sigmas(station.tag.pose), grid,
+        doubts=doubts, lens=lens,
+    )  # fmt: skip
+
+
+def _focal_length_mm(station: Station, told: float | None) -> float:
+    known = told or station.tag.focal_length_mm
     if known is None:
         raise PhotographError(f"the focal length of {station.frame.name} is unknown: give it with --focal-length")
     return float(known)
@@ -192,14 +238,14 @@ def photograph(
     sigmas = _sigmas(station.tag.pose)
     return Photograph(
         station.name, station.tag.utc_ns, image, eye, *sigmas, field.grid, views, apertures, aperture, field.doubts,
-        lens_of(profile, _focal_length_mm(station, field), focus_m),
+        lens_of(profile, _focal_length_mm(station, field.attributes.get("focal_length_mm")), focus_m),
     )  # fmt: skip
 
 
 def aperture_of(station: Station, field: LightField) -> ApertureWidth:
     """The full aperture: focal length / f-number, the one that the carriers show where they do. Raises PhotographError
     where one is unknown."""
-    length_m = _focal_length_mm(station, field) * 1e-3
+    length_m = _focal_length_mm(station, field.attributes.get("focal_length_mm")) * 1e-3
     shown, sigma = (field.attributes.get(f"f_number_shown{word}") for word in ("", "_sigma"))
     if shown and sigma:
         return ApertureWidth(length_m / float(shown), length_m / float(shown) ** 2 * float(sigma), "carriers")

@@ -52,6 +52,7 @@ def of(
     made: Survey, progress: Progress, *, lowest_m: float | None = None, highest_m: float | None = None
 ) -> TerrainModel:
     """Find a survey's terrain by hyperstereo, between two heights above sea level. Raises HyperstereoError."""
+    made = made.coarse()
     grid = map_grid.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
     east, north = grid.places(made.projection)
     given = made.ground.heights(east, north)

@@ -44,6 +44,7 @@ def surface(
     σ of a height is that of a match and of each frame's pose, over the frames' baselines. Raises HyperstereoError
     where no cell is seen twice.
     """
+    made = made.coarse()
     photos = made.photographs
     grid = map_grid.grid_of(photos, made.ground, made.projection, cell_m or CELL * made.gsd_m)
     east, north = grid.places(made.projection)

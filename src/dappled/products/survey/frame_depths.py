@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dappled.decode.array_types import Singles
 from dappled.decode.depth import DepthMap
@@ -26,13 +27,14 @@ class InverseDepth:
 
     Inverse distances have errors that are normal and don't depend on the distance, and below 2 σ they can't be told
     from infinity: so frames are averaged in them. `gain_sigma_share` is the common error of all distances as a share of
-    them, `source` where the distances come from.
+    them, `source` where the distances come from; `grid` maps their pixels to the sensor, as in `LightField`.
     """
 
     inverse_per_m: Singles
     sigma_per_m: Singles
     gain_sigma_share: float
     source: str
+    grid: NDArray[np.float64]
 
 
 def of_field(found: OpenedLightField, made: DepthMap) -> InverseDepth:
@@ -43,8 +45,9 @@ def of_field(found: OpenedLightField, made: DepthMap) -> InverseDepth:
     share = np.float32(scale / ranging.gain_px_m)
     inverse = made.disparity * share - np.float32(ranging.offset_px / ranging.gain_px_m)
     return InverseDepth(
-        inverse.astype(np.float32), (made.sigma * share).astype(np.float32), ranging.gain_sigma_share, ranging.source
-    )
+        inverse.astype(np.float32), (made.sigma * share).astype(np.float32), ranging.gain_sigma_share, ranging.source,
+        found.field.grid,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,4 +75,4 @@ class FrameDepths:
         for kind, values in zip(_KINDS, (made.inverse_per_m, made.sigma_per_m), strict=True):
             np.save(self.scratch / f"{one.name}-{kind}.npy", values)
         inverse, sigma = (np.load(self.scratch / f"{one.name}-{kind}.npy", mmap_mode="r") for kind in _KINDS)
-        self.found[one.name] = InverseDepth(inverse, sigma, made.gain_sigma_share, made.source)
+        self.found[one.name] = replace(made, inverse_per_m=inverse, sigma_per_m=sigma)

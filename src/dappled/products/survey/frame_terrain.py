@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,7 @@ def of(
 
     Raises FrameTerrainError where no frame has inverse distances or no height is known, MapError for a grid too large.
     """
-    seen = [(one, depths[one.name]) for one in made.photographs if one.name in depths]
+    seen = [(_sampled(one, depths[one.name]), depths[one.name]) for one in made.photographs if one.name in depths]
     if not seen:
         raise FrameTerrainError("no frame has distances of its own, so single frames give no heights")
     photos = [one for one, _ in seen]
@@ -105,6 +105,12 @@ def of(
         float(np.median([_level_sigma(one, depth, _level(one, made)) for one, depth in seen])),
         float(np.nanmedian(above)), 1 / focus if focus > 0 else math.inf, seen[0][1].source,
     )  # fmt: skip
+
+
+def _sampled(one: Photograph, depth: InverseDepth) -> Photograph:
+    """The photograph, its eye that of the depth map's pixels."""
+    rows, columns = depth.inverse_per_m.shape
+    return replace(one, eye=one.eye_on(depth.grid, (rows, columns)), grid=depth.grid)
 
 
 def write_raster(made: Survey, terrain: FrameTerrain, path: Path) -> Path:

@@ -1,0 +1,96 @@
+"""Make of a flight's frames what is asked for: pictures at the sensor's own resolution, and light fields.
+
+A picture costs a tenth of the views. What shows a frame as a whole is made of it; views are made where they are named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from dappled.config import profiles
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.picture_maker import PictureMaker
+from dappled.findings import Finding
+from dappled.flight import FlightFolder, Frame, Tag
+from dappled.products.maps import photographs
+from dappled.products.maps.earth import Projection
+from dappled.products.maps.photographs import Photograph, Station
+
+MEAN = "mean"
+
+
+class Laboratory:
+    """Makes pictures and light fields by one recipe; `pictures` is None behind lenslets, which show none but views."""
+
+    def __init__(self, recipe: Recipe) -> None:
+        self.recipe = recipe
+        self.darkroom = Darkroom(recipe)
+        self.pictures = None if recipe.mask == profiles.LENSLET else PictureMaker(recipe)
+
+    def frame(
+        self,
+        flight: Path,
+        frame: Frame,
+        tag: Tag | None,
+        *,
+        focal_length_mm: float | None = None,
+        f_number: float | None = None,
+    ) -> FlightFrame:
+        """One frame of a flight; lens and stop are those given, else its tag's, else those of its file."""
+        return FlightFrame(
+            self,
+            FlightFolder(flight).file(frame.name),
+            focal_length_mm or (tag.focal_length_mm if tag else None),
+            f_number or (tag.f_number if tag else None),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FlightFrame:
+    """A frame's picture and light field, each made when it is first asked for. Both raise DappledError."""
+
+    laboratory: Laboratory
+    path: Path
+    focal_length_mm: float | None
+    f_number: float | None
+    _doubts: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
+    _kept: dict[str, Photograph] = field(default_factory=dict)  # by projection
+
+    @cached_property
+    def decoded(self) -> DecodeResult:
+        """The light field."""
+        made = self.laboratory.darkroom.decode(self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number)
+        self._doubts["decoded"] = made.doubts
+        return made
+
+    @property
+    def doubts(self) -> tuple[Finding, ...]:
+        """All that is in doubt about what was made so far, each once."""
+        return tuple({one.kind: one for found in self._doubts.values() for one in found}.values())
+
+    def photograph(self, station: Station, projection: Projection, *, view: str, focus_m: float) -> Photograph:
+        """The frame on the map: its picture for `view` "mean", else views, see `photographs.photograph`. Raises
+        DappledError."""
+        laboratory = self.laboratory
+        if view == MEAN and laboratory.pictures is not None:
+            if projection.name not in self._kept:
+                self._kept[projection.name] = self._pictured(laboratory.pictures, station, projection, focus_m)
+            return self._kept[projection.name]
+        decoded = self.decoded
+        light_field, gains = decoded.light_field, photographs.true_colours(decoded.raw)
+        if gains is not None and light_field.views.ndim == 5:
+            light_field = replace(light_field, views=light_field.views * gains.astype(np.float32))
+        profile = laboratory.darkroom.camera(decoded.raw.camera_model or "")
+        return photographs.photograph(station, light_field, profile, projection, view=view, focus_m=focus_m)
+
+    def _pictured(self, maker: PictureMaker, station: Station, projection: Projection, focus_m: float) -> Photograph:
+        made = maker.picture(self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number)
+        profile = self.laboratory.darkroom.camera(made.raw.camera_model or "")
+        colour = self.laboratory.recipe.colour
+        one = photographs.of_picture(station, made, profile, projection, focus_m=focus_m, colour=colour)
+        self._doubts["picture"] = one.doubts
+        return one
