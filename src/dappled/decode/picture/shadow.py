@@ -129,7 +129,7 @@ def shadow_of(
     none = equations.explained(None)
     for one in others:
         there = _Equations.of(means, one.lattice, one.orders)
-        if (told := there.explained(one) - none) > gain:
+        if (told := there.explained(one, equations.weights) - none) > gain:
             best, gain = one, told
     return best
 
@@ -339,10 +339,11 @@ class _Equations:
                 total += float((weights * self._gains(colour, self._local(c, degree)))[fold].sum()) / 2
         return total
 
-    def explained(self, other: Shadow | None) -> float:
-        """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none."""
+    def explained(self, other: Shadow | None, weights_of_blocks: Floats | None = None) -> float:
+        """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none.
+        (Those of several shadows compare where blocks weigh the same.)"""
         total, n = 0.0, self.right.shape[2]
-        for colour, weights in enumerate(self.weights):
+        for colour, weights in enumerate(self.weights if weights_of_blocks is None else weights_of_blocks):
             local = np.zeros((len(weights), n), dtype=np.complex128)
             if other is not None:
                 c = other.coefficients[min(colour, len(other.coefficients) - 1)]

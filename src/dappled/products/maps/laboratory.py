@@ -57,20 +57,20 @@ class FlightFrame:
     path: Path
     focal_length_mm: float | None
     f_number: float | None
-    _doubts: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
+    _found: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     _kept: dict[str, Photograph] = field(default_factory=dict)  # by projection
 
     @cached_property
     def decoded(self) -> DecodeResult:
         """The light field."""
         made = self.laboratory.darkroom.decode(self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number)
-        self._doubts["decoded"] = made.doubts
+        self._found["decoded"] = made.doubts
         return made
 
     @property
     def doubts(self) -> tuple[Finding, ...]:
         """All that is in doubt about what was made so far, each once."""
-        return tuple({one.kind: one for found in self._doubts.values() for one in found}.values())
+        return tuple({one.kind: one for found in self._found.values() for one in found}.values())
 
     def photograph(self, station: Station, projection: Projection, *, view: str, focus_m: float) -> Photograph:
         """The frame on the map: its picture for `view` "mean", else views, see `photographs.photograph`. Raises
@@ -92,5 +92,5 @@ class FlightFrame:
         profile = self.laboratory.darkroom.camera(made.raw.camera_model or "")
         colour = self.laboratory.recipe.colour
         one = photographs.of_picture(station, made, profile, projection, focus_m=focus_m, colour=colour)
-        self._doubts["picture"] = one.doubts
+        self._found["picture"] = one.doubts
         return one
