@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 
 from dappled import codec, findings
@@ -68,6 +70,26 @@ def test_the_report_names_frames_in_doubt_and_what_the_card_holds(
     assert "in doubt: frame 0: it may be of shot 1 as well: compare the picture with its neighbours" in said
 
 
+def test_the_report_says_what_stood_and_when(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:
+    down = finding(Code.LINK_DOWN, Subject("link", "/dev/ttyS0"), why="no such device")
+    filling = finding(Code.DISK_FILLING, Subject("disk"), left_mb=409, least_mb=200)
+    full = finding(Code.DISK_FULL, Subject("disk"), left_kb=1)
+    for kind, one in (("began", down), ("began", filling), ("ended", down), ("began", full), ("began", down)):
+        flight.ledger.add_event(kind, findings.json_text(one))
+    flight.close()
+    stood = flight_report.balance(flight.folder.path).stood
+    assert [one.finding for one in stood] == [down, filling, full, down]
+    assert [one.ended_utc_ns is None for one in stood] == [False, True, True, True]
+    assert stood[0].began_utc_ns is not None
+    main(["flight", "report", str(flight.folder.path)])
+    said = [line.strip() for line in capsys.readouterr().out.splitlines()]
+    (first, *_, last) = [line for line in said if line.startswith("stood: ")]
+    assert first.endswith(f": {findings.told(down)}")
+    assert last.endswith(f" to the end: {findings.told(down)}")
+    assert main(["flight", "report", str(flight.folder.path), "--json"]) == 1  # no shot was taken
+    assert json.loads(capsys.readouterr().out)["stood"][1]["finding"]["code"] == "disk.filling"
+
+
 def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:
     states = ("good", "bad", "unknown")
     for index in range(len(states) + 1):
@@ -82,9 +104,9 @@ def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys
     said = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
     judged = said.index("judged: 1 good, 0 usable, 1 bad, 2 unknown")
     assert said[judged + 1 : judged + 6] == [
-        "bad: frame 1: too dark: 1.0% of white on average",
+        "bad: frame 1: too dark: 1.0% of white on average: expose more",
         "bad: frame 1: 80% of the pixels are black",
-        "unknown: frame 2: too dark: 1.0% of white on average",
+        "unknown: frame 2: too dark: 1.0% of white on average: expose more",
         "unknown: frame 2: 80% of the pixels are black",
         "unknown: frame 3: not judged in flight",
     ]

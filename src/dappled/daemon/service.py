@@ -37,7 +37,7 @@ from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.health.record import DecodingState
-from dappled.daemon.health.standing import StandingFindings
+from dappled.daemon.health.standing import StandingEvents, StandingFindings
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
@@ -118,7 +118,7 @@ class Service:
         self._clock = clock or SystemClock()
         self._began_monotonic_ns = self._clock.monotonic_ns()
         self._logbook = Logbook(self._clock)
-        self._alarms, self._standing = Alarms(), StandingFindings()
+        self._alarms, self._standing, self._told = Alarms(), StandingFindings(), StandingEvents()
         self._stack = ExitStack()
         self._stopping = threading.Event()
         self._started = False
@@ -380,6 +380,8 @@ class Service:
     def _publish_health(self) -> None:
         record = self.health()
         self._publisher.publish("health", record)
+        for kind, one in self._told.of(record):
+            self._writer.later(kind, findings.json_text(one))
         for text, severity in self._alarms.lines(record, again=self.component.audience_has_grown()):
             self.component.say(text, severity, news=True)  # it began or ended again
 

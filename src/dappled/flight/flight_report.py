@@ -8,13 +8,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from dappled import findings
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import layout
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import (
+    BEGAN,
     DOUBT,
+    ENDED,
     LATER_DOUBT,
     LOST,
     NOTICED,
@@ -27,19 +28,30 @@ from dappled.flight.records import (
     Tag,
 )
 
+
+@dataclass(frozen=True, slots=True)
+class StoodFinding:
+    """A finding of the service above a note, and from when to when it stood; None: until the recording ended, or where
+    UTC was never known."""
+
+    finding: Finding
+    began_utc_ns: int | None
+    ended_utc_ns: int | None
+
+
 FrameVerdict = tuple[str, tuple[Finding, ...]]  # a frame's state, and why
 
 
 @dataclass(frozen=True, slots=True)
 class Balance:
     """The numbers of a flight. Every shot (`wishes`) is safe, failed or open; `refused` requests became no shot, and
-    neither did the autopilot's triggers in `lost_triggers` (a text for each run of its numbers, `lost` in all).
+    neither did the autopilot's triggers in `lost_triggers` (one for each run of its numbers, `lost` in all).
 
     `by_source` counts shots, `following` the failed ones whose files are still on the camera, `companions` files beside
     frames. `began_utc_ns` is None where UTC was never known. `judged` counts frames by their verdict in flight (a frame
     without one is unknown; empty where none was judged), `bad` says of each bad one why, `unknown` of each unknown one.
     `doubts` says of each frame that may be another shot's why, `card` what happened to the camera's card, and what
-    stays on it.
+    stays on it. `stood` is what the service found, above notes, in the order of its beginning.
     """
 
     flight: str
@@ -59,12 +71,13 @@ class Balance:
     companions: int = 0
     began_utc_ns: int | None = None
     lost: int = 0
-    lost_triggers: tuple[str, ...] = ()
+    lost_triggers: tuple[Finding, ...] = ()
     judged: Mapping[str, int] = field(default_factory=dict)
     bad: tuple[Finding, ...] = ()
     unknown: tuple[Finding, ...] = ()
     doubts: tuple[Finding, ...] = ()
     card: tuple[Finding, ...] = ()
+    stood: tuple[StoodFinding, ...] = ()
 
     @property
     def balanced(self) -> bool:
@@ -137,7 +150,7 @@ def balance(path: Path) -> Balance:
             companions=len(ledger.companions()),
             refused=_refused(events).total(),
             lost=sum(one.number("triggers") for one in lost),
-            lost_triggers=tuple(findings.told(one) for one in lost),
+            lost_triggers=tuple(lost),
             began_utc_ns=None
             if correction_ns is None or "began_utc_ns" not in facts
             else facts["began_utc_ns"] + correction_ns,
@@ -146,12 +159,32 @@ def balance(path: Path) -> Balance:
             unknown=_reasons("unknown", judged, frames),
             doubts=_found(events, DOUBT, LATER_DOUBT),
             card=_found(events, NOTICED),
+            stood=_stood(events, correction_ns),
         )
 
 
 def _found(events: Iterable[LedgerEvent], *kinds: str) -> tuple[Finding, ...]:
     """What events of these kinds hold."""
     return tuple(found for event in events if event.kind in kinds and (found := event.finding) is not None)
+
+
+def _stood(events: Iterable[LedgerEvent], correction_ns: int | None) -> tuple[StoodFinding, ...]:
+    """From when to when each finding of the service stood. One that rose goes on as what it has become."""
+    stood: list[StoodFinding] = []
+    lasting: dict[tuple[Code, Subject], int] = {}
+    for event in events:
+        if event.kind not in (BEGAN, ENDED) or (one := event.finding) is None:
+            continue
+        at_ns = None if correction_ns is None else event.utc_ns + correction_ns
+        place = lasting.pop(one.kind, None) if event.kind == ENDED else lasting.get(one.kind)
+        if event.kind == ENDED and place is not None:
+            stood[place] = replace(stood[place], ended_utc_ns=at_ns)
+        elif event.kind == BEGAN and place is not None:
+            stood[place] = replace(stood[place], finding=one)
+        elif event.kind == BEGAN:
+            lasting[one.kind] = len(stood)
+            stood.append(StoodFinding(one, at_ns, None))
+    return tuple(stood)
 
 
 def _reasons(wanted: str, judged: Mapping[int, FrameVerdict], frames: Sequence[Frame]) -> tuple[Finding, ...]:

@@ -22,6 +22,8 @@ DOUBT, LATER_DOUBT = "doubt", "later doubt"
 tag; the second was found after that."""
 NOTICED = "noticed"
 """A kind of events that hold a finding: what a driver said of the camera's card."""
+BEGAN, ENDED = "began", "ended"
+"""Kinds of events that hold a finding of the service above a note: it began to stand or rose, or was over."""
 REFUSED, LOST = "refused", "lost trigger"
 """Kinds of events that hold a finding: requests that became no shot, with their number `times` and their source as
 subject; triggers of the autopilot that became no request."""

@@ -10,7 +10,7 @@ from dappled import findings
 from dappled.errors import counted
 from dappled.flight import LIVE
 from dappled.flight.checks.flight_check import CheckReport
-from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport
+from dappled.flight.flight_report import Balance, FlightContents, ListedFlight, ShotLine, SourceReport, StoodFinding
 from dappled.flight.offload import Offloaded
 
 _SHOWN = 20  # frames of a verdict
@@ -108,8 +108,10 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     yield from (f"  {'card':>13}: {findings.told(one)}" for one in found.card[:_SHOWN])
     if len(found.card) > _SHOWN:
         yield f"  {'':13}  and {len(found.card) - _SHOWN} more (--json names all)"
-    for text in found.lost_triggers:
-        yield f"lost: {text}"
+    yield from (f"  {'stood':>13}: {_span(one)}: {findings.told(one.finding)}" for one in found.stood[:_SHOWN])
+    if len(found.stood) > _SHOWN:
+        yield f"  {'':13}  and {len(found.stood) - _SHOWN} more (--json names all)"
+    yield from (f"lost: {findings.told(one)}" for one in found.lost_triggers)
     if found.balanced and not found.wishes:
         yield "NO SHOT in this flight: there are no counts to compare"
         return
@@ -117,6 +119,15 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield f"THE COUNTS DO NOT AGREE: {counted(found.lost, 'trigger')} of the autopilot became no shot"
         return
     yield "the counts agree" if found.balanced else "THE COUNTS DO NOT AGREE: run `dappled flight check`"
+
+
+def _span(one: StoodFinding) -> str:
+    """From when to when a finding stood, UTC."""
+    if one.began_utc_ns is None:
+        return "at a time that is not known"
+    return (
+        f"{_utc(one.began_utc_ns)[11:19]} to {'the end' if one.ended_utc_ns is None else _utc(one.ended_utc_ns)[11:19]}"
+    )
 
 
 def _table(sources: Sequence[SourceReport]) -> Iterator[str]:

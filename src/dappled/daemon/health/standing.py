@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from dappled import codec
 from dappled.findings import WORDS, Code, Finding, Level, Subject, above_note, in_order
+from dappled.flight.records import BEGAN, ENDED
 
 ALL_IS_WELL = "all is well"
+_MOST_TIMES, _MOST_KINDS = 20, 200  # that the ledger is told of: some come and go all the time
 _AGE = "age_s"  # beside a finding in the record
 
 
@@ -74,3 +77,26 @@ class NewFindings:
         known, now = self._known, above_note(found)
         self._known = {one.kind: one.level for one in now}
         return [one for one in now if again or one.level > known.get(one.kind, Level.NOTE)]
+
+
+class StandingEvents:
+    """What the ledger is told: when each finding above a note began to stand, or rose; and when it was over."""
+
+    def __init__(self) -> None:
+        self._open: dict[tuple[Code, Subject], Finding] = {}
+        self._times: Counter[tuple[Code, Subject]] = Counter()
+
+    def of(self, health: Mapping[str, Any]) -> list[tuple[str, Finding]]:
+        """(kind of event, finding) for what has changed since the last health record."""
+        standing = {one.kind for one in above_note(in_record(health))}
+        events = [(ENDED, one) for kind, one in self._open.items() if kind not in standing]
+        self._open = {kind: one for kind, one in self._open.items() if kind in standing}
+        for one in above_note(unasked(health)):
+            known = self._open.get(one.kind)
+            if known is not None and known.level >= one.level:
+                continue
+            if self._times[one.kind] < _MOST_TIMES and (one.kind in self._times or len(self._times) < _MOST_KINDS):
+                self._times[one.kind] += 1
+                self._open[one.kind] = one
+                events.append((BEGAN, one))
+        return events
