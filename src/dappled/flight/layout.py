@@ -12,7 +12,7 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -76,6 +76,13 @@ class FlightFolder:
     @property
     def frames(self) -> Path:
         return self.path / "frames"
+
+    def files(self) -> Iterator[Path]:
+        """Every plain file below, in order; links are not followed. Raises OSError."""
+        for root, folders, names in os.walk(self.path, onerror=_raise):
+            folders.sort()
+            paths = (Path(root, name) for name in sorted(names))
+            yield from (path for path in paths if path.is_file() and not path.is_symlink())
 
     def file(self, name: str) -> Path:
         """The path of a file that the ledger names, inside the flight. Raises OutsideError for a name that isn't."""
@@ -323,6 +330,19 @@ def refuse_unfinished(folder: FlightFolder) -> None:
         raise FlightError(f"{folder.path} is the copy of an offload that was cut short: run that offload again first")
 
 
+def remove_parts(folder: FlightFolder) -> list[str]:
+    """Remove what was left half-written when recording or work was killed, durably, and name it. Raises FlightError."""
+    try:
+        parts = [path for path in folder.files() if durable.is_temporary(path.name)]
+        for path in parts:
+            path.unlink()
+        for place in {path.parent for path in parts}:
+            durable.sync_folder(place)  # or they might stand there again, in a flight that is closed by then
+    except OSError as error:
+        raise disk_error("remove what was left half-written in", folder.path, error) from error
+    return [path.name for path in parts]
+
+
 def work_lock(root: Path, doing: str, *, needed: bool = False) -> AbstractContextManager[object]:
     """The lock of a flights folder for work on its closed flights. Where this user can't make it there and no other
     process holds it, or the file system has no locks, the work goes without, unless it is `needed`. Raises
@@ -352,3 +372,7 @@ def is_locked(root: Path) -> bool:
         return True
     finally:
         os.close(fd)
+
+
+def _raise(error: OSError) -> None:
+    raise error

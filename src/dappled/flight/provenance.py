@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 from dappled import durable
-from dappled.confined import OutsideError
 from dappled.flight import layout
 from dappled.flight.errors import disk_error
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.ledger import Ledger
 
 _FACT = "sha256:"  # and the name relative to the flight; the value lists every hash that is right
 
@@ -43,27 +41,10 @@ def write_facts(folder: FlightFolder, ledger: Ledger, facts: Mapping[str, Any]) 
         raise disk_error("write", folder.settings, error) from error
 
 
-def problems(folder: FlightFolder, ledger: LedgerReader) -> Iterator[str]:
-    """A sentence for each file that differs from its stored hash. `read_facts` reports a missing flight.toml."""
-    for key, hashes in sorted(ledger.facts().items()):
-        if not key.startswith(_FACT):
-            continue
-        name = key.removeprefix(_FACT)
-        try:
-            path = folder.file(name)
-        except OutsideError as error:
-            yield str(error)
-            continue
-        if path == folder.settings and not path.exists():
-            continue
-        yield from _problem(path, name, hashes)
-
-
-def _problem(path: Path, name: str, hashes: list[str]) -> Iterator[str]:
-    try:
-        if durable.hash_file(path) not in hashes:
-            yield f"{name} was changed: its SHA-256 is not the ledger's"
-    except FileNotFoundError:
-        yield f"{name} is in the ledger, but the file is missing"
-    except OSError as error:
-        yield f"{name} can't be read: {error.strerror}"
+def noted(facts: Mapping[str, Any]) -> dict[str, list[str]]:
+    """From the ledger's facts: every hash that is right, by the name of the file."""
+    return {
+        key.removeprefix(_FACT): value if isinstance(value, list) else []
+        for key, value in sorted(facts.items())
+        if key.startswith(_FACT)
+    }

@@ -71,7 +71,8 @@ def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:
     Raises FlightError or OSError when ledger or disk don't allow it, OutsideError when a part of it is a link.
     """
     folder.refuse_links()
-    report = _remove_parts(folder) + _move_damaged_ledger(folder)
+    report = [f"the half-written file {name} was removed" for name in layout.remove_parts(folder)]
+    report += _move_damaged_ledger(folder)
     with Ledger(folder.ledger, clock) as ledger:
         report += _add_noted_shots(folder, ledger)
         report += _adopt(folder, ledger)
@@ -118,20 +119,6 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
     durable.sync_folder(folder.path)
     lost = "it was rebuilt from shots.jsonl and frames, without poses, tags and times of firing"
     return [f"the ledger was damaged ({damage}) and moved to {aside.name}; {lost}"]
-
-
-def _remove_parts(folder: FlightFolder) -> list[str]:
-    report = []
-    for place in (folder.path, folder.frames):
-        if not place.is_dir():
-            continue
-        for name in sorted(os.listdir(place)):
-            if durable.is_temporary(name):
-                (place / name).unlink()
-                report.append(f"the half-written file {name} was removed")
-        if report:
-            durable.sync_folder(place)  # or it might stand there again, in a flight that is closed by then
-    return report
 
 
 def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:

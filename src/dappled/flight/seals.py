@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -141,7 +141,8 @@ def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None =
 def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None) -> Iterator[None]:
     """Work on a closed flight as `reopened` does, where the caller has judged whether `key` may sign. Raises
     FlightError."""
-    _remove_parts(folder)
+    layout.refuse_unfinished(folder)
+    layout.remove_parts(folder)
     last, changed = read(folder).last, changed_since(folder)
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event("opened again", why)
@@ -153,20 +154,6 @@ def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | No
         yield
     finally:
         seal(folder, clock, why, key)
-
-
-def _remove_parts(folder: FlightFolder) -> None:
-    """Remove what earlier work left half-written when it was killed. Raises FlightError, also where the flight is the
-    copy of an offload that was cut short: that one goes on."""
-    layout.refuse_unfinished(folder)
-    try:
-        for root, _, names in os.walk(folder.path, onerror=_raise):
-            for name in names:
-                path = Path(root, name)
-                if durable.is_temporary(name) and path.is_file() and not path.is_symlink():
-                    path.unlink()
-    except OSError as error:
-        raise disk_error("remove what was left half-written in", folder.path, error) from error
 
 
 def may_sign(folder: FlightFolder, key: SealKey) -> bool:
@@ -198,24 +185,41 @@ def changed_since(folder: FlightFolder) -> list[str]:
         return []
     with LedgerReader.open(folder.ledger) as ledger:
         recorded = recorded_files(ledger)
-    present = {path.relative_to(folder.path).as_posix(): path for path in sealed_paths(folder)}
-    wal = folder.ledger.with_name(folder.ledger.name + "-wal")
-    found = {*(last.files.keys() - present.keys())}
+    found = set()
+    try:
+        for name, what in differing(folder, last, recorded.keys()):
+            if isinstance(what, OSError):
+                raise what
+            found.add(name)
+        wal = folder.ledger.with_name(folder.ledger.name + "-wal")
+        if wal.is_file() and wal.stat().st_size:
+            found.add(folder.ledger.name)
+    except OSError as error:
+        raise disk_error("read the files of", folder.path, error) from error
     try:
         found -= pruning.removed(folder).keys()
     except FlightError:  # `flight check` says what is wrong with it
         found.add(pruning.RECORD)
-    try:
-        if wal.is_file() and wal.stat().st_size:
-            found.add(folder.ledger.name)
-        found |= {
-            name
-            for name, path in present.items()
-            if name not in recorded and last.files.get(name) != (path.stat().st_size, durable.hash_file(path))
-        }
-    except OSError as error:
-        raise disk_error("read the files of", folder.path, error) from error
     return sorted(found)
+
+
+def differing(folder: FlightFolder, last: Seal, known: Collection[str]) -> Iterator[tuple[str, str | OSError]]:
+    """Each file that is not as a seal covers it: its name, and whether it is "missing", "changed" or "added", or why it
+    can't be read. Those of `known` are not read: something else has their digests. Raises OSError."""
+    present = {path.relative_to(folder.path).as_posix(): path for path in sealed_paths(folder)}
+    for name in sorted(last.files.keys() | present.keys()):
+        if name not in present:
+            yield name, "missing"
+            continue
+        if name in known:
+            continue
+        try:
+            if name not in last.files:
+                yield name, "added"
+            elif last.files[name] != (present[name].stat().st_size, durable.hash_file(present[name])):
+                yield name, "changed"
+        except OSError as error:
+            yield name, error
 
 
 def is_sealed(folder: FlightFolder) -> bool:
@@ -280,14 +284,7 @@ def sealed_paths(folder: FlightFolder) -> Iterator[Path]:
     ledger = folder.ledger
     beside = {ledger.with_name(ledger.name + suffix) for suffix in _BESIDE_LEDGER}
     beside |= {folder.seals, folder.path / pruning.RECORD}
-    for root, folders, names in os.walk(folder.path, onerror=_raise):
-        folders.sort()
-        for name in sorted(names):
-            path = Path(root, name)
-            if path in beside or durable.is_temporary(name):
-                continue
-            if path.is_file() and not path.is_symlink():
-                yield path
+    return (path for path in folder.files() if path not in beside and not durable.is_temporary(path.name))
 
 
 def of_flight(facts: Mapping[str, object]) -> str:
@@ -347,7 +344,3 @@ def _alone(path: Path) -> Iterator[None]:
         yield
     finally:
         os.close(fd)
-
-
-def _raise(error: OSError) -> None:
-    raise error

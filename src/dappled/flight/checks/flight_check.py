@@ -5,10 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from dappled import durable
 from dappled.confined import OutsideError
@@ -122,7 +123,7 @@ def _compare(
             problems += [problem] if problem else []
         problems += _names(folder, ledger, closed)
     with _examining("the inputs", problems):
-        problems += provenance.problems(folder, ledger)
+        problems += _inputs(folder, facts)
     with _examining("the shot journal", problems):
         problems += _shots(folder, ledger, notes)
     with _examining("the telemetry", problems):
@@ -186,23 +187,33 @@ def _where(elsewhere: Mapping[str, Removed]) -> Iterator[str]:
 def _files(folder: FlightFolder, ledger: LedgerReader, elsewhere: Collection[str]) -> Iterator[tuple[int, str | None]]:
     """(bytes read, problem) for every file that the ledger acknowledges and that was not offloaded `elsewhere`."""
     for row in ledger.files():
-        if row.name in elsewhere:
-            continue
-        try:
-            path = folder.file(row.name)
-            size = path.stat().st_size
-            if size != row.size:
-                yield size, f"{row.name} has {size} bytes, the ledger says {row.size}"
-            elif durable.hash_file(path) != row.sha256:
-                yield size, f"{row.name} was changed: its SHA-256 is not the ledger's"
-            else:
-                yield size, None
-        except OutsideError as error:
-            yield 0, str(error)
-        except FileNotFoundError:
-            yield 0, f"{row.name} is in the ledger, but the file is missing"
-        except OSError as error:
-            yield 0, f"{row.name} can't be read: {error.strerror}"
+        if row.name not in elsewhere:
+            yield _read(folder, row.name, row.size, [row.sha256])
+
+
+def _inputs(folder: FlightFolder, facts: Mapping[str, Any]) -> Iterator[str]:
+    """A sentence for each input that differs from its hash. `read_facts` tells of a missing flight.toml."""
+    for name, hashes in provenance.noted(facts).items():
+        _, problem = _read(folder, name, None, hashes)
+        if problem is not None and (name != folder.settings.name or folder.settings.exists()):
+            yield problem
+
+
+def _read(folder: FlightFolder, name: str, size: int | None, hashes: Sequence[str]) -> tuple[int, str | None]:
+    """(bytes read, problem) of one file that the ledger holds hashes of, any of which is right."""
+    try:
+        path = folder.file(name)
+        found = path.stat().st_size
+        if size not in (found, None):
+            return found, f"{name} has {found} bytes, the ledger says {size}"
+        right = durable.hash_file(path) in hashes
+        return found, None if right else f"{name} was changed: its SHA-256 is not the ledger's"
+    except OutsideError as error:
+        return 0, str(error)
+    except FileNotFoundError:
+        return 0, f"{name} is in the ledger, but the file is missing"
+    except OSError as error:
+        return 0, f"{name} can't be read: {error.strerror}"
 
 
 def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator[str]:

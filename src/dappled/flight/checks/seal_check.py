@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from dappled import durable
-from dappled.confined import OutsideError
 from dappled.errors import counted
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight import layout, seals
+from dappled.flight import layout, provenance, seals
 from dappled.flight.chain import ChainLink
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -80,9 +79,8 @@ def compare(
             f"the flight was opened again after seal {last.seal} ({last.why}): {counted(unsealed, 'link')} "
             "of the chain and the files written since are not sealed yet"
         )
-    for name, text in _files(folder, last, _vouched_by_ledger(ledger, facts)):
-        (notes if unsealed and not seals.never_changes(name) else problems).append(text)
-    notes += _added(folder, last, ledger, problems if not unsealed else notes)
+    for wrong, text in _files(folder, last, _vouched_by_ledger(ledger, facts), unsealed=unsealed > 0):
+        (problems if wrong else notes).append(text)
     if not unsealed:
         problems += _ledger_file(last, before)
     vouched, verdict = _verdict(file.seals, last, key, unsealed)
@@ -137,49 +135,34 @@ def _rewritten(found: Mapping[int, Seal]) -> Iterator[str]:
 def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
     """Digests of the files that are compared with the ledger elsewhere; the ledger has no size of some."""
     known: dict[str, tuple[int | None, str]] = dict(seals.recorded_files(ledger))
-    for name, value in facts.items():
-        if name.startswith("sha256:") and isinstance(value, list) and len(value) == 1:
-            known[name.removeprefix("sha256:")] = (None, value[0])
-    return known
+    return known | {name: (None, hashes[0]) for name, hashes in provenance.noted(facts).items() if len(hashes) == 1}
 
 
-def _files(folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]]) -> Iterator[tuple[str, str]]:
-    """(name, sentence) of files that are not those which the newest seal covers."""
+def _files(
+    folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]], *, unsealed: bool
+) -> Iterator[tuple[bool, str]]:
+    """(whether that is wrong, sentence) of files that are not those which the newest seal covers. Where work was not
+    sealed, only what was recorded can't be the work's."""
     for name, (size, sha256) in last.files.items():
-        if name == folder.ledger.name:
+        if name in known and known[name] not in ((size, sha256), (None, sha256)):
+            yield (
+                not unsealed or seals.never_changes(name),
+                f"seal {last.seal} and the ledger hold different digests of {name}",
+            )
+    for name, what in seals.differing(folder, last, {*known, folder.ledger.name}):
+        if name in known or name == folder.ledger.name:
             continue
-        if name in known:
-            if known[name] not in ((size, sha256), (None, sha256)):
-                yield name, f"seal {last.seal} and the ledger hold different digests of {name}"
-            continue
-        try:
-            path = folder.file(name)
-            found = path.stat().st_size
-            now = (found, durable.hash_file(path) if found == size else "")
-        except OutsideError as error:
-            yield name, str(error)
-            continue
-        except FileNotFoundError:
-            yield name, f"{name} is missing: seal {last.seal} covers it"
-            continue
-        except OSError as error:
-            yield name, f"{name} can't be read: {error.strerror}"
-            continue
-        if now != (size, sha256):
-            yield name, f"{name} was changed since seal {last.seal}"
-
-
-def _added(folder: FlightFolder, last: Seal, ledger: LedgerReader, problems: list[str]) -> Iterator[str]:
-    """Files that no seal covers: notes, and problems where only dappled writes."""
-    rows = {row.name for row in ledger.files()}
-    for path in seals.sealed_paths(folder):
-        name = path.relative_to(folder.path).as_posix()
-        if name in last.files or name in rows:
-            continue
-        if name.startswith("inputs/"):
-            problems.append(f"{name} was added since seal {last.seal}")
+        wrong = not unsealed or seals.never_changes(name)
+        if isinstance(what, OSError):
+            yield wrong, f"{name} can't be read: {what.strerror}"
+        elif what == "missing":
+            yield wrong, f"{name} is missing: seal {last.seal} covers it"
+        elif what == "changed":
+            yield wrong, f"{name} was changed since seal {last.seal}"
+        elif name.startswith("inputs/"):
+            yield not unsealed, f"{name} was added since seal {last.seal}"
         elif not name.startswith("frames/") or name.endswith(layout.SIDECAR):  # other frames are missed in the ledger
-            yield f"{name} was added since seal {last.seal}: no seal covers it"
+            yield False, f"{name} was added since seal {last.seal}: no seal covers it"
 
 
 def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[str]:
