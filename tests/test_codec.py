@@ -22,14 +22,32 @@ from hypothesis import strategies as st
 
 from dappled import codec
 from dappled.codec import CodecError
+from dappled.daemon.pipeline.recipes import Names
+from dappled.daemon.pipeline.verdicts import PictureFacts
+from dappled.decode import DecodeError
+from dappled.decode.calibration import LatticeFit
+from dappled.decode.calibration.swept_distance import SweptDistance
+from dappled.decode.depth.ranging import Ranging
 from dappled.decode.geometry import Pose
+from dappled.decode.joint.mask_place import MaskPlace
+from dappled.decode.optics import LAWS, Mask, Sensor
+from dappled.drivers.gphoto2.messages import Carryover
+from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Cause, Frame, Result, Shot, Stray, Tag
 from dappled.flight.pruning import Removed
 from dappled.flight.seals import Seal
+from dappled.products.batch.batch import Done
 
-RECORDS: Mapping[str, type] = {
-    one.__name__: one for one in (Cause, Finding, Frame, Pose, Removed, Result, Seal, Shot, Stray, Tag)
+_ALL = (
+    Carryover, Cause, Done, Finding, Frame, GPhoto2Settings, LatticeFit, LawDecision, Mask, MaskPlace, Names,
+    PictureFacts, Pose, Ranging, Recipe, Removed, Result, Seal, Sensor, Shot, Stray, SweptDistance, Tag,
+)  # fmt: skip
+RECORDS: Mapping[str, type] = {one.__name__: one for one in _ALL}
+OWN: Mapping[tuple[Any, str], Sequence[Any]] = {  # fields that take less than their type says
+    (LawDecision, "law"): tuple(LAWS),
+    (Ranging, "gain_px_m"): (0.25, 80.0),
 }
 KEPT = Path(__file__).parent / "records" / "version_1.json"
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)
@@ -65,13 +83,18 @@ def made(hint: Any, depth: int = 2) -> st.SearchStrategy[Any]:  # noqa: PLR0911 
         many = st.lists(made(inner[0], depth), max_size=2)
         return many if origin is list else many.map(tuple)
     if is_dataclass(hint):
-        hints = get_type_hints(hint)
         record: Any = hint
-        return st.builds(record, **{one.name: made(hints[one.name], depth) for one in fields(hint)})
+        return st.builds(record, **{one.name: field(hint, one.name, depth) for one in fields(hint)})
     if issubclass(origin or hint, Mapping):
         return st.dictionaries(WORDS, made(inner[1], depth), max_size=2)
     assert issubclass(hint, Enum)
     return st.sampled_from(hint)
+
+
+def field(record: Any, name: str, depth: int) -> st.SearchStrategy[Any]:
+    """Values of a field."""
+    own = OWN.get((record, name))
+    return made(get_type_hints(record)[name], depth) if own is None else st.sampled_from(own)
 
 
 def example(hint: Any, depth: int = 1) -> Any:
@@ -89,7 +112,9 @@ def example(hint: Any, depth: int = 1) -> Any:
     if is_dataclass(hint):
         hints = get_type_hints(hint)
         record: Any = hint
-        return record(**{one.name: example(hints[one.name], depth) for one in fields(hint)})
+        return record(
+            **{one.name: OWN.get((hint, one.name), [example(hints[one.name], depth)])[0] for one in fields(hint)}
+        )
     return {"key": example(inner[1], depth)} if issubclass(origin or hint, Mapping) else next(iter(hint))
 
 
@@ -116,14 +141,14 @@ def refusal(kind: Any, value: Any) -> str:
     """Why it is no such record; "" where it is one."""
     try:
         codec.read(kind, value)
-    except CodecError as error:
+    except (CodecError, DecodeError) as error:
         return str(error)
     return ""
 
 
 @pytest.mark.parametrize("kind", RECORDS.values(), ids=RECORDS)
 @given(data=st.data())
-@settings(max_examples=20)
+@settings(max_examples=10)
 def test_a_record_comes_back_as_it_was(kind: Any, data: st.DataObject) -> None:
     record = data.draw(made(kind))
     text = codec.canonical(record)
@@ -134,7 +159,7 @@ def test_a_record_comes_back_as_it_was(kind: Any, data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("kind", RECORDS.values(), ids=RECORDS)
 @given(data=st.data())
-@settings(max_examples=40)
+@settings(max_examples=20)
 def test_damage_is_read_as_another_record_or_refused_in_one_clause(kind: Any, data: st.DataObject) -> None:
     whole = codec.plain(example(kind))
     at = data.draw(st.sampled_from(sorted(places(whole), key=repr)))

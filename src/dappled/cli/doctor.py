@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -271,7 +271,7 @@ def _watch(output: Output) -> Report:
         for word, bodies in (("gone", went), ("here", came)):
             for body in bodies:
                 fires = "can be fired over USB" if body.fires else "USB can't fire it"
-                facts = {"event": word, **asdict(body)}
+                facts = {"event": word, **codec.plain(body)}
                 output.row(facts, f"{word}  {body.port}  {body.maker} {body.name} ({body.mode}): {fires}")
         before = now
         time.sleep(0.5)

@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any, Protocol
 
@@ -249,8 +249,8 @@ def frame_values(pending: PendingShot) -> dict[str, Any]:
     """For JSON: the shot, its frame, tag, carriers and times."""
     return {
         "index": pending.shot.index,
-        "cause": asdict(pending.shot.cause),
-        "frame": asdict(pending.frame) if pending.frame else None,
+        "cause": codec.plain(pending.shot.cause),
+        "frame": codec.plain(pending.frame),
         "tag": codec.plain(pending.tag),
         "carriers_found": pending.decoded.carriers_found if pending.decoded else None,
         "carriers_predicted": pending.decoded.carriers_predicted if pending.decoded else None,

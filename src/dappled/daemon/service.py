@@ -12,12 +12,12 @@ import shutil
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import dappled
-from dappled import findings
+from dappled import codec, findings
 from dappled.clock import Clock, SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
@@ -164,7 +164,7 @@ class Service:
         facts = {
             "software": {"dappled": dappled.__version__, **recipes.versions()},
             "settings": configuration.to_tables(settings),
-            "names": asdict(names),
+            "names": codec.plain(names),
             "decode_in_flight": recipe is not None,
         }
         directory, key = Path(settings.record.directory), settings.record.seal_key
@@ -433,7 +433,7 @@ class Service:
             found=[one for one in found if one is not None],
             standing=self._standing,
             lost=self._control.lost_triggers,
-            parameters=[asdict(one) for one in self._parameters.all()],
+            parameters=codec.plain(self._parameters.all()),
             frame_bytes=self._writer.frame_bytes,
             body=self._body.report(),
             battery=self._autopilot.battery(),

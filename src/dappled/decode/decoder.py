@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import codec
 from dappled.decode.array_types import Singles
 from dappled.decode.calibration.calibration import Calibration, LatticeFit, moved
 from dappled.decode.errors import DecodeError
@@ -445,10 +446,10 @@ class MaskDecoder:
             "f_number_shown_sigma": shown_sigma,
             "views_model": made.model,
             "views_reason": made.reason or ("" if fits else "its carriers agree with no aperture"),
-            "views_shares": asdict(made.shares) if made.shares else None,
+            "views_shares": codec.plain(made.shares),
             "view_sigma": made.sigma,
             "views_unclipped": told,
-            "mask_place": place.to_dict() if place is not None else None,
+            "mask_place": codec.plain(place),
         }
         strange = None if width is None else width.finding(f_number)
         return MadeViews(

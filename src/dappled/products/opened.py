@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import codec
 from dappled.config import profiles
 from dappled.decode import DecodeError
 from dappled.decode.depth import RANGING, DepthMap, DistanceMap, Ranging
@@ -445,7 +446,7 @@ def _sensor(known: Mapping[str, Any]) -> Sensor | None:
 
 def with_ranging(field: LightField, ranging: Ranging) -> LightField:
     """Return the light field with `ranging` among its attributes."""
-    return replace(field, attributes={**field.attributes, RANGING: ranging.to_dict()})
+    return replace(field, attributes={**field.attributes, RANGING: codec.plain(ranging)})
 
 
 def _lens(tag: Tag | None) -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
+from dappled import codec
 from dappled.daemon.pipeline.decode_worker import DecodeWorker, nearest
 from dappled.decode.depth.depth_map import DepthMap
 from dappled.decode.depth.ranging import Ranging
@@ -55,7 +56,7 @@ def ask(
 
 def worker_of(recipe: Recipe) -> DecodeWorker:
     worker = DecodeWorker()
-    worker(ChannelMessage({"do": "set up", "recipe": recipe.as_values(), "preview_px": 64}))
+    worker(ChannelMessage({"do": "set up", "recipe": codec.plain(recipe), "preview_px": 64}))
     return worker
 
 
@@ -86,7 +87,7 @@ def test_the_law_that_the_carriers_obey_is_decided_once_a_flight(flown: tuple[Re
     true = (1, 1) @ Shot(MASKS["mask-2"], QUARTER, 85.0, 22.0, turn_deg=1.0).lattice
     assert np.abs((at - true) * QUARTER.shape).max() < 0.3
     # a replay goes by the flight's decision, and an older flight by what it was configured with: neither looks
-    decided = LawDecision.of_values(stopped["decision"])
+    decided = codec.read(LawDecision, stopped["decision"])
     replayed = worker_of(replace(recipe, try_laws=False, decided=decided))
     for n in (2, 0, 1):
         assert ask(replayed, frames[n], n)["sha256"] == (opened, stopped, later)[n]["sha256"]

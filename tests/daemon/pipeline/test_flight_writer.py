@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled import codec
 from dappled.clock import SystemClock
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.drivers.camera import Blob, Fired
@@ -66,7 +67,7 @@ def test_the_law_of_a_flight_is_written_down_and_read_with_its_recipe(tmp_path: 
     made = of_flight(flight.folder.path, facts, {})
     assert made is not None
     assert made.decided == decision
-    assert Recipe.of_values(made.as_values()) == made
+    assert codec.read(Recipe, codec.plain(made)) == made
     asked = of_flight(flight.folder.path, facts, {"law": "fd"})
     assert asked is not None
     assert asked.decided is None

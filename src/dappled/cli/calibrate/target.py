@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import tomli_w
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.cli.verb import Output, Report
 from dappled.config import profiles
 from dappled.decode.depth import RANGING, Ranging
@@ -45,7 +44,7 @@ def calibrated(
     if found.offset_px < 0:
         lines.append(f"in focus at {-found.gain_px_m / found.offset_px:.4g} m")
     lines.append(f"written to {', '.join(map(str, written))}")
-    return Report({"targets": [asdict(one) for one in targets], **found.to_dict()}, lines)
+    return Report({"targets": codec.plain(targets), **codec.plain(found)}, lines)
 
 
 def from_frames(
@@ -84,7 +83,7 @@ def _listed(values: set[float | None]) -> str:
 
 
 def _write(recipe: Recipe, output: Path, found: Ranging) -> list[Path]:
-    more: dict[str, Any] = {RANGING: {k: v for k, v in found.to_dict().items() if v is not None}}
+    more: dict[str, Any] = {RANGING: codec.table(found)}
     if not recipe.calibration:
         durable.write_file(output, tomli_w.dumps(more).encode())
         return [output]

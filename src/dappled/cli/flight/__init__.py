@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import codec
@@ -104,7 +104,7 @@ class ReportFlight(FlightArgument, Verb):
         """See Verb."""
         flight = self.chosen(output)
         found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
-        sources = [asdict(one) for one in by_source]
+        sources = codec.plain(by_source)
         values = {**codec.plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
         agree = found.balanced and found.wishes > 0 and not found.doubts
         said = [*flight_lines.of_report(found, by_source)]

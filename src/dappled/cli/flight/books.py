@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.daemon.replay import three_books
 from dappled.daemon.replay.three_books import ThreeBooks
 from dappled.errors import counted
@@ -25,8 +26,8 @@ class Compared:
 def compared(flight: Path, logs: Sequence[Path]) -> Compared:
     """Compare a flight with logs of its autopilot. Raises DappledError."""
     found = three_books.reconcile(flight, logs)
-    values = {"files_read": [str(path) for path in logs], **asdict(found), "balanced": found.balanced}
-    values["imbalances"] = [{**asdict(one), "text": one.text()} for one in found.imbalances]
+    values = {"files_read": [str(path) for path in logs], **codec.plain(found), "balanced": found.balanced}
+    values["imbalances"] = [{**codec.plain(one), "text": one.text()} for one in found.imbalances]
     return Compared(values, tuple(_lines(found, logs)), found.balanced)
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from PIL import Image
 
+from dappled import codec
 from dappled.cli.mask.arguments import AltitudeArguments, InstallationArguments, out_of_reach
 from dappled.cli.verb import Output, Overwriting, Report, Verb, option
 from dappled.config import profiles
@@ -85,7 +86,7 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         lines.append(f"by geometry its views are separated at f/{ideal:.3g}, whatever the lens")
         warning = out_of_reach(camera, ideal)
         lines += [] if warning is None else [f"warning: {warning}"]
-        return Report({"law": one.law, "mask_distance_mm": one.distance_mm, **asdict(best)}, lines)
+        return Report({"law": one.law, "mask_distance_mm": one.distance_mm, **codec.plain(best)}, lines)
 
 
 CLASSES = {"mask design": DesignMask}
@@ -102,7 +103,7 @@ def _picture(made: Design) -> Any:
 
 
 def _as_json(made: Design) -> dict[str, Any]:
-    report = asdict(made)
+    report = codec.plain(made)
     wanted = report.pop("wanted")
     return {
         "works": made.works,

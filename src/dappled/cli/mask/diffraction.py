@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
+from dappled import codec
 from dappled.cli.mask import make
 from dappled.cli.verb import Output, Overwriting, Report, Verb, option
 from dappled.config import profiles
@@ -59,8 +60,8 @@ class PredictDiffraction(Overwriting, Verb):
         values = {
             "wavelength_nm": self.wavelength,
             "distance_m": self.distance,
-            "impulses": [{**asdict(i), "x_mm": x, "y_mm": y} for i, (x, y) in found],
-            "verdict": asdict(verdict) if verdict else None,
+            "impulses": [{**codec.plain(i), "x_mm": x, "y_mm": y} for i, (x, y) in found],
+            "verdict": codec.plain(verdict),
             "spots_of": others,
         }
         if verdict:

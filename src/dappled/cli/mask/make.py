@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dappled import codec
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.config import profiles
 from dappled.config.profiles import MaskProfile
@@ -85,7 +86,7 @@ class MakeMask(Overwriting, Verb):
             report = {
                 "carriers": len(image.orders_drawn()),
                 "period_px": list(image.period_px),
-                "harmonics": [{**asdict(h), "drawable": h.drawable} for h in image.harmonics()],
+                "harmonics": [{**codec.plain(h), "drawable": h.drawable} for h in image.harmonics()],
                 "warnings": image.warnings(),
             }
         for text in report["warnings"]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
+from dappled import codec
 from dappled.cli.mask.arguments import AltitudeArguments, out_of_reach
 from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import profiles
@@ -69,7 +70,7 @@ class PlanFlight(AltitudeArguments, Verb):
             f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB, on the card and again on the disk",
             *(f"warning: {warning}" for warning in warnings),
         ]
-        return Report({**asdict(made), "warnings": warnings}, lines)
+        return Report({**codec.plain(made), "warnings": warnings}, lines)
 
 
 CLASSES = {"plan": PlanFlight, "mask plan": PlanFlight}

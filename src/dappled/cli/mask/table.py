@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
+from dappled import codec
 from dappled.cli.mask.arguments import InstallationArguments, only_length
 from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.decode.optics import MaskedOptics, carrier_tables
@@ -63,7 +64,7 @@ class TabulateCarriers(InstallationArguments, Verb):
         lines.append(f"contrast left by diffraction at 550 nm: {contrasts}")
         lines += [f"warning: {warning}" for warning in warnings]
         facts = {**_facts(one), "mask_distance_mm": one.distance_mm}
-        return Report({**facts, "rows": [asdict(r) for r in rows], "warnings": warnings}, lines)
+        return Report({**facts, "rows": codec.plain(rows), "warnings": warnings}, lines)
 
 
 CLASSES = {"mask table": TabulateCarriers}
@@ -111,7 +112,7 @@ def _visibility(one: MaskedOptics, lengths: Sequence[float], stops: Sequence[flo
         lattice = carrier_tables.lattice_of(one, length)
         for stop in stops:
             for order in order_strengths(one, lattice, stop):
-                listed.append({"focal_length_mm": length, "f_number": stop, **asdict(order), "cause": order.cause})
+                listed.append({"focal_length_mm": length, "f_number": stop, **codec.plain(order), "cause": order.cause})
     lines = [
         f"law {one.law}, mask {one.distance_mm:g} mm before the sensor; strengths as shares of the mean",
         f"{'f/mm':>6} {'f/':>5} {'ky':>4} {'kx':>4} {'least':>9} {'most':>9}",

@@ -16,6 +16,7 @@ from typing import Any
 import uvicorn
 from starlette.types import ASGIApp
 
+from dappled import codec
 from dappled.daemon.console import placement
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
@@ -54,8 +55,7 @@ def main() -> int:
 
 
 async def _serve(channel: ProcessChannel, listener: socket.socket, setup: Mapping[str, Any]) -> None:
-    recipe = setup["recipe"]
-    studio = Studio(None if recipe is None else Recipe(**recipe), setup["mount"])
+    studio = Studio(setup["recipe"] and codec.read(Recipe, setup["recipe"]), setup["mount"])
     feed = Feed(setup["endpoint"], setup["ask"], Hub(), studio, run=setup["run"], area=_area(setup["area"]))
     daemon = DaemonChannel(channel)
     rules = Access(setup["token"], setup["hosts"])

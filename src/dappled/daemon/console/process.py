@@ -8,10 +8,11 @@ import socket
 import threading
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from dappled import codec
 from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
@@ -200,7 +201,7 @@ def start(
         "area": settings.console.area,
         "endpoint": opened.private or publish.slices,
         "ask": f"{opened.private}.ask" if opened.private else publish.ask,
-        "recipe": None if recipe is None else asdict(recipe),
+        "recipe": codec.plain(recipe),
         "mount": list(settings.pose.mount),
         "run": requests.run,
     }

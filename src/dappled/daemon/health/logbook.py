@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections import deque
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any, Literal
 
+from dappled import codec
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.errors import sentence
@@ -46,7 +47,7 @@ class Logbook(logging.Handler):
     def after(self, number: int, limit: int = 50) -> list[dict[str, Any]]:
         """The newest lines with a higher number, oldest first, as JSON values; at most `limit`."""
         with self._guard:
-            return [asdict(line) for line in self._lines if line.number > number][-limit:]
+            return [codec.plain(line) for line in self._lines if line.number > number][-limit:]
 
     def emit(self, record: logging.LogRecord) -> None:
         """Add a logger's warning."""

@@ -249,7 +249,7 @@ class DecodeProcess:
             )
         self._budget.spend(self._clock.monotonic_ns())
         self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker")
-        self._channel.send({"do": "set up", "recipe": self._recipe.as_values(), "preview_px": self._preview_px})
+        self._channel.send({"do": "set up", "recipe": codec.plain(self._recipe), "preview_px": self._preview_px})
         return self._channel
 
     def _end(self) -> int | None:
@@ -297,7 +297,7 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
         ms=facts["ms"],
         seen=facts["seen"],
         doubts=codec.read(tuple[Finding, ...], facts["doubts"]),
-        decision=None if facts["decision"] is None else LawDecision.of_values(facts["decision"]),
+        decision=facts["decision"] and codec.read(LawDecision, facts["decision"]),
         fingerprint=facts["fingerprint"],
         picture=_picture(facts["picture"]),
     )
@@ -305,8 +305,8 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
 
 def _picture(values: Mapping[str, Any] | None) -> PictureFacts | None:
     try:
-        return None if values is None else PictureFacts.of_values(values)
-    except (KeyError, TypeError, ValueError) as error:  # a frame must not be lost with what only its verdict needs
+        return None if values is None else codec.read(PictureFacts, values)
+    except codec.CodecError as error:  # a frame must not be lost with what only its verdict needs
         log.warning("a frame can't be judged: its facts can't be read: %s", error)
         return None
 

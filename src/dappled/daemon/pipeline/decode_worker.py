@@ -11,7 +11,7 @@ import socket
 import sys
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -59,7 +59,7 @@ class DecodeWorker:
     def __call__(self, question: ChannelMessage) -> WorkerReply:
         body = question.body
         if body["do"] == "set up":
-            recipe = Recipe.of_values(body["recipe"])
+            recipe = codec.read(Recipe, body["recipe"])
             plain = replace(recipe, try_laws=False, keep_law=False)
             self._darkroom = Darkroom(replace(plain, decided=None))
             self._looks = recipe.try_laws and recipe.decided is None
@@ -126,9 +126,9 @@ class DecodeWorker:
             "seen": _seen(done),
             "doubts": codec.plain(doubts),
             "preview_size": list(size),
-            "picture": None if picture is None else asdict(picture),
+            "picture": codec.plain(picture),
             "ms": ms,
-            "decision": None if decided is None or index < decided.first else asdict(decided),
+            "decision": None if decided is None or index < decided.first else codec.plain(decided),
         }
         return facts, (body.fd, blob.fd)
 

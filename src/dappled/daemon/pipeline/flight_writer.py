@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from dataclasses import asdict
 from typing import Protocol
 
+from dappled import codec
 from dappled.clock import Clock
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import DECISION, LawDecision
@@ -131,7 +131,7 @@ class LedgerWriter:
 
     def law_decided(self, decision: LawDecision) -> None:
         """See FlightWriter. flight.toml holds it, so that replays and products decode as the flight did."""
-        self._recording.add_facts({DECISION: asdict(decision)})
+        self._recording.add_facts({DECISION: codec.plain(decision)})
         self.event("law", decision.sentence, decision.first)
 
     def decoded(self, result: Result) -> None:

@@ -68,15 +68,6 @@ class PictureFacts:
     pixel_mm: tuple[float, float] | None = None
     bounds: VerdictBounds = field(default_factory=VerdictBounds)
 
-    @classmethod
-    def of_values(cls, values: Mapping[str, Any]) -> PictureFacts:
-        """From what `asdict` made of it."""
-        pairs: dict[str, Any] = {
-            name: values[name] and tuple(values[name]) for name in ("side_mm", "view_mm", "pixel_mm")
-        }
-        pairs["detail"] = tuple(tuple(one) for one in values["detail"])
-        return cls(**{**values, **pairs, "bounds": VerdictBounds(**values["bounds"])})
-
 
 @dataclass(frozen=True, slots=True)
 class FrameFacts:

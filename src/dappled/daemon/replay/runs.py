@@ -9,10 +9,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
+from dappled import codec
 from dappled.clock import Clock
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
@@ -64,7 +65,7 @@ class RunWriter:
             self.run = replace(run, recipe=kept)
             self._ledger = stack.enter_context(Ledger(folder.ledger, clock))
             provenance.note(folder, self._ledger, f"{recipes.FOLDER}/{run.name}")
-            kept_as = {"recipe": _relative(kept, flight), "names": asdict(run.names), "software": recipes.versions()}
+            kept_as = {"recipe": _relative(kept, flight), "names": run.names, "software": recipes.versions()}
             self._ledger.set_fact(_fact(run.name), {**kept_as, "utc_ns": clock.utc_ns()})
             self._opened = stack.pop_all()
 
@@ -87,7 +88,8 @@ def of_flight(flight: Path, name: str) -> Run:
     if fact is None:
         runs = sorted(key.removeprefix("run:") for key in facts if key.startswith("run:"))
         raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'only the flight itself'}")
-    return Run(name, Recipe.of_values({**fact["recipe"], **_absolute(fact["recipe"], flight)}), Names(**fact["names"]))
+    recipe = codec.read(Recipe, {**fact["recipe"], **_absolute(fact["recipe"], flight)})
+    return Run(name, recipe, codec.read(Names, fact["names"]))
 
 
 def _fact(name: str) -> str:
@@ -97,7 +99,7 @@ def _fact(name: str) -> str:
 def _relative(recipe: Recipe, flight: Path) -> dict[str, Any]:
     """The recipe as JSON values; its files relative to the flight, which may be copied elsewhere."""
     top = f"{flight}/"
-    values = recipe.as_values()
+    values = codec.plain(recipe)
     return {k: v.removeprefix(top) if isinstance(v, str) and v.startswith(top) else v for k, v in values.items()}
 
 

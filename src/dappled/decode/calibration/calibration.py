@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
 from dappled.findings import FRAME, Code, Finding, Level, finding
 
+_KIND, _VERSION = "dappled calibration", 1
 _MOST_HARMONICS = 20  # as a mask's profile
 _BLOCKS = (6, 8)  # of a frame, whose scatter says how well a mean is known
 _SURE = 30.0  # chi², or log likelihood: clean frames reach 3
@@ -174,79 +175,29 @@ class Calibration:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for a TOML file."""
-        return {
-            "kind": "dappled calibration",
-            "version": 1,
-            "shape": list(self.shape),
-            "law": self.law,
-            "pupil_mm": self.pupil_mm,
-            **({"verdict": codec.plain(self.verdict)} if self.verdict is not None else {}),
-            **({"swept": _swept_values(self.swept)} if self.swept is not None else {}),
-            "focal_sigma_mm": self.focal_sigma_mm,
-            "overridden": codec.plain(self.overridden),
-            "mask": {
-                "frequency_per_mm": self.mask.frequency_per_mm,
-                "p": self.mask.p,
-                "pattern": self.mask.pattern,
-                "harmonics": self.mask.harmonics,
-            },
-            "sensor": _sensor_values(self.sensor),
-            "fits": [
-                {
-                    "focal_length_mm": f.focal_length_mm,
-                    "f_number": f.f_number,
-                    "lattice": {"ky": list(f.lattice.ky), "kx": list(f.lattice.kx)},
-                    "rotation_rad": f.rotation_rad,
-                    "mask_distance_mm": f.mask_distance_mm,
-                    "distance_fitted": f.distance_fitted,
-                    "origin": list(f.origin),
-                    "transfer": list(f.transfer),
-                    "residual_bins": f.residual_bins,
-                    "phase_residual_rad": f.phase_residual_rad,
-                    "found": f.found,
-                    "seen": [list(one) for one in f.seen],
-                    "print_scale": f.print_scale,
-                }
-                for f in self.fits
-            ],
-        }
+        values = codec.table(replace(self, mask=replace(self.mask, film_px_per_mm=None)))
+        del values["sensor"]["shape"]  # the frames'
+        return {"kind": _KIND, "version": _VERSION, **values}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Calibration:
-        """The inverse of `to_dict`. Raises DecodeError, which names the missing or wrong value."""
-        if values.get("kind") != "dappled calibration" or values.get("version") != 1:
-            raise DecodeError("this is not a calibration of version 1: make one with `dappled calibrate`")
+        """The inverse of `to_dict`; other tables may stand beside. Raises DecodeError, which names what is wrong."""
+        if (values.get("kind"), values.get("version")) != (_KIND, _VERSION):
+            raise DecodeError(f"this is not a calibration of version {_VERSION}: make one with `dappled calibrate`")
+        known = {one.name: values[one.name] for one in fields(cls) if one.name in values}
+        if isinstance(known.get("sensor"), Mapping) and "shape" in known:
+            known["sensor"] = {"shape": known["shape"], **known["sensor"]}
         try:
-            shape = _pair(values["shape"])
-            mask = _mask_of(values["mask"])
-            sensor = _sensor_of({"shape": shape, **values["sensor"]})
-            fits = tuple(
-                LatticeFit(
-                    **{
-                        **entry,
-                        "lattice": Lattice(_pair(entry["lattice"]["ky"]), _pair(entry["lattice"]["kx"])),
-                        "origin": _pair(entry["origin"]),
-                        "transfer": tuple(float(m) for m in entry["transfer"]),
-                        "seen": tuple(_carrier(one) for one in entry.get("seen", ())),
-                        "print_scale": float(entry.get("print_scale", 1.0)),
-                    }
-                )
-                for entry in values["fits"]
-            )
-            law, pupil = values["law"], float(values.get("pupil_mm", 0.0))
-            verdict = codec.read(Finding, values["verdict"]) if "verdict" in values else None
-            swept = _swept_of(values["swept"]) if "swept" in values else None
-            focal_sigma = float(values.get("focal_sigma_mm", 0.0))
-            overridden = codec.read(tuple[Finding, ...], values.get("overridden", ()))
-            known_law = law in LAWS
-        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            found = codec.read(cls, known)
+        except codec.CodecError as error:
             raise DecodeError(f"the calibration is incomplete or wrong ({error}): calibrate again") from error
-        if not known_law:
-            raise DecodeError(f"the calibration names the law {law!r}; known are {', '.join(LAWS)}")
-        if not fits or any(len(f.transfer) != len(mask.half_orders()) for f in fits):
+        if found.law not in LAWS:
+            raise DecodeError(f"the calibration names the law {found.law!r}; known are {', '.join(LAWS)}")
+        if not 1 <= found.mask.p <= _MOST_HARMONICS:  # its carriers grow with the square
+            raise DecodeError(f"its mask.p is {found.mask.p}, not 1 to {_MOST_HARMONICS}: calibrate again")
+        if not found.fits or any(len(f.transfer) != len(found.mask.half_orders()) for f in found.fits):
             raise DecodeError("the calibration's transfer doesn't fit its mask: calibrate again")
-        shape = int(shape[0]), int(shape[1])
-        return cls(shape, law, mask, sensor, fits, pupil, verdict, swept, focal_sigma, overridden)
+        return found
 
 
 def _block_sums(
@@ -309,43 +260,3 @@ def _turn_of(
     if scatter[_TURNS // 2] - scatter[best] < _SURE or abs(tried[best]) < _LEAST_TURN:
         return 0.0
     return float(tried[best])
-
-
-def _mask_of(values: Mapping[str, Any]) -> Mask:
-    """Raises ValueError for a number of harmonics that no mask has: its carriers grow with the square."""
-    mask = Mask(**values)
-    if type(mask.p) is not int or not 1 <= mask.p <= _MOST_HARMONICS:
-        raise ValueError(f"the mask's p is {mask.p!r}, not a whole number from 1 to {_MOST_HARMONICS}")
-    return mask
-
-
-def _sensor_values(sensor: Sensor) -> dict[str, Any]:
-    values: dict[str, Any] = {"row_mm": list(sensor.row_mm), "column_mm": list(sensor.column_mm)}
-    if sensor.picture is not None:
-        values["picture"] = {"shape": list(sensor.picture.shape), **_sensor_values(sensor.picture)}
-    return values
-
-
-def _sensor_of(values: Mapping[str, Any]) -> Sensor:
-    height, width = _pair(values["shape"])
-    picture = _sensor_of(values["picture"]) if "picture" in values else None
-    return Sensor((int(height), int(width)), _pair(values["row_mm"]), _pair(values["column_mm"]), picture)
-
-
-def _swept_values(swept: SweptDistance) -> dict[str, Any]:
-    return {"scaled_mm": swept.scaled_mm, "sigma_mm": swept.sigma_mm, "stops": list(swept.stops)}
-
-
-def _swept_of(values: Mapping[str, Any]) -> SweptDistance:
-    stops = tuple(float(stop) for stop in values["stops"])
-    return SweptDistance(float(values["scaled_mm"]), float(values["sigma_mm"]), stops)
-
-
-def _carrier(values: Sequence[float]) -> tuple[int, int, float, float, float]:
-    ky, kx, fy, fx, strength = values
-    return int(ky), int(kx), float(fy), float(fx), float(strength)
-
-
-def _pair(values: Sequence[float]) -> tuple[float, float]:
-    first, second = values
-    return float(first), float(second)

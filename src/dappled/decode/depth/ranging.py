@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled import codec
 from dappled.decode.depth.depth_map import CONTRAST_WINDOW, DepthMap, Map
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
@@ -102,29 +103,12 @@ class Ranging:
             sigma = np.hypot(distance**2 * error / np.float32(self.gain_px_m), self.gain_sigma_share * distance)
         return DistanceMap(distance.astype(np.float32), sigma.astype(np.float32))
 
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for a file."""
-        return {
-            "gain_px_m": self.gain_px_m,
-            "offset_px": self.offset_px,
-            "f_number": self.f_number,
-            "source": self.source,
-            "gain_sigma_share": self.gain_sigma_share,
-            "focal_length_mm": self.focal_length_mm,
-        }
-
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Ranging:
-        """The inverse of `to_dict`. Raises DecodeError."""
+        """As a file has it. Raises DecodeError."""
         try:
-            f_number, length = (
-                None if values.get(name) is None else float(values[name]) for name in ("f_number", "focal_length_mm")
-            )
-            return cls(
-                float(values["gain_px_m"]), float(values["offset_px"]), f_number,
-                str(values.get("source", "calibration")), float(values.get("gain_sigma_share", 0.0)), length,
-            )  # fmt: skip
-        except (KeyError, TypeError, ValueError) as error:
+            return codec.read(cls, values)
+        except codec.CodecError as error:
             raise DecodeError(f"the ranging is incomplete or wrong ({error}): calibrate with targets again") from error
 
 

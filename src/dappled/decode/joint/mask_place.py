@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,15 +75,6 @@ class MaskPlace:
             for along, side, px in zip(cycles.T, slices.shape[1:], steps_px, strict=True)
         )
         return np.asarray(slices * down[:, :, None] * across[:, None, :])
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values for a light field's attributes."""
-        return {
-            "periods": list(self.periods),
-            "periods_sigma": list(self.periods_sigma),
-            "turn_rad": self.turn_rad,
-            "turn_sigma_rad": self.turn_sigma_rad,
-        }
 
 
 def cycles_per_radian(lattice: Lattice, sensor: Sensor) -> Floats:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from dappled import confined
+from dappled import codec, confined
 from dappled.decode.optics import LAWS
 from dappled.errors import DappledError
 
@@ -32,13 +32,10 @@ class LawDecision:
     first: int
     sentence: str
 
-    @classmethod
-    def of_values(cls, values: Mapping[str, Any]) -> LawDecision:
-        """From plain values. Raises TypeError, KeyError or ValueError for anything else."""
-        a, b, c, d = (float(one) for one in values["ratio"])
-        if values["law"] not in LAWS:
-            raise ValueError(f"unknown law {values['law']!r}")
-        return cls(str(values["law"]), (a, b, c, d), int(values["first"]), str(values["sentence"]))
+    def __post_init__(self) -> None:
+        """Raises ValueError for an unknown law."""
+        if self.law not in LAWS:
+            raise ValueError(f"the law {self.law!r} is unknown")
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,16 +67,6 @@ class Recipe:
     keep_law: bool = False
     decided: LawDecision | None = None
 
-    def as_values(self) -> dict[str, Any]:
-        """Plain values, for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def of_values(cls, values: Mapping[str, Any]) -> Recipe:
-        """The inverse of `as_values`. Raises TypeError or KeyError for anything else."""
-        decided = values.get("decided")
-        return cls(**{**values, "decided": None if decided is None else LawDecision.of_values(decided)})
-
 
 def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
     """Return the recipe that a recorded flight was decoded by, with the flight's own copies of its files.
@@ -106,8 +93,8 @@ def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, An
 
 def _decided(flight: Path, facts: Mapping[str, Any]) -> LawDecision | None:
     try:
-        return None if DECISION not in facts else LawDecision.of_values(facts[DECISION])
-    except (TypeError, KeyError, ValueError, AttributeError) as error:
+        return codec.read(LawDecision, facts[DECISION]) if DECISION in facts else None
+    except codec.CodecError as error:
         raise DappledError(f"{flight}/flight.toml: the law that the flight decided on can't be read: {error}") from None
 
 

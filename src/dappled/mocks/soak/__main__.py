@@ -14,6 +14,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from dappled import codec
 from dappled.flight import FlightError
 from dappled.mocks.soak.soak import SoakPlan, SoakReport, soak
 
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             lambda text: print(f"{time.monotonic() - began:7.1f} s  {text}", file=sys.stderr),  # noqa: T201  # a tool that prints
         )
     report = {name: getattr(result, name) for name in SoakReport.__slots__ if name not in ("before", "after")}
-    report |= {"before": result.before and result.before.as_dict(), "after": result.after and result.after.as_dict()}
+    report |= {"before": codec.plain(result.before), "after": codec.plain(result.after)}
     print(json.dumps(report, indent=1))  # noqa: T201  # as above
     return 1 if result.problems else 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.drivers.reader_process import python_module
@@ -21,10 +21,6 @@ class Resources:
     files: int
     threads: int
     children: int
-
-    def as_dict(self) -> dict[str, float]:
-        """The values as a mapping, for JSON."""
-        return asdict(self)
 
     def grown(self, after: Resources) -> list[str]:
         """A sentence for each resource that has grown by more than 3 files, 2 threads, or 10 % and 16 MB."""

@@ -9,16 +9,15 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import json
 import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Self
 
 from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
@@ -146,7 +145,7 @@ def plan(
         options = replace(options, crs=options.crs or utm(first.latitude_deg, first.longitude_deg))
     common = {
         "version": __version__,
-        "recipe": {**asdict(recipe), **_digests(recipe)},
+        "recipe": {**codec.plain(recipe), **_digests(recipe)},
         "options": _plain(options),
         "terrain": None if options.terrain is None else durable.hash_file(options.terrain),
         "level_m": level,
@@ -231,7 +230,7 @@ class _Making:
 
     def _light_field(self, kind: str) -> BatchOutput:
         job = self.job
-        pose = {} if job.tag is None else {"pose": asdict(job.tag.pose)}
+        pose = {} if job.tag is None else {"pose": codec.plain(job.tag.pose)}
         made = self.frame.decoded.light_field
         light_files.save(_beside(job, kind), replace(made, attributes={**made.attributes, **pose}), overwrite=True)
         return _output(_beside(job, kind), job, kind)
@@ -308,7 +307,7 @@ def _anywhere(recipe: Recipe) -> Recipe:
 
 def _plain(options: Options) -> dict[str, object]:
     """The options as JSON values, without the choice of frames, which is not part of a job."""
-    values = asdict(replace(options, frames=None, terrain=None))
+    values = codec.plain(replace(options, frames=None, terrain=None))
     return {name: value if isinstance(value, str | None) else repr(value) for name, value in values.items()}
 
 
@@ -383,10 +382,7 @@ class Manifest:
 
     def add(self, done: Done) -> None:
         """Append a result, durably."""
-        os.write(
-            self._fd,
-            json.dumps(codec.plain(done), sort_keys=True).encode() + b"\n",
-        )
+        os.write(self._fd, codec.canonical(done) + b"\n")
         os.fsync(self._fd)
         self._note(done)
 
@@ -423,24 +419,13 @@ class Manifest:
             os.lseek(self._fd, 0, os.SEEK_END)
         for number, line in enumerate(text[:whole].splitlines(), 1):
             try:
-                done = _done(parse_json(line, _LINE_BYTES))
-            except (ValueError, TypeError, KeyError):
+                done = codec.read(Done, parse_json(line, _LINE_BYTES))
+            except ValueError:
                 raise DappledError(
                     f"{self.path}, line {number} is not a line of a manifest: move the file away, "
                     "and everything will be made again"
                 ) from None
             yield done
-
-
-def _done(row: dict[str, Any]) -> Done:
-    """Raises ValueError, TypeError and KeyError."""
-    outputs = tuple(BatchOutput(**one) for one in row["outputs"])
-    done = Done(**{**row, "outputs": outputs, "doubts": codec.read(tuple[Finding, ...], row.get("doubts", ()))})
-    if not all(isinstance(name, str) for name in (done.key, *(one.name for one in done.outputs))):
-        raise TypeError("a name is not text")
-    if not isinstance(done.refused, dict):
-        raise TypeError("what was refused is not told by kind")
-    return done
 
 
 def _size(path: Path) -> int | None:

@@ -7,7 +7,7 @@ import io
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -252,7 +252,7 @@ def geojson(placed: Sequence[Placed]) -> str:
                     "height_above_home_m": camera.height_above_home_m,
                     "position_sigma_m": one.tag.pose.position_sigma_m,
                     "vertical_sigma_m": one.tag.pose.vertical_sigma_m,
-                    "gnss": None if one.tag.pose.gnss is None else asdict(one.tag.pose.gnss),
+                    "gnss": codec.plain(one.tag.pose.gnss),
                     **dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), turned, strict=True)),
                 },
                 "geometry": {

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from dappled import codec
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
 from dappled.products.maps import matching
@@ -49,7 +50,7 @@ class Refinement:
 
     def facts(self) -> dict[str, Any]:
         """The values for reports."""
-        return {"refined": self.why is None, **asdict(self)}
+        return {"refined": self.why is None, **codec.plain(self)}
 
 
 def refine(
