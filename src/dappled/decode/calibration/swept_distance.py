@@ -21,7 +21,7 @@ from dappled.decode.optics import MaskedOptics, Order, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
 
 _SEARCHED = 1.8  # times or a fraction of the stated distance
-_STEPS = 241
+_STEPS = 241  # of the search: 0.5 % of the distance each
 _AMPLITUDE = 1.5e-3  # of the mean: what a wall's own structure and the noise add to a carrier
 _EACH_STOP = 0.02  # relative: one stop's diameter against the others (f/22 is f/22.6, f/11 is f/11.3; blades)
 _ALL_STOPS = 0.03  # relative: all stops' diameters against what the lens says

@@ -37,7 +37,7 @@ _LEAST_SHARE = 0.1  # of the typical variance, where there is no texture
 _UNLIKE, _UNLIKE_PX = 6.0, 2.0  # what the best disparity of even pixels leaves, as a mean over so many px: gloss
 _SHADE = 1.5  # px: the Gaussian without which no highlight is left
 _GROUP_PX, _LEAST_GROUP = 9, 64  # glossy pixels within so many px belong together; fewer are left as they are
-LEAST_VARIANCE = 1e-8
+LEAST_VARIANCE = 1e-8  # of a view with values around 1: below it float32 decides
 
 
 @dataclass(frozen=True, slots=True, eq=False)

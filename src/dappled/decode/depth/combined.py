@@ -31,7 +31,7 @@ _SMALL, _LARGE = 4.0, 30.0  # P1 and P2, in units of the log-likelihood
 _NARROW = 5  # px: the window in which noisy views are compared
 # Of noisy masked frames, measured on the masked frames of benchmarks/depth.py, seeds 1 and 2.
 _VOTE_WINDOW = 11  # px
-_SMALL_HALVES, _LARGE_HALVES = 8.0, 32.0
+_SMALL_HALVES, _LARGE_HALVES = 8.0, 32.0  # P1 and P2 of the votes
 _SPREAD_HALVES, _SAMPLES_HALVES = 2.0, 40.0  # variance over information; of the votes, as in `confidence`
 # Of the logarithm of odds. On seeds 1 and 2 (SNR 100 and 50) 76 and 89 % then lie within σ and 2 σ, not 65 and 84; on
 # six frames like those of tests/system/test_depth_sigma.py, with other seeds, 73 and 96 %, not 72 and 95.

@@ -19,8 +19,8 @@ Map = NDArray[np.float32]
 _SCATTER = 1.1
 _EDGE, _EDGE_SHARE = 0.0005, 0.0005  # px/view, and of the disparity
 _SEAM = 2.0  # of the disparities' spread under the window
-_LEAST_CONFIDENCE = 0.5
-_MOST_DISPARITIES = 400
+_LEAST_CONFIDENCE = 0.5  # chosen by hand: the share that is known is measured by benchmarks/depth.py
+_MOST_DISPARITIES = 400  # a volume of more is refused, as it would not fit into memory
 CONTRAST_WINDOW = 13  # px a side
 
 

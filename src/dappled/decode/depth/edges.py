@@ -12,7 +12,7 @@ from dappled.decode.lightfield.light_field import centred
 _NEAR, _REACH = 3, 3  # px: pixels beside a jump, or beside something unknown; how far the median's window reaches
 _JUMP = 0.07  # px/view
 _ALIKE = 0.08  # of the middle view's range: pixels that differ by more hardly count
-_ROUNDS = 2
+_ROUNDS = 2  # of the median; chosen by hand, measured by benchmarks/depth.py
 _LEVEL, _LEVEL_REACH = 0.15, 6  # px/view: neighbours that differ by more are another surface; px
 _CHUNK = 65_536  # pixels whose windows are in memory at once
 

@@ -21,9 +21,9 @@ from dappled.decode.lightfield.light_field import Image
 from dappled.errors import install_extra
 
 _BASE_PX = 8.0  # views are enlarged until the outermost is so many pixels off for a disparity of 1
-_MOST_ENLARGED = 4
-_BLOCK = 5
-_SIXTEENTHS = 16
+_MOST_ENLARGED = 4  # times, chosen by hand: interpolation adds nothing to a pair's detail
+_BLOCK = 5  # px, of OpenCV's matcher; chosen by hand
+_SIXTEENTHS = 16  # OpenCV's matcher counts disparities in sixteenths of a pixel
 _LEAST_SIGMA = 0.02  # px/view: what sixteenths and blocks leave at best
 _WIDEST = 512  # px that the matcher may search
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from dappled.decode.geometry.pose import Pose, Quaternion, Vector3, turned
 
-EARTH_RADIUS_M = 6_371_000.0
+EARTH_RADIUS_M = 6_371_000.0  # mean radius (IUGG)
 _SHALLOW = 0.05  # below 3° under the horizon the ground is too far for a flat one
 
 

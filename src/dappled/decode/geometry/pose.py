@@ -10,8 +10,8 @@ from typing import Literal, Protocol
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Symmetric = tuple[float, float, float, float, float, float]  # a 3 × 3 matrix's upper triangle: xx, xy, xz, yy, yz, zz
-_WGS84_A_M = 6378137.0
-_WGS84_E2 = 6.69437999014e-3
+_WGS84_A_M = 6378137.0  # WGS 84: the semi-major axis
+_WGS84_E2 = 6.69437999014e-3  # WGS 84: the first eccentricity squared
 _SWAY_S = 0.06  # within less, a multicopter's turn rate is as good as a straight line
 _SHALLOW = 0.05  # below 3° under the horizon the ground is too far for a flat one
 

@@ -21,7 +21,7 @@ from dappled.findings import FRAME, Code, Finding, finding
 
 ViewsModel = Literal["joint", "independent"]
 _REACH = 1.0  # samples of a slice from view to view: a carrier's order further, and parallax can't be told apart
-_LEAST_TRANSFER = 1e-3
+_LEAST_TRANSFER = 1e-3  # of the whole light: a carrier that the mask doesn't make tells nothing
 _MOST_BEYOND = 0.1  # of a frame may be beyond the widest range
 _TOLD_BEYOND = 0.005  # of a frame is told
 _TOLD_CONTRADICTED = 0.1  # frames of opaque boards with fine detail have up to 0.065

@@ -54,13 +54,14 @@ _FEWEST = 12  # patches in a group
 _TRUST = np.float32(0.75)
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 # Of a patch's mean square difference to the views that it and its neighbours were joined to, of the model's variance of
-# what views have alone, and of all else of it, for each kind: 68 % of errors are within the root of the sum.
+# what views have alone, and of all else of it, for each kind: 68 % of errors are within the root of the sum. Fitted by
+# hand to frames of benchmarks/views.py; docs/decoding.md has what share of errors is within on which family.
 _TOLD = (
     *((0.16, 0.47, 0.14), *((1.2, 0.85, 0.35),) * 4),
     *((1.6, 0.04, 0.3), *((1.8, 0.01, 0.15),) * 2, *((0.25, 0.05, 1.2),) * 3, (0.45, 0.05, 0.4)),
     *((1.0, 0.9, 1.0),) * 6,
 )
-_TOLD_MOTIONLESS = (0.7, 0.86, 2.65)
+_TOLD_MOTIONLESS = (0.7, 0.86, 2.65)  # the same, of patches at rest that are as good as motionless
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -39,16 +39,22 @@ class PatchKind:
     nats: float = 0.0
 
 
+# Chosen by hand, each four to ten times the last: a hard edge has far more folded detail than its texture continued
+# (one amount for all patches cost views at edges 3 dB); measured by benchmarks/views.py.
 _BEYOND = (0.1, 1.0, 4.0, 16.0, 64.0)
-_FAR_NATS = 12.0  # few things are beyond a range
-# Of detail that folds in where nothing moves: usual amounts, and those of few frequencies.
+_FAR_NATS = 12.0  # few things are beyond a range; chosen by hand, measured by benchmarks/views.py
+# Of detail that folds in where nothing moves: usual amounts, and those of few frequencies. Chosen by hand, measured by
+# benchmarks/views.py (terrain, and boards before a background at rest).
 _USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
 # Of the median patch: terrain from the air has less than 1, boards with parallax of 0.3 px and more 6 to 27.
 _MOVED_NATS = 2.0
 # Of one patch: straight edges at rest have up to 13, things that move by 0.9 px from view to view 24 and more.
 MOVES_NATS = 16.0
-_ALONE_NATS = 500.0  # edges between depths look like it, too
-# A patch with all its detail in the band, or without parallax, can be trusted further.
+# Edges between depths look like it, too. Chosen by hand: a thing 18 px from view to view before a board at 0.5 px has
+# 32.8 dB with this kind, 28.1 without.
+_ALONE_NATS = 500.0
+# A patch with all its detail in the band, or without parallax, can be trusted further. The shares that views have alone
+# (1e-4, 0.01, 0.03, 1) are chosen by hand, measured by benchmarks/views.py.
 KINDS: Sequence[PatchKind] = (
     *(PatchKind(AT_REST, beyond, 1e-4) for beyond in (0.0, 1.0, 4.0, 16.0, 64.0)),
     PatchKind(USUAL, 0.0, 0.03),
@@ -57,9 +63,9 @@ KINDS: Sequence[PatchKind] = (
     *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (FAR, BEYOND) for beyond in (0.1, 1.0, 4.0)),
 )
 USUAL_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
-LEAST_NOISE = 1e-12
+LEAST_NOISE = 1e-12  # variance: what a slice without noise counts as, so that its inverse is finite in double precision
 WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
-_HYPOTHESES = 17  # disparities over a range
+_HYPOTHESES = 17  # disparities over a range, an eighth of the reach apart
 # In reaches: disparities of what folds in from beyond the band.
 _FOLDED = {AT_REST: np.linspace(-STILL, STILL, 3), USUAL: np.linspace(-0.6, 0.6, 5)}
 _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate

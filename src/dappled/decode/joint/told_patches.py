@@ -21,7 +21,7 @@ _TRANSPARENT_NATS, _AROUND = 2000.0, 5
 # times the geometric mean of two variances, by how much the patch and its neighbours were apart before they were told,
 # and what the model leaves to the median patch. The first misses errors that neighbours share, the second the model's.
 _TOLD_TWICE = dict(zip(USUAL_KINDS, (1.8, 1.04, 2.76, 1.24, 1.49, 1.51), strict=True))
-_IN_BAND = [kind for kind in USUAL_KINDS if KINDS[kind].beyond < 1]
+_IN_BAND = [kind for kind in USUAL_KINDS if KINDS[kind].beyond < 1]  # hardly any detail beyond the band
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -47,7 +47,7 @@ _EVIDENCE = 9.0  # squared deviations: less doesn't tell one shape from another 
 SHAPES: tuple[Shape, ...] = ("beams", "filled", "round")
 _PRINTED = 0.04  # of a carrier: how well a design says the strength of a print's
 _GAINS = np.linspace(0.8, 1.25, 10)  # of all carriers of a print: its film's contrast
-_GAIN_SIGMA = 0.1
+_GAIN_SIGMA = 0.1  # relative: of a film's contrast; chosen by hand, as no print was measured
 _DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
 _AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
 

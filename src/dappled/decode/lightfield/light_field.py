@@ -17,7 +17,7 @@ from dappled.findings import Finding
 
 Image = NDArray[np.float32]
 CAMERAS = "cameras"  # an attribute of light fields: true where each view is a camera's, further right with larger u
-PROJECTIONS = 64
+PROJECTIONS = 64  # of a fingerprint: fixed, recorded flights hold them (docs/flight-data.md)
 _BLOCK = 4096  # values of each projection that are summed at once
 _REGULAR = 1e-3  # of a view: how far views may stand from a grid of rows and columns
 

@@ -21,6 +21,8 @@ from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.workers import each
 
 _SHARPNESS_BOX = 5  # px: the side of the box that sharpness is averaged over, twice
+# Of the windowed sinc, and its window: true views refocused reach 65.9 to 79.4 dB, by cubic convolution 51.7 to 63.6
+# (frames of benchmarks/views.py, 25 points, seed 1, four planes).
 _TAPS, _KAISER = 16, 5.0
 _LEAST_WEIGHT = 1e-6  # of all views: a pixel that less is seen of is unknown
 

@@ -17,8 +17,8 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Mask
 from dappled.decode.optics.lenses import within
 
-THESIS_WAVELENGTH_NM = 532.0
-THESIS_DISTANCE_M = 0.5842
+THESIS_WAVELENGTH_NM = 532.0  # the thesis' laser (section on the bench)
+THESIS_DISTANCE_M = 0.5842  # from film to wall, the same
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,9 @@ from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Sensor
 from dappled.decode.optics.film import FILMS, Film
 from dappled.decode.optics.lenses import depth_sigma_m, ground_sample_m, image_distance_mm, within
 
-FRESNEL_LIMIT = 0.25
+FRESNEL_LIMIT = 0.25  # of λ·d·(p·f_m)²: diffraction then leaves cos(π/4) = 0.71 of the contrast
 LEAST_VIEW_PX, SMALL_VIEW_PX = 16, 64  # a side: below the first a view is no picture, below the second a poor one
-_STOPS = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)
+_STOPS = (1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)  # whole stops, where a profile names none
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ from dappled.decode.spectrum.peaks import Measured, fit, is_suspect, lattice_fro
 from dappled.decode.spectrum.transform import Spectrum
 
 _SMALLEST_VERIFIED = 6  # carriers in one half plane, DC left out
-_CANDIDATES = 30
-_TOLERANCE_BINS = 1.5
+_CANDIDATES = 30  # the strongest: pairs of them are bases to try
+_TOLERANCE_BINS = 1.5  # of a multiple of the basis: an order stands so near; chosen by hand
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from dappled.workers import each, spans
 
 Plane = NDArray[np.float32]
 LARGEST_PIXELS = 120_000_000  # 480 MB of float32; a spectrum of it takes as much again
-_SMALLEST_SIDE = 16
+_SMALLEST_SIDE = 16  # pixels
 _ROWS = 96  # at a time: with fewer the interpreter's overhead outweighs what the cache gains
 _PRODUCT = 250_000  # multiplications in a matrix product: larger ones would start BLAS' own threads beside ours
 _STEP = 29  # every so many rows and columns are sampled for the mean: odd, so that all colours are among them

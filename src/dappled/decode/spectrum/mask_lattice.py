@@ -25,11 +25,11 @@ from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, fit, is_suspect,
 from dappled.decode.spectrum.transform import Spectrum, hann
 
 SCALES = 0.35  # relative: a print's scale and the mask's distance, together
-TURN_RAD = math.radians(8)
+TURN_RAD = math.radians(8)  # of a mask: what is farther turned is not looked for
 SURE_NATS = 8.0  # log odds against chance, 1 : 3000
 ABOVE_FLOOR = 12.0  # times the level around: a carrier so strong is seen
-_PEAK_NATS = 1.6
-_SPACING_BINS = 11
+_PEAK_NATS = 1.6  # as `peaks.ALONE_NATS`: weaker ones are many
+_SPACING_BINS = 11  # between two peaks, the side of the part that the level around is taken from
 _SCALE_SIGMA, _TURN_SIGMA = 0.1, math.radians(3)  # of a mask that was mounted by hand
 _SKEW = 0.03  # of a step: film, paper and glue stretch no more; on pixels that are not square a turn adds to it
 _SEEDS = 6  # strong orders that hypotheses start from

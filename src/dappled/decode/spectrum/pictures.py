@@ -18,7 +18,7 @@ from dappled.decode.spectrum.peaks import Measured
 Look = Literal["magnitude", "phase", "laplacian"]
 LOOKS: tuple[Look, ...] = get_args(Look)
 Colour = NDArray[np.uint8]
-_RED, _GREEN, _YELLOW, _BLUE = (230, 30, 30), (60, 220, 60), (250, 220, 40), (70, 130, 255)
+_RED, _GREEN, _YELLOW, _BLUE = (230, 30, 30), (60, 220, 60), (250, 220, 40), (70, 130, 255)  # sRGB, 8 bits
 
 
 def spectrum_boxes(

@@ -20,7 +20,7 @@ Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 Period = tuple[int, int]
 _ROWS = 96  # at a time: a run of them stays in the cache
 _STANDS_OUT = 12.0  # robust standard deviations of the dark frame's own noise
-_LEAST_LEVELS = 8.0
+_LEAST_LEVELS = 8.0  # of the raw file: a dark frame without noise of its own has hot pixels above that
 _MOST = 0.02  # of all pixels: more than this is a pattern
 
 

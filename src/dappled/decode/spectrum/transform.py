@@ -26,7 +26,7 @@ TILE = 24  # columns that lie together in memory: a tile of them stays in the ca
 _TILES = 4  # transformed at a time
 _NOISE_SIDE = 34  # bins of a part that noise is measured in, one at each edge for the window
 _NOISE_PARTS = (8, 8)  # rows and columns of parts
-_NOISE_AT_ONCE = 8
+_NOISE_AT_ONCE = 8  # parts: what is worked on stays small
 
 
 def padded_shape(shape: tuple[int, int]) -> tuple[int, int]:
