@@ -39,21 +39,21 @@ class _MachineThreads:
     """Threads that the machine runs."""
 
     def pause(self, event: threading.Event, timeout_s: float | None) -> bool:
-        """See Clock."""
+        """As `wait`, in the machine's time even where this clock stands still; None: without end."""
         return event.wait(timeout_s)
 
     def wait_for(self, changed: threading.Condition, holds: Callable[[], object], timeout_s: float | None) -> bool:
-        """See Clock."""
+        """As `changed.wait_for`, whose lock is held, in the machine's time; None: without end."""
         return bool(changed.wait_for(holds, timeout_s))
 
     def start(self, run: Callable[[], None], name: str) -> threading.Thread:
-        """See Clock."""
+        """Start a daemon thread."""
         thread = threading.Thread(target=run, name=name, daemon=True)
         thread.start()
         return thread
 
     def join(self, thread: threading.Thread, timeout_s: float) -> None:
-        """See Clock."""
+        """Wait for the end of a thread that was started here, in the machine's time."""
         thread.join(timeout_s)
 
 
@@ -69,15 +69,15 @@ class SystemClock(_MachineThreads):
         self.utc_minus_monotonic_ns = utc_minus_monotonic_ns
 
     def monotonic_ns(self) -> int:
-        """See Clock."""
+        """Time that never steps, the same in every process of this machine (CLOCK_MONOTONIC)."""
         return time.monotonic_ns()
 
     def utc_ns(self) -> int:
-        """See Clock."""
+        """Time since 1970 as far as this machine knows it."""
         return time.monotonic_ns() + self.utc_minus_monotonic_ns
 
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
-        """See Clock."""
+        """Until the event is set (True) or this clock has gone on by `timeout_s` (False)."""
         return event.wait(max(0.0, timeout_s))
 
 
@@ -85,7 +85,7 @@ class TimeOfDayClock(SystemClock):
     """The machine's clock. UTC is the system's time of day and follows its steps (NTP, a person)."""
 
     def utc_ns(self) -> int:
-        """See Clock."""
+        """Time since 1970 as far as this machine knows it."""
         return time.time_ns()
 
 
@@ -103,11 +103,11 @@ class RecordedClock(_MachineThreads):
         self._changed = threading.Condition()
 
     def monotonic_ns(self) -> int:
-        """See Clock."""
+        """Time that never steps, the same in every process of this machine (CLOCK_MONOTONIC)."""
         return self.utc_ns() - self.utc_minus_monotonic_ns
 
     def utc_ns(self) -> int:
-        """See Clock."""
+        """Time since 1970 as far as this machine knows it."""
         with self._changed:
             return self._utc_ns
 
@@ -128,7 +128,7 @@ class RecordedClock(_MachineThreads):
             self._changed.notify_all()
 
     def wait(self, event: threading.Event, timeout_s: float) -> bool:
-        """See Clock. The event is looked at every 10 ms of real time, the clock as soon as it moves."""
+        """Wait in steps: the event is looked at every 10 ms of real time, the clock as soon as it moves."""
         with self._changed:
             until_ns = self._utc_ns + round(timeout_s * 1e9)
             while not (event.is_set() or self._closed or self._utc_ns >= until_ns):

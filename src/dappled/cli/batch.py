@@ -50,7 +50,7 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
     json: bool = flag("--json", "print one JSON object per frame")
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.check_profiles()
         if self.pos and len(self._folders()) > 1:
             raise CallError(f"--pos {self.pos} holds the marks of one flight: give one FLIGHT")
@@ -59,7 +59,7 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
         return _different(_flights(self.flights))
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Process whole flights."""
         jobs: list[Job] = []
         doubts: list[Finding] = []
         refused = 0

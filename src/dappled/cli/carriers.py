@@ -94,7 +94,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.picture)
         if self.frame is None:
             if not self.shape or self.camera == "auto" or self.mask == profiles.LENSLET:
@@ -106,7 +106,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
         Darkroom(self.recipe()).check()
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Show the predicted and the measured carriers."""
         if self.frame is None:
             table = self._predicted()
         else:

@@ -44,11 +44,11 @@ class DecodeFrames(Overwriting, Doubtable, FramesArguments, Verb):
         return Darkroom(recorded(self.frames, self.recipe(colour=self.colour, taper=self.taper)))
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self._darkroom().check()
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Decode frames to light fields."""
         darkroom, found = self._darkroom(), frames(self.frames)
         single = len(found) == 1 and bool(self.output.suffix)
         if not single:

@@ -59,7 +59,7 @@ class ExamineMachine(SettingsArgument, Verb):
     watch: bool = flag("--watch", "print which cameras appear and disappear on USB, until Ctrl-C")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Say what is missing on this machine."""
         return _watch(output) if self.watch else _examined(self, output)
 
 

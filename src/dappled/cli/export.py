@@ -25,7 +25,7 @@ _REPLACED = (*_WHOLE, "rerun")
 
 @dataclass(frozen=True, kw_only=True)
 class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
-    """See table."""
+    """Write light fields for other tools."""
 
     examples = ("dappled export frame.zarr --as hci -o hci/frame",)
     notes = "formats:\n" + "\n".join(f"  {name:6} {what}" for name, what in KINDS.items())
@@ -41,7 +41,7 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
     output: Path = option("-o --output", "file or folder to write", metavar="OUT")
 
     def check(self) -> None:
-        """See Verb. A quilt's name is known only when it is made."""
+        """Refuse a call that is wrong by itself. A quilt's name is known only when it is made."""
         if self.kind in _WHOLE and self.output.suffix != f".{self.kind}":
             raise CallError(f"{self.output}: --as {self.kind} writes a .{self.kind} file; give it that ending")
         if self.kind in _REPLACED:
@@ -52,7 +52,7 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
             raise OutputExistsError(f"{self.output} exists already: move it away, or choose another name")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Write light fields for other tools."""
         found = opened_field(self.field, self)
         written = self._write(found)
         words = views_words(found.field)

@@ -97,14 +97,14 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.check_mounted()
         check_geoid(self.geoid)
         if self.mark_lever_arm is not None and self.pos is None:
             raise CallError("--mark-lever-arm goes with --pos: leave it out, or give the positions of the marks")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Write positions and attitudes."""
         facts = layout.read_facts(layout.open_folder(self.flight))
         key = sealing.key_of(self.config)
         into_flight = self.output is None
@@ -168,7 +168,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         return Report(values, [words], findings=found)
 
     def mounting(self, facts: Mapping[str, Any]) -> Mounting:
-        """See Mounted."""
+        """The flight's mounting, with the values that the arguments replace."""
         made = super().mounting(facts)
         return made if self.on_gimbal is None else replace(made, on_gimbal=self.on_gimbal)
 

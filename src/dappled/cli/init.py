@@ -62,11 +62,11 @@ class InitSettings(Overwriting, Verb):
     folder: str | None = option("--folder", of_setting(RecordSettings, "directory"), None, metavar="DIR")
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.file)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Write a settings file."""
         asks = sys.stdin.isatty() and sys.stderr.isatty() and not self.json
         given = {"--camera": self.camera, "--shutter": self.shutter, "--mask": self.mask}
         given |= {"--link": self.link, "--folder": self.folder}

@@ -34,7 +34,7 @@ class MakeKeys(Verb):
     folder: Path = option("-o --folder", "folder to write to", _HOME, metavar="DIR")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Make a pair of keys."""
         public, secret = curve.make(self.folder.expanduser(), self.name)
         lines = [f"{public}  to give away", f"{secret}  to keep: name it in publish.keys, or after --keys"]
         return Report({"public": str(public), "secret": str(secret)}, lines)
@@ -49,7 +49,7 @@ class ShowKey(Verb):
     file: Path = argument("FILE", "NAME.key or NAME.key_secret", there=True)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Show a public key."""
         key = curve.load_public(self.file).decode()
         return Report({"public_key": key}, [key])
 
@@ -65,7 +65,7 @@ class MakeToken(_NewFile):
     examples = ("dappled keys token /etc/dappled/console.token",)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Make a token for the console."""
         try:
             key_files.write_new(self.file.expanduser(), secrets.token_urlsafe(24) + "\n")
         except FileExistsError:
@@ -82,7 +82,7 @@ class MakeSealKey(_NewFile):
     examples = ("dappled keys seal /etc/dappled/seal.key",)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Make a key that signs the seals of flights."""
         seal_key.make(self.file.expanduser())
         said = f"{self.file}  name it in record.seal_key, and keep a copy where flights are checked"
         return Report({"seal_key_file": str(self.file)}, [said])
@@ -99,7 +99,7 @@ class MakeLinkKey(_NewFile):
     )
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Make a key for a signed link."""
         make_key(self.file, _passphrase() if self.passphrase else None)
         said = f'{self.file}: a key for this user alone; set keys = ["{self.file.absolute()}"] in [mavlink]'
         return Report({"key_file": str(self.file)}, [said])

@@ -30,19 +30,19 @@ class TerminalOutput:
         self._what = ""
 
     def row(self, values: Mapping[str, Any], *lines: str) -> None:
-        """See Output."""
+        """Print one result at once: its values as a line of JSON with --json, else its lines."""
         self._print([json.dumps(values)] if self._as_json else lines)
 
     def remark(self, text: str) -> None:
-        """See Output."""
+        """Say something beside the results, on standard error."""
         self._print([text], error=True)
 
     def warn(self, text: str) -> None:
-        """See Output."""
+        """Say what went wrong or is in doubt, on standard error, with the verb's name."""
         self.remark(f"dappled {self._path}: {text}")
 
     def each(self, items: Sequence[Item], unit: str = "frame") -> Iterator[Item]:
-        """See Output."""
+        """The items, with a bar."""
         with self.bar(len(items), unit) as add:
             for item in items:
                 yield item
@@ -50,7 +50,7 @@ class TerminalOutput:
 
     @contextmanager
     def bar(self, total: int | None, unit: str, what: str = "") -> Iterator[Callable[[int], object]]:
-        """See Output."""
+        """A bar of so many units; the function adds to it."""
         if not sys.stderr.isatty():
             yield lambda _: None
             return
@@ -59,7 +59,7 @@ class TerminalOutput:
         self._bar = None
 
     def show(self, what: str, done: int, total: int) -> None:
-        """See Output."""
+        """So many frames of a stretch of work are done."""
         if not sys.stderr.isatty():
             return
         if self._bar is None or what != self._what:

@@ -113,7 +113,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         return {name: getattr(self, name) for name in _GIVEN}
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         if not self._is_flight:
             if not self.flight.is_dir():
                 raise CallError(f"{self.flight} is neither a flight nor a folder of frames")
@@ -131,7 +131,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
             profiles.mask(self.mask)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Run a recorded flight."""
         settings = configuration.load(self.config)
         problems = list(flight_check.check(self.flight).problems) if self.verify else []
         facts = layout.read_facts(layout.open_folder(self.flight)) if self._is_flight else {}
@@ -248,6 +248,6 @@ class PrintedProgress(ReplayProgress):
         self._output = output
 
     def finished(self, pending: PendingShot) -> None:
-        """See Observer."""
+        """Nothing more is expected of a shot."""
         self._output.row(frame_values(pending), frame_line(pending))
         super().finished(pending)

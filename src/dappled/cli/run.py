@@ -59,7 +59,7 @@ class RunDaemon(SettingsArgument, Verb):
     json: bool = flag("--json", "print one JSON object per frame")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Run the daemon."""
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until a daemon can end in order
         hung_up = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         try:
@@ -119,11 +119,11 @@ class RunSurroundings:
     frames: int | None
 
     def ready(self) -> bool:
-        """See Surroundings."""
+        """Whether the camera is ready."""
         return self.camera.state == "ready"
 
     def ground_station(self) -> Asker | None:
-        """See Surroundings."""
+        """Start the ground station that asks for the frames; None where there is none to start."""
         return self.simulation.ground_station(self.frames) if self.simulation and self.frames else None
 
 

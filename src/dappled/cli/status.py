@@ -41,7 +41,7 @@ class ShowStatus(Verb):
     json: bool = flag("--json", "print the health record as it is published")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Show the state of the daemon."""
         record = health(self.endpoint or stream_endpoint(self.config), self.timeout, unit(self.config))
         return Report(record, screen(record))
 

@@ -154,12 +154,12 @@ class RunObserver(Observer):
         self._tally, self._frames, self._camera = tally, frames, camera
 
     def finished(self, pending: PendingShot) -> None:
-        """See Observer."""
+        """Nothing more is expected of a shot."""
         self._tally.add(pending)
         self._frames.finished(pending)
 
     def camera_changed(self, change: StateChanged) -> None:
-        """See Observer."""
+        """The camera's state changed."""
         self._camera.changed(change)
 
 

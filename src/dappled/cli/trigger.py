@@ -69,7 +69,7 @@ class AskForPhotographs(Verb):
     json: bool = flag("--json", "print one JSON object per photograph")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Ask for photographs."""
         url, key = self._link()
         with GroundClient(url, key_file=key) as client:
             with waiting_for(f"a camera on {url}"):

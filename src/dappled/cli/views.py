@@ -22,7 +22,7 @@ _LONGEST = 2400  # px
 
 @dataclass(frozen=True, kw_only=True)
 class DrawViews(Overwriting, FieldArguments, Verb):
-    """See table."""
+    """Draw views, slices or shifts as one picture."""
 
     examples = (
         "dappled views frame.zarr -o views.png",
@@ -40,13 +40,13 @@ class DrawViews(Overwriting, FieldArguments, Verb):
     output: Path = option("-o --output", "picture to write")
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         if self.of != "epi" and (self.row, self.column) != (None, None):
             raise CallError(f"--row and --column are of --of epi: leave them out of {self.of}")
         self.refuse_existing(self.output)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Draw views, slices or shifts as one picture."""
         found = opened_field(self.field)
         if self.of == "epi":
             made, note = epi.drawn(found.stack, self.row, self.column), ""

@@ -30,7 +30,7 @@ class ConfigError(DappledError):
 
     @property
     def sentences(self) -> list[str]:
-        """See DappledError."""
+        """One for each setting that is wrong."""
         return self._sentences
 
 

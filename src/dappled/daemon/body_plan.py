@@ -152,11 +152,11 @@ class BodyPlan:
     # what a ground station uses
 
     def settings(self) -> tuple[Setting, ...]:
-        """See BodySettings."""
+        """The settings as last read, from memory; empty while none were read, and for a camera that has none."""
         return self._body.settings()
 
     def change(self, name: SettingName, value: str) -> None:
-        """See BodySettings: a person's request, which is the plan from now on unless the body refuses it."""
+        """Request another value for a person: it is the plan from now on unless the body refuses it."""
         self._body.change(name, value)
         self._requested = {**self._requested, name: value}
         self._replan()

@@ -53,7 +53,7 @@ class FlightControl:
     # ShotSink
 
     def obstacle(self) -> Finding | None:
-        """See ShotSink."""
+        """Why no shot can be taken now (no camera, disk full); None where one can."""
         if self._handover is not None and self._handover.next is not None:
             return finding(Code.FLIGHT_NEXT_BEGINS, Subject("flight"))
         if (missing := self._shots.without_camera()) is not None:
@@ -75,51 +75,51 @@ class FlightControl:
         self._looked = resources.shortage(resources.look()), self._clock.monotonic_ns()
 
     def note(self, shot: Shot) -> None:
-        """See ShotSink."""
+        """Write a shot down before the camera is touched."""
         self._recording.journal.note(shot)
 
     def fire(self, shot: Shot) -> None:
-        """See ShotSink."""
+        """Hand a noted shot to the camera."""
         self._shots.fire(shot)
 
     def refused(self, why: Finding) -> None:
-        """See ShotSink."""
+        """Requests became no shots: the first of a source for a reason, later how many more."""
         self._writer.later(REFUSED, findings.json_text(why))
 
     # CameraModel
 
     @property
     def mount(self) -> tuple[float, ...]:
-        """See CameraModel."""
+        """The rotation from camera to body axes, row by row, as it may be changed in flight."""
         return self._settings.now.pose.mount
 
     def facts(self) -> CameraFacts:
-        """See CameraModel."""
+        """Make, model, lens and sensor, as far as they are known."""
         return self._camera.facts()
 
     def storage(self) -> DiskSpace | None:
-        """See CameraModel."""
+        """The disk that frames go to; None while it can't be read."""
         try:
             return layout.disk_space(self._recording.folder.path)
         except FlightError:
             return None
 
     def lookup(self, index: int) -> Captured | None:
-        """See CameraModel."""
+        """How an old shot ended; None for one that never was."""
         if self._shots.untagged(index):
             return None  # its own message will come
         return camera_status.captured_image(index, self._recording.index)
 
     def pose(self) -> Pose | None:
-        """See CameraModel."""
+        """The vehicle's pose now; None while it is unknown."""
         return self._navigation.pose_now()
 
     def troubled(self) -> bool:
-        """See CameraModel."""
+        """Whether the heartbeat says MAV_STATE_CRITICAL."""
         return self._alarms.troubled
 
     def lost(self, triggers: Finding) -> None:
-        """See CameraModel."""
+        """Write down triggers of the autopilot that became no shot."""
         self.lost_triggers += triggers.number("triggers")
         self._writer.later(LOST, findings.json_text(triggers))
 
@@ -140,11 +140,11 @@ class DecodingParameter:
         self._shots, self._writer, self._decodes = shots, writer, decodes
 
     def parameters(self) -> tuple[Parameter]:
-        """See OwnParameters."""
+        """Each as it is now."""
         choices = ("on", "off") if self._decodes else ()
         return (Parameter("LF_DECODE", "Decode in flight", "on" if self._shots.decoding else "off", choices),)
 
     def set(self, name: str, value: str) -> None:
-        """See OwnParameters."""
+        """Take one of the choices of one of them; it has it at once."""
         self._shots.decoding = value == "on"
         self._writer.later("decoding", f"{value} from now on, by the ground station")

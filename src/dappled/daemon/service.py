@@ -456,7 +456,7 @@ class Service:
         return self.shutter.request(request)
 
     def reload(self, wanted: Settings) -> list[str]:
-        """See LiveSettings.reload."""
+        """Take over what may change in flight."""
         return self._settings.reload(wanted)
 
 

@@ -52,12 +52,12 @@ class ShotEvents(Observer):
         self.of_body: deque[BodyNews] = deque(maxlen=_OF_BODY)
 
     def settled(self, index: int, ok: bool) -> None:
-        """See Observer."""
+        """A shot is safe (`ok`) or failed."""
         self._shutter.settled(index, ok)
         self._outside.settled(index, ok)
 
     def tagged(self, pending: PendingShot) -> None:
-        """See Observer."""
+        """A shot's tag is known, or there will be none."""
         captured = captured_shot(pending, self._utc.utc_ns)
         if self._component.announce(captured):
             self._note_reported(captured.index)
@@ -75,14 +75,14 @@ class ShotEvents(Observer):
         self._outside.tagged(pending)
 
     def finished(self, pending: PendingShot) -> None:
-        """See Observer."""
+        """Nothing more is expected of a shot."""
         self._logbook.add(*of_shot(pending))
         if self._depth is not None:
             self._depth.offer(pending)
         self._outside.finished(pending)
 
     def camera_changed(self, change: StateChanged) -> None:
-        """See Observer."""
+        """The camera's state changed."""
         log.debug("camera %s %s", change.state, change.reason)
         if change.state != "busy" and not (change.state == "ready" and self._camera.known):
             reason = f": {change.reason}" if change.reason else ""
@@ -96,7 +96,7 @@ class ShotEvents(Observer):
         self._outside.camera_changed(change)
 
     def settings_changed(self, change: SettingsChanged) -> None:
-        """See Observer."""
+        """The camera's settings changed."""
         self.of_body.append(change)
         if change.refused:
             self._logbook.add(f"the camera refused a setting: {change.refused}", "warning")

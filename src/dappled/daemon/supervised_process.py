@@ -71,7 +71,7 @@ class SupervisedProcess:
         self._loop.stop(timeout_s)
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return self._loop.dead_threads()
 
     def _run(self) -> None:

@@ -20,11 +20,11 @@ class LiveSurvey:
         self._navigation, self._camera, self._shots = navigation, camera, shots
 
     def pose(self) -> Pose | None:
-        """See SurveyFacts."""
+        """Now."""
         return self._navigation.pose_now()
 
     def height(self) -> Height | None:
-        """See SurveyFacts."""
+        """Now; None where it is unknown."""
         pose = self._navigation.pose_now()
         if pose.ground is not None:
             return Height(pose.ground.metres, pose.ground.source)
@@ -32,14 +32,14 @@ class LiveSurvey:
         return None if above_m is None else Height(above_m, "above the take-off place")
 
     def field(self) -> tuple[float, float] | None:
-        """See SurveyFacts."""
+        """The sensor's (height, width) over the focal length; None where one is unknown."""
         facts = self._camera.facts()
         if not (facts.focal_length_mm and facts.sensor_height_mm and facts.sensor_width_mm):
             return None
         return facts.sensor_height_mm / facts.focal_length_mm, facts.sensor_width_mm / facts.focal_length_mm
 
     def busy(self) -> bool:
-        """See SurveyFacts."""
+        """Whether the body is at work on a shot, so that another would be taken later, and elsewhere."""
         return self._shots.state == "busy" or self._shots.waits
 
 

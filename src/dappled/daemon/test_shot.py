@@ -73,7 +73,7 @@ class EndedShots(Observer):
         self._changed = threading.Condition()
 
     def finished(self, pending: PendingShot) -> None:
-        """See Observer."""
+        """Nothing more is expected of a shot."""
         with self._changed:
             self._shots[pending.shot.index] = pending
             self._changed.notify_all()

@@ -333,7 +333,7 @@ class QueuedCamera:
             self._reported.notify()
 
     def next_event(self, timeout_s: float) -> CameraEvent | None:
-        """See Camera. After `stop` it still returns the events that are left."""
+        """Return the next event, or None where none came in time; after `stop` it still returns those that are left."""
         with self._reported:
             if timeout_s > 0:
                 self._patience.wait_for(self._reported, lambda: self._events, timeout_s)
@@ -344,14 +344,14 @@ class PlainCamera(QueuedCamera):
     """Base class of a camera that has no readable settings and never deletes its own copies of files."""
 
     def release(self, arrival: Arrival | Companion) -> None:
-        """See Camera: the camera's copy stays where it is."""
+        """Do nothing: the camera's copy stays where it is."""
 
     def settings(self) -> tuple[Setting, ...]:
-        """See Camera: there are none."""
+        """No settings."""
         return ()
 
     def change(self, name: SettingName, value: str) -> None:
-        """See Camera."""
+        """Refuse: there is no such setting. Raises CameraError."""
         check_change((), name, value)
 
 

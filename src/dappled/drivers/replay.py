@@ -39,12 +39,12 @@ class ReplayCamera(PlainCamera):
         self._playing = False
 
     def start(self) -> None:
-        """See Camera."""
+        """Begin to look for the camera and to report events."""
         self._playing = True
         self.report(StateChanged("ready", "", self._clock.monotonic_ns(), self._identity))
 
     def fire(self, shot: int) -> None:
-        """See Camera. The recorded events of this shot follow at once."""
+        """Report the recorded events of this shot at once."""
         now_ns = self._clock.monotonic_ns()
         if not self._playing:
             self.report(ShotFailed(shot, "the recording is not playing", now_ns))
@@ -69,9 +69,9 @@ class ReplayCamera(PlainCamera):
 
     @property
     def identity(self) -> Identity:
-        """See Camera."""
+        """The body of the recording."""
         return self._identity
 
     def stop(self) -> None:
-        """See Camera."""
+        """Close the camera within two seconds."""
         self._playing = False

@@ -20,7 +20,7 @@ class StoredRows(LedgerReader):
     """
 
     def __init__(self, path: Path, *, uri: str) -> None:
-        """See LedgerReader."""
+        """Open a ledger."""
         super().__init__(path, uri=uri)
         self._db.text_factory = lambda data: data.decode("utf-8", "surrogateescape")
         self._rows("BEGIN")

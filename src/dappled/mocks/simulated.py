@@ -73,7 +73,7 @@ class Exposing:
         self._exposures: Worker[tuple[int, int]] | None = None
 
     def open(self) -> None:
-        """See ShutterLine."""
+        """Acquire the line; called again after an error."""
         try:
             self._expose = self._expose or pictures(self._options).expose
             self._card.mkdir(mode=0o700, exist_ok=True)
@@ -84,7 +84,7 @@ class Exposing:
             self._exposures.start()
 
     def press(self) -> None:
-        """See ShutterLine."""
+        """Press the shutter, now."""
         assert self._exposures is not None
         self._taken += 1
         self._exposures.put((time.monotonic_ns(), self._taken))
@@ -102,10 +102,10 @@ class Exposing:
             return  # the camera was closed meanwhile, and its card deleted
 
     def let_go(self) -> None:
-        """See ShutterLine."""
+        """Release the shutter after it was held long enough."""
 
     def close(self) -> None:
-        """See ShutterLine: files that are open stay readable."""
+        """Give the line back, released. Files that are open stay readable."""
         exposures, self._exposures = self._exposures, None
         if exposures is not None:
             exposures.stop(0.0)

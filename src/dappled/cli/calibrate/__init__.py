@@ -47,7 +47,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
     )
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         if self.kit is not None:
             if self.frames or self.mask:
                 raise CallError("--kit reads the frames and masks of its folder: leave out FRAME and --mask")
@@ -63,7 +63,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
             Darkroom(self.recipe()).check()
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Fit lattice, law and phases."""
         if self.kit is not None:
             return kit.calibrated(kit.KitCall(self.kit, self.recipe(), self._given), self.output, output)
         assert self.output is not None

@@ -25,7 +25,7 @@ class ListFlights(SettingsArgument, Verb):
     folder: Path | None = argument("FOLDER", "flights folder (default: record.directory)", default=None)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """List all flights in a folder."""
         folder = self.folder or folder_of_flights(self.config)
         found = flight_report.list_flights(folder)
         if not found and not self.json:
@@ -40,7 +40,7 @@ class ShowFlight(FlightArgument, Verb):
     examples = (f"dappled flight show {EXAMPLE}",)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Show every shot of a flight."""
         found = flight_report.show(self.chosen(output))
         events = [{**codec.plain(one), "text": one.words, "finding": codec.plain(one.finding)} for one in found.events]
         return Report({**codec.plain(found), "events": events}, list(flight_lines.of_flight(found)))
@@ -57,7 +57,7 @@ class CheckFlight(FlightArgument, Verb):
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Check that every byte is intact."""
         key = sealing.key_of(self.config, self.key)
         return _of_check(flight_check.check(self.chosen(output), key), signed=self.key is not None)
 
@@ -73,7 +73,7 @@ class SealFlight(FlightArgument, Verb):
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Check a flight and sign it as it stands."""
         flight = self.chosen(output)
         key = sealing.key_of(self.config, self.key)
         if key is None:
@@ -101,7 +101,7 @@ class ReportFlight(FlightArgument, Verb):
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Count which requests became frames."""
         flight = self.chosen(output)
         found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
         sources = codec.plain(by_source)
@@ -130,7 +130,7 @@ class OffloadFlight(FlightArgument, Verb):
     same_device: bool = flag("--same-device", "insist on a DEST that is on the same disk")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Copy a flight to another disk."""
         flight = self.chosen(output)
         total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
         with output.bar(total, "B") as add:

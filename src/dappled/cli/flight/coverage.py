@@ -44,7 +44,7 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         return [] if self.output is None else [self.output / f"coverage.{kind}" for kind in ("tif", "geojson", "png")]
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         if self.refly is not None and self.refly.suffix != ".plan":
             raise CallError(f"--refly {self.refly}: QGroundControl opens .plan files only")
         if self.refly is not None and self.area is None:
@@ -52,7 +52,7 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         self.refuse_existing(*self._files(), self.refly)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Which ground the frames have seen."""
         files = self._files()
         area = None if self.area is None else areas.read(self.area)
         seen = coverage.of_flight(

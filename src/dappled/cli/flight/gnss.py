@@ -26,7 +26,7 @@ class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
     output: Path | None = option("-o --output", "the file", None, otherwise="the flight's name.ubx")
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Write the GNSS receiver's stream."""
         flight = self.chosen(output)
         folder = layout.open_folder(flight)
         to = self.output or Path(f"{folder.name}.ubx")

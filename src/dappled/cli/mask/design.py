@@ -43,12 +43,12 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
     picture: Path | None = option("--picture", "draw the carriers on the spectrum", None, metavar="FILE.png")
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.picture)
         profiles.camera(self.camera)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Design mask, distance and film."""
         if self.mask:
             return self._best(self.mask)
         camera, sensor, length = self.camera_set()

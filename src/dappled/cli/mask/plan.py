@@ -33,13 +33,13 @@ class PlanFlight(AltitudeArguments, Verb):
     sideways: bool = flag("--sideways", "the width of the frame, not its height, lies along the flight line")
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.camera_set()
         if self.mask:
             profiles.mask(self.mask)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Plan a flight."""
         camera, sensor, length = self.camera_set()
         columns, warnings = None, list[str]()
         if self.mask:

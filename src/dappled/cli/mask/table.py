@@ -34,11 +34,11 @@ class TabulateCarriers(InstallationArguments, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self.installed(self.mask)
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Print where the carriers are."""
         camera, one = self.installed(self.mask)
         only = only_length(camera)
         lengths = self.focal_length or (THESIS_FOCAL_LENGTHS_MM if only is None else (only,))

@@ -35,11 +35,11 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
         return PictureMaker(recorded(self.frames, self.recipe()))
 
     def check(self) -> None:
-        """See Verb."""
+        """Refuse a call that is wrong by itself."""
         self._maker().check()
 
     def run(self, output: Output) -> Report:
-        """See Verb."""
+        """Make photographs without the mask's shadow."""
         maker, found = self._maker(), frames(self.frames)
         suffix = self.output.suffix.lower()
         single = len(found) == 1 and suffix in picture_files.SUFFIXES

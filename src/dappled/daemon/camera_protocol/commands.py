@@ -139,13 +139,13 @@ class DistanceSeries(Protocol):
     """Photographs by distance (see `DistanceTrigger`)."""
 
     def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None:
-        """See DistanceTrigger."""
+        """Take photographs by distance, in place of a running series; the first one spacing away, or `at_once`."""
 
     def begin_configured(self, source: str) -> bool:
-        """See DistanceTrigger."""
+        """Begin the series of the settings; False where they have none."""
 
     def end(self) -> object:
-        """See DistanceTrigger."""
+        """End a running series, from any source; one that began after `asked_ns` (monotonic) goes on."""
 
 
 class MessageIntervals:

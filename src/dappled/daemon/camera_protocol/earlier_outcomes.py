@@ -42,7 +42,7 @@ class IndexedOutcomes:
         self._due_ns = 0
 
     def summary(self) -> str | None:
-        """See EarlierOutcomes."""
+        """A sentence that counts the lost photographs among them; None where no new one was lost."""
         if not self._uncounted:
             return None
         lost = [index for index in self._uncounted if not _outcome(index, self._images).ok]
@@ -54,14 +54,14 @@ class IndexedOutcomes:
         return f"{counted(len(lost), 'photograph')} {were} lost when the daemon ended: {numbers(lost)}"
 
     def due(self, now_ns: int) -> Sequence[Captured]:
-        """See EarlierOutcomes."""
+        """The outcomes to send now."""
         if not self._left or now_ns < self._due_ns:
             return ()
         self._due_ns = now_ns + PACE_NS
         return (_outcome(self._left[0], self._images),)
 
     def sent(self, index: int) -> None:
-        """See EarlierOutcomes."""
+        """The outcome of this shot was sent, and is not due again."""
         self._images.note_late_report(index)
         self._left.remove(index)
 

@@ -196,10 +196,10 @@ class GroundClient:
         return _Listening(self._changed, self._listeners, self._clock)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
-        """See `PacketLog`: a ground client keeps no log."""
+        """Write a packet to the telemetry log. A ground client keeps no log."""
 
     def on_packet(self, packet: Packet) -> None:
-        """See `PacketLog`."""
+        """Take a packet that was logged, received or sent."""
         message = packet.message
         if packet.sent:
             return

@@ -154,7 +154,7 @@ class TargetedTimesync(mavlink.MAVLink_timesync_message):  # type: ignore[misc] 
         self._target = system, 1
 
     def pack(self, mav: mavlink.MAVLink, force_mavlink1: bool = False) -> bytes:
-        """See pymavlink."""
+        """Pack the message with its target, which pymavlink's own TIMESYNC lacks."""
         whole = _TIMESYNC.pack(self.tc1, self.ts1, *self._target)
         payload = whole[:16] if force_mavlink1 else whole
         return bytes(self._pack(mav, self.crc_extra, payload, force_mavlink1=force_mavlink1))
@@ -254,7 +254,7 @@ class AutopilotNow:
         return self._boot.heard(boot_ms * 1000, now_ns) if boot_ms > 0 else None
 
     def is_stale(self, time_us: int, now_ns: int) -> bool | None:
-        """See `OwnAutopilot.is_stale`."""
+        """Whether a time of the autopilot's, since boot or in UTC, is not about now."""
         about_now = (self._utc if time_us >= EPOCH_US else self._boot).is_about(time_us, now_ns)
         return None if about_now is None else not about_now
 

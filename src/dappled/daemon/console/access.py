@@ -99,7 +99,7 @@ class Access:
         self._refusals.refused(Finding(code, Subject("peer", client), facts))
 
     def settle(self) -> None:
-        """See `RefusalLog.settle`."""
+        """Log how many more there were, where the interval is over; forget those that came no more."""
         self._refusals.settle()
 
     def try_token(self, token: str, client: str) -> Refusal | None:

@@ -36,7 +36,7 @@ class RecordedHub(Hub):
         self._end: Event = {"is": "end", "shots": dict(shots)}
 
     def listen(self, first: list[Event]) -> AsyncIterator[str]:
-        """See Hub."""
+        """Server-sent events for a new page: the first ones at once, a comment when there are none for a while."""
         return super().listen([*first, self._end])
 
 
@@ -85,7 +85,7 @@ class RecordedFeed(Feed):
                 log.warning("frame %d: %s", index, error)
 
     async def slices(self, frame: int) -> Message:
-        """See Feed."""
+        """The slices of a frame: as kept, or asked for again."""
         if (kept := self._stacks.get(frame)) is not None:
             return kept
         if frame not in self.frames:
@@ -111,7 +111,7 @@ class _NoDaemon:
     """Answers what the page asks of a daemon: there is none."""
 
     def ask(self, question: Mapping[str, Any]) -> dict[str, Any]:
-        """See DaemonChannel."""
+        """The daemon's answer."""
         if question.get("do") == "log":
             return {"lines": []}
         return {"ok": False, "error": "this is a recording: nothing can be fired or set"}

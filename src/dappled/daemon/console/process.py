@@ -129,7 +129,7 @@ class Console:
         self._listener.close()
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return self._process.dead_threads()
 
 
@@ -141,11 +141,11 @@ class _PageRequests:
     handler: RequestHandler
 
     def begun(self, channel: ProcessChannel) -> None:
-        """See ProcessPeer."""
+        """The process was started, the first time or again."""
         channel.send(self.setup, timeout_s=5.0)
 
     def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
-        """See ProcessPeer."""
+        """Its next message; None where none came for 0.2 s."""
         if message is None:
             return
         answer = {**self.handler.answer(message.body), "number": message.body.get("number")}

@@ -62,18 +62,18 @@ class FlightFrames:
 
     @property
     def start(self) -> Mapping[str, Any]:
-        """See FrameSource."""
+        """The header of the `start` message: flight, camera, mask."""
         tags = [line.tag for line in self._lines.values() if line.tag is not None]
         camera, mask = (tags[0].camera, tags[0].mask) if tags else ("", "")
         return {"flight": self._contents.name, "camera": camera, "mask": mask}
 
     @property
     def shots(self) -> Mapping[str, int]:
-        """See FrameSource."""
+        """How many shots were wished for, and how many became safe frames."""
         return {"wished": len(self._contents.lines), "safe": len(self._lines)}
 
     def frames(self) -> Sequence[ShownFrame]:
-        """See FrameSource."""
+        """All frames that have a tag, in order."""
         shown = []
         for line in self._lines.values():
             if line.tag is not None and line.frame is not None:
@@ -85,7 +85,7 @@ class FlightFrames:
         return shown
 
     def slices(self, index: int) -> Message:
-        """See FrameSource."""
+        """A frame's `slices` message."""
         line = self._lines.get(index)
         if line is None or line.frame is None or line.tag is None:
             raise DappledError(f"there is no frame {index} in this flight")
@@ -96,7 +96,7 @@ class FlightFrames:
         return Message("slices", self._named(wire.slices_header(line.tag, decoded)), decoded.body)
 
     def light_field(self, _index: int) -> LightField | None:
-        """See FrameSource."""
+        """The frame's light field where it was decoded before; None where views are made of its slices."""
         return None
 
     def _named(self, header: Mapping[str, Any]) -> dict[str, Any]:
@@ -112,21 +112,21 @@ class LightFieldFrames:
 
     @property
     def start(self) -> Mapping[str, Any]:
-        """See FrameSource."""
+        """The header of the `start` message: flight, camera, mask."""
         return {"flight": self._name, "camera": self._said("camera") or "", "mask": self._said("mask") or ""}
 
     @property
     def shots(self) -> Mapping[str, int]:
-        """See FrameSource."""
+        """How many shots were wished for, and how many became safe frames."""
         return {"wished": 1, "safe": 1}
 
     def frames(self) -> Sequence[ShownFrame]:
-        """See FrameSource."""
+        """All frames that have a tag, in order."""
         facts = {"utc_sigma_ns": None, "time_source": "", "exposure_s": None, "iso": None}
         return [ShownFrame({**self._facts(), **facts, "name": self._name, "size": self._size})]
 
     def slices(self, index: int) -> Message:
-        """See FrameSource."""
+        """A frame's `slices` message."""
         if index != 0:
             raise DappledError(f"there is no frame {index} in {self._name}")
         slices, carriers = self._field.slices, self._field.carriers
@@ -149,7 +149,7 @@ class LightFieldFrames:
         return Message("slices", header, slices.data.cast("B"))
 
     def light_field(self, _index: int) -> LightField | None:
-        """See FrameSource."""
+        """The frame's light field where it was decoded before; None where views are made of its slices."""
         return self._field
 
     def _said(self, name: str) -> Any:

@@ -302,7 +302,7 @@ class Navigation:
         self._vehicles, self._vehicles_noted = list[tuple[int, int]](), 0
 
     def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
-        """See PacketLog."""
+        """Write a packet to the telemetry log."""
         return self._recording.telemetry.append(stamp_us, raw)
 
     def on_packet(self, packet: Packet) -> None:
@@ -335,7 +335,7 @@ class Navigation:
         return self.telemetry.locate(exposure)
 
     def rates(self, pose: Pose) -> Vector3 | None:
-        """See PoseSource."""
+        """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
         return self.telemetry.rates(pose)
 
     def pose_now(self) -> Pose:

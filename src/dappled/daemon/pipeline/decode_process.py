@@ -166,7 +166,7 @@ class DecodeProcess:
     def decode(
         self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int, look: bool = False
     ) -> DecodedFrame:
-        """See FrameDecoder."""
+        """Decode the raw file of frame `index` at `path`."""
         frame = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number, "index": index}
         with self._turn:
             look = look and self._may_look

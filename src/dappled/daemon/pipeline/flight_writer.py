@@ -70,23 +70,23 @@ class LedgerWriter:
         self._sizes: deque[int] = deque(maxlen=_RECENT)
 
     def requested(self, shot: Shot) -> None:
-        """See FlightWriter."""
+        """Enter a shot that stands in the journal."""
         self._recording.ledger.add_shot(shot)
 
     def frame(self, index: int) -> Frame | None:
-        """See FlightWriter."""
+        """A frame that is safe."""
         return self._recording.ledger.frame(index)
 
     def tag(self, index: int) -> Tag | None:
-        """See FlightWriter."""
+        """The tag of a frame, once known."""
         return self._recording.ledger.tag(index)
 
     def fired(self, event: Fired) -> None:
-        """See FlightWriter."""
+        """The trigger call was made."""
         self._recording.ledger.fired(event.shot, event.called_monotonic_ns, event.returned_monotonic_ns)
 
     def failed(self, index: int, reason: str) -> None:
-        """See FlightWriter."""
+        """A shot will bring no frame."""
         self._recording.ledger.failed(index, reason)
         self._index(index)
 
@@ -104,12 +104,12 @@ class LedgerWriter:
         return frame
 
     def follows(self, index: int, reason: str) -> None:
-        """See FlightWriter."""
+        """A shot was fired, and its file stays at the camera for now."""
         self._recording.ledger.follows(index, reason)
         self._index(index)
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
-        """See FlightWriter."""
+        """Make a file safe that stands beside a frame."""
         recorder = self._recording.recorder
         recorder.record_companion(index, name, blob, arrived_utc_ns=self._clock.utc_ns())
         if self._sizes:
@@ -122,11 +122,11 @@ class LedgerWriter:
         return sum(sizes) / len(sizes) if sizes else None
 
     def path(self, frame: Frame) -> str:
-        """See FlightWriter."""
+        """Where the frame's file stands."""
         return str(self._recording.folder.path / frame.name)
 
     def tagged(self, tag: Tag) -> None:
-        """See FlightWriter."""
+        """A frame's tag is known."""
         self._recording.ledger.add_tag(tag)
 
     def law_decided(self, decision: LawDecision) -> None:
@@ -135,11 +135,11 @@ class LedgerWriter:
         self.event("law", decision.sentence, decision.first)
 
     def decoded(self, result: Result) -> None:
-        """See FlightWriter."""
+        """A frame's slices are known."""
         self._recording.ledger.add_result(result)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See FlightWriter."""
+        """Something happened."""
         self._recording.ledger.add_event(kind, text, index)
 
     def later(self, kind: str, text: str) -> None:

@@ -140,7 +140,7 @@ class Decoding:
         )
 
     def take(self, pending: PendingShot) -> None:
-        """See NextStage. A frame that is not to be decoded comes to its end here."""
+        """Queue a shot. A frame that is not to be decoded comes to its end here."""
         if self._decoder is None:
             self._ends.finish(pending)
         elif self._ends.shots.decoding:

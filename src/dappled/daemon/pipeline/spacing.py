@@ -147,7 +147,7 @@ class DistanceTrigger:
         self._loop.stop(2.0)
 
     def dead_threads(self) -> list[str]:
-        """See HasThreads."""
+        """The threads that have ended without having been stopped."""
         return self._loop.dead_threads()
 
     def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None:

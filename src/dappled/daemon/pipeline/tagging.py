@@ -132,7 +132,7 @@ class Tagging:
         )
 
     def take(self, pending: PendingShot) -> None:
-        """See NextStage."""
+        """Queue a shot."""
         self.worker.put(pending)
 
     def _work(self, pending: PendingShot) -> None:

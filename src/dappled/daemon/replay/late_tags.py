@@ -34,21 +34,21 @@ class MissingTagWriter(ReplayVerifier):
         self.added: list[int] = []
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See FlightWriter: `flight check` verifies the bytes."""
+        """Make a file safe; when this returns it is. `flight check` verifies the bytes."""
         frame = None if index is None else self.frame(index)
         if frame is None:
             raise DappledError(f"{name} belongs to no recorded frame")
         return frame
 
     def tagged(self, tag: Tag) -> None:
-        """See FlightWriter."""
+        """A frame's tag is known."""
         super().tagged(tag)
         if self._lacks(tag.index):
             self._ledger.add_tag(tag)
             self.added.append(tag.index)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See FlightWriter."""
+        """Something happened."""
         if index is not None and self._lacks(index) and kind not in self._expected[index].events:
             self._ledger.add_event(kind, text, index)
 
@@ -118,7 +118,7 @@ def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None,
 
 
 def _logged(folder: FlightFolder, wanted: int | None) -> tuple[int | None, list[Finding]]:
-    """See `vehicle_of`; None without telemetry. Raises VehicleError and FlightError."""
+    """The vehicle that carried the camera; None without telemetry. Raises VehicleError and FlightError."""
     if folder.telemetry.is_file():
         return vehicle_of(folder.telemetry, wanted)
     if wanted is None:

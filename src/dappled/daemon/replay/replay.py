@@ -310,7 +310,7 @@ class RecordedTelemetry:
         return self._telemetry.locate(exposure, upto_packet=horizon)
 
     def rates(self, pose: Pose) -> Vector3 | None:
-        """See PoseSource."""
+        """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
         return self._telemetry.rates(pose)
 
     def findings(self) -> list[Finding]:
@@ -339,7 +339,7 @@ class ReplayProgress(Observer):
         self.frames = self.bad = 0
 
     def finished(self, pending: PendingShot) -> None:
-        """See Observer."""
+        """Nothing more is expected of a shot."""
         self.frames += pending.frame is not None
         self.bad += bool(pending.problem) and pending.frame is not None
         self.ended.release()

@@ -72,27 +72,27 @@ class ReplayVerifier:
         self.differences: list[str] = []
 
     def frame(self, index: int) -> Frame | None:
-        """See FlightWriter."""
+        """A frame that is safe."""
         one = self._expected.get(index)
         return None if one is None else one.frame
 
     def tag(self, index: int) -> Tag | None:
-        """See FlightWriter."""
+        """The tag of a frame, once known."""
         return self._tags.get(index)
 
     def requested(self, shot: Shot) -> None:
-        """See FlightWriter: the shot is in the record."""
+        """Enter a shot that stands in the journal. The shot is in the record."""
 
     def fired(self, event: Fired) -> None:
-        """See FlightWriter."""
+        """The trigger call was made."""
 
     def failed(self, index: int, reason: str) -> None:
-        """See FlightWriter."""
+        """A shot will bring no frame."""
         if self._expected[index].frame is not None:
             self.differences.append(f"frame {index}: {reason}")
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See FlightWriter: the file is where it was; its bytes are hashed again."""
+        """Make a file safe; when this returns it is. The file is where it was; its bytes are hashed again."""
         frame = None if index is None else self._expected[index].frame
         if index is None or frame is None:
             raise DappledError(f"{name} belongs to no recorded frame")
@@ -102,17 +102,17 @@ class ReplayVerifier:
         return frame
 
     def follows(self, index: int, reason: str) -> None:
-        """See FlightWriter: the file has come by now, or it is replayed as failed."""
+        """A shot's file stays at the camera: it has come by now, or the shot is replayed as failed."""
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
-        """See FlightWriter: a replay brings frames only."""
+        """Make a file safe that stands beside a frame. A replay brings frames only."""
 
     def path(self, frame: Frame) -> str:
-        """See FlightWriter."""
+        """Where the frame's file stands."""
         return str(self.root / frame.name)
 
     def tagged(self, tag: Tag) -> None:
-        """See FlightWriter."""
+        """A frame's tag is known."""
         one = self._expected[tag.index]
         self._tags[tag.index] = tag
         recorded = codec.plain(one.tag)
@@ -123,10 +123,10 @@ class ReplayVerifier:
         self._compare(tag.index, "tag", (one.tag_sha256, digest(tag)), near=near)
 
     def law_decided(self, decision: LawDecision) -> None:
-        """See FlightWriter: a replay goes by what the flight decided."""
+        """A frame showed by which law this flight is decoded. A replay goes by what the flight decided."""
 
     def decoded(self, result: Result) -> None:
-        """See FlightWriter."""
+        """A frame's slices are known."""
         if self._keep is not None:
             self._keep.decoded(result)
             self._seen[result.index].add("slices")
@@ -139,7 +139,7 @@ class ReplayVerifier:
             self._compare(result.index, "slices", hashes, share=self._share(one, result))
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
-        """See FlightWriter. An event of a kind that the flight has for this shot too does not count as a difference."""
+        """Something happened. An event of a kind that the flight has for this shot too is no difference."""
         if index is not None and kind in self._expected[index].events:
             return
         self.differences.append(f"frame {index}: {kind}: {text}" if index is not None else f"{kind}: {text}")

@@ -78,7 +78,7 @@ class Answers:
         self._worker.stop(1.0)
 
     def dead_threads(self) -> list[str]:
-        """See `Worker.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return self._worker.dead_threads()
 
     def answer(self, request: Mapping[str, Any], reply: Reply) -> None:

@@ -157,17 +157,17 @@ class Publisher:
         )
 
     def start(self, flight: str, answer: Answer) -> None:
-        """See Stream."""
+        """Start to send and to listen."""
         self._flight, self._answer = flight, answer
         self._loop.start()
         self._sockets.start()
 
     def dead_threads(self) -> list[str]:
-        """See Stream."""
+        """The threads that have ended without having been stopped: never, unless there is a bug."""
         return [*self._loop.dead_threads(), *self._sockets.dead_threads()]
 
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
-        """See Stream."""
+        """Queue a message; `seq`, `dropped` and the rest of the envelope are added when it is sent."""
         with self._lock:
             self._waiting.append((b"", Message(topic, facts, body)))
             if sum(not peer for peer, _ in self._waiting) > self._capacity:
@@ -175,7 +175,7 @@ class Publisher:
         self._ring()
 
     def statistics(self) -> PublisherStatistics:
-        """See Stream."""
+        """Counters, taken together."""
         with self._lock:
             return PublisherStatistics(
                 dict(self._sent),

@@ -65,7 +65,7 @@ class TcpRelay:
             listener.close()
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return [] if self._process is None else self._process.dead_threads()
 
 
@@ -76,10 +76,10 @@ class _RefusalReports:
     refusals: RefusalLog
 
     def begun(self, channel: ProcessChannel) -> None:
-        """See ProcessPeer. The process has all that it needs."""
+        """The process was started, the first time or again. The process has all that it needs."""
 
     def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
-        """See ProcessPeer."""
+        """Its next message; None where none came for 0.2 s."""
         self.refusals.settle()
         for address, reason, count in message.body.get("refused", ()) if message is not None else ():
             self.refusals.refused(finding(Code(reason), Subject("peer", str(address))), int(count))

@@ -98,7 +98,7 @@ class Sockets:
         self._relay.start()
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return self._relay.dead_threads()
 
     def let_in(self) -> None:

@@ -67,7 +67,7 @@ class GnssPort:
         self._loop.stop(2.0)
 
     def dead_threads(self) -> list[str]:
-        """See HasThreads."""
+        """The threads that have ended without having been stopped."""
         return self._loop.dead_threads()
 
     def problem(self) -> Finding | None:

@@ -140,7 +140,7 @@ class GPhoto2Camera(QueuedCamera):
         return self._identity
 
     def settings(self) -> tuple[Setting, ...]:
-        """See Camera."""
+        """The settings as last read, from memory; empty while none were read."""
         return self._known_settings
 
     def change(self, name: SettingName, value: str) -> None:
@@ -155,7 +155,7 @@ class GPhoto2Camera(QueuedCamera):
                 raise CameraError(f"{name} was not set: {error}") from None
 
     def look(self) -> LivePicture | None:
-        """See LiveView: a message to the process, where none is on its way."""
+        """Return the newest picture of live view, and ask the process for another where no question is on its way."""
         with self._lock:
             if self._channel is None:
                 raise CameraError("the camera's process is not running: there is no live view now")
@@ -198,7 +198,7 @@ class GPhoto2Camera(QueuedCamera):
         self._loop.stop(_KILL_S)
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return self._loop.dead_threads()
 
     # --- the supervising thread

@@ -183,11 +183,11 @@ class MachineTransport:
         self._clock = clock
 
     def open(self, address: Address) -> ByteChannel:
-        """See Transport."""
+        """Open the connection that `address` names."""
         return open_channel(address, self._clock)
 
     def wait(self, channel: ByteChannel, timeout_s: float) -> tuple[bool, bool]:
-        """See Transport. poll takes descriptors above 1023, select does not."""
+        """Wait until a channel can be read or written. poll takes descriptors above 1023, select does not."""
         poll = select.poll()
         for descriptor in channel.descriptors():
             poll.register(descriptor, select.POLLIN | (select.POLLOUT if channel.wants_write() else 0))
@@ -196,7 +196,7 @@ class MachineTransport:
 
 
 def open_channel(address: Address, clock: Clock) -> ByteChannel:
-    """See Transport."""
+    """Open the connection that `address` names."""
     try:
         if address.kind == "serial":
             return over_serial(address)

@@ -376,7 +376,7 @@ class MavlinkLinks:
         return tuple(link.statistics() for link in self._links)
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return [name for loop in self._loops for name in loop.dead_threads()]
 
     # --- the receiving threads

@@ -137,7 +137,7 @@ class SigningTime:
             return max(self._floor, max(self._used, self._accepted, self._now()) - NEW_STREAM_UNITS)
 
     def ahead(self, timestamp: int) -> int:
-        """See SignedTimes."""
+        """Return by how much a time is ahead of this machine's; 0 while that is not known, or by less than a minute."""
         ahead = timestamp - self._now()
         return ahead if self._correction is not None and ahead > NEW_STREAM_UNITS else 0
 

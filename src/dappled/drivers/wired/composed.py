@@ -90,12 +90,12 @@ class ComposedCamera(PlainCamera):
             self._loops.append(Loop("pickup", self._pick_up, self._stopping, self._clock))
 
     def use_autopilot(self, send: CommandSender) -> None:
-        """See UsesAutopilot: hand it on to a line that is fired by the autopilot."""
+        """Send commands by this from now on. Hand it on to a line that is fired by the autopilot."""
         if isinstance(self._line, UsesAutopilot):
             self._line.use_autopilot(send)
 
     def start(self) -> None:
-        """See Camera."""
+        """Begin to look for the camera and to report events."""
         self.report(StateChanged("starting", "", self._clock.monotonic_ns()))
         if self._watch is None:
             self._looked.set()
@@ -103,7 +103,7 @@ class ComposedCamera(PlainCamera):
             loop.start()
 
     def fire(self, shot: int) -> None:
-        """See Camera: a thread of its own presses the line."""
+        """Queue the shot: a thread of its own presses the line. Raises CameraError for one that has not ended."""
         with self._lock:
             if shot in self._open:
                 raise CameraError(f"shot {shot} was fired before and has not ended")
@@ -120,11 +120,11 @@ class ComposedCamera(PlainCamera):
 
     @property
     def identity(self) -> Identity | None:
-        """See Camera: known once the line has been open."""
+        """The body, known once the line has been open."""
         return self._identity if self._opened else None
 
     def stop(self) -> None:
-        """See Camera."""
+        """Close the camera within two seconds."""
         with self._lock:
             self._stopping.set()
         self._asked.set()
@@ -138,7 +138,7 @@ class ComposedCamera(PlainCamera):
             self.report(ShotFailed(shot, "the camera was stopped", self._clock.monotonic_ns()))
 
     def dead_threads(self) -> list[str]:
-        """See `Loop.dead_threads`."""
+        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
         return [name for loop in self._loops for name in loop.dead_threads()]
 
     # the shutter

@@ -46,7 +46,7 @@ class PtpSource:
         self._taken_s: dict[str, int | None] = {}
 
     def list(self) -> list[FoundFile]:
-        """See FileSource. Each call opens the camera anew: libgphoto2 remembers what it listed."""
+        """List all pictures. Each call opens the camera anew: libgphoto2 remembers what it listed."""
         (fd,) = self._ask({"do": "list"}).fds
         with os.fdopen(fd, "rb") as file:
             file.seek(0)
@@ -55,16 +55,16 @@ class PtpSource:
         return [FoundFile(name, size, round((taken_s or 0) * 1e9)) for name, size, taken_s in rows]
 
     def taken_s(self, found: FoundFile) -> float | None:
-        """See FileSource: the body's own note of when the file was made."""
+        """The body's own note of when the file was made, as if it were UTC; None where it has none."""
         return self._taken_s.get(found.name)
 
     def open(self, found: FoundFile) -> Blob:
-        """See FileSource."""
+        """Open its bytes."""
         answer = self._ask({"do": "fetch", "name": found.name})
         return Blob(answer.fds[0], answer.body["size"])
 
     def close(self) -> None:
-        """See FileSource."""
+        """Close the source."""
         child, self._child = self._child, None
         if child is None:
             return

@@ -74,7 +74,7 @@ class GpioLine:
         self._output: TriggerOutput | None = None
 
     def open(self) -> None:
-        """See ShutterLine."""
+        """Acquire the line; called again after an error."""
         if self._output is None:
             try:
                 self._output = (self._request or request_output)(self._chip, self._line, self._active_low)
@@ -85,11 +85,11 @@ class GpioLine:
                 ) from None
 
     def press(self) -> None:
-        """See ShutterLine."""
+        """Press the shutter, now."""
         self._set(Value.ACTIVE)
 
     def let_go(self) -> None:
-        """See ShutterLine."""
+        """Release the shutter after it was held long enough."""
         self._set(Value.INACTIVE)
 
     def _set(self, value: Value) -> None:
@@ -101,7 +101,7 @@ class GpioLine:
             raise CameraError(f"the shutter line {self._line} of {self._chip} can't be set: {error.strerror}") from None
 
     def close(self) -> None:
-        """See ShutterLine."""
+        """Give the line back, released."""
         output, self._output = self._output, None
         if output is not None:
             try:
@@ -128,18 +128,18 @@ class AutopilotLine:
         self._sender: CommandSender | None = None
 
     def use_autopilot(self, send: CommandSender) -> None:
-        """See UsesAutopilot."""
+        """Send commands by this from now on."""
         self._sender = send
 
     def open(self) -> None:
-        """See ShutterLine: the daemon opens the link to the autopilot."""
+        """Acquire the line; called again after an error. The daemon opens the link to the autopilot."""
 
     def press(self) -> None:
-        """See ShutterLine."""
+        """Press the shutter, now."""
         self._send(self._commands.pressed)
 
     def let_go(self) -> None:
-        """See ShutterLine."""
+        """Release the shutter after it was held long enough."""
         if self._commands.released is not None:
             self._send(self._commands.released)
 
@@ -149,23 +149,23 @@ class AutopilotLine:
             raise CameraError(f"the autopilot did not get the command to fire: {problem}")
 
     def close(self) -> None:
-        """See ShutterLine."""
+        """Give the line back, released."""
 
 
 class OutsideLine:
     """A camera that something else fires (the autopilot on its mission, a person) before the shot is requested."""
 
     def open(self) -> None:
-        """See ShutterLine."""
+        """Acquire the line; called again after an error."""
 
     def press(self) -> None:
-        """See ShutterLine."""
+        """Press the shutter, now."""
 
     def let_go(self) -> None:
-        """See ShutterLine."""
+        """Release the shutter after it was held long enough."""
 
     def close(self) -> None:
-        """See ShutterLine."""
+        """Give the line back, released."""
 
 
 class HalfPressedLine:
@@ -179,13 +179,13 @@ class HalfPressedLine:
         self._full, self._half, self.lead_s = full, half, lead_s
 
     def use_autopilot(self, send: CommandSender) -> None:
-        """See UsesAutopilot."""
+        """Send commands by this from now on."""
         for line in (self._full, self._half):
             if isinstance(line, UsesAutopilot):
                 line.use_autopilot(send)
 
     def open(self) -> None:
-        """See ShutterLine."""
+        """Acquire the line; called again after an error."""
         self._half.open()
         self._full.open()
 
@@ -194,7 +194,7 @@ class HalfPressedLine:
         self._half.press()
 
     def press(self) -> None:
-        """See ShutterLine."""
+        """Press the shutter, now."""
         try:
             self._full.press()
         except CameraError:
@@ -202,12 +202,12 @@ class HalfPressedLine:
             raise
 
     def let_go(self) -> None:
-        """See ShutterLine: both, the shutter first."""
+        """Release the shutter after it was held long enough. Both, the shutter first."""
         self._full.let_go()
         self._half.let_go()
 
     def close(self) -> None:
-        """See ShutterLine."""
+        """Give the line back, released."""
         try:
             self._full.close()
         finally:

@@ -116,7 +116,7 @@ class FolderSource:
         self.folder = folder
 
     def list(self) -> list[FoundFile]:
-        """See FileSource."""
+        """List all pictures in the order of their names."""
         try:
             if not self.folder.is_dir():
                 raise CameraError(f"{self.folder} is not there: check the path, or mount the card")
@@ -147,7 +147,7 @@ class FolderSource:
             raise error
 
     def taken_s(self, found: FoundFile) -> float | None:
-        """See FileSource: from EXIF."""
+        """Return the camera's time of a file, as if it were UTC; None where it has none. From EXIF."""
         try:
             with open(self.folder / found.name, "rb", opener=durable.plain_file) as file:
                 return seconds(read_exif(file).taken)
@@ -155,7 +155,7 @@ class FolderSource:
             raise self._lost(found, error) from None
 
     def open(self, found: FoundFile) -> Blob:
-        """See FileSource."""
+        """Open its bytes."""
         try:
             fd = durable.plain_file(str(self.folder / found.name), os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
@@ -170,7 +170,7 @@ class FolderSource:
         return CameraError(f"{self.folder / found.name} can't be read: {error.strerror}")
 
     def close(self) -> None:
-        """See FileSource."""
+        """Close the source."""
 
 
 class StorageSource(FolderSource):
@@ -183,7 +183,7 @@ class StorageSource(FolderSource):
         self._mounts, self._places = mounts or MOUNTS, places or PLACES
 
     def list(self) -> list[FoundFile]:
-        """See FileSource. Of several cards the one that was read before counts, or none."""
+        """List all pictures. Of several cards the one that was read before counts, or none."""
         unreadable, cards = "", []
         for where in self._mounted():
             try:

@@ -231,10 +231,10 @@ class Flyer:
         return max(0.0, (next_ns - self.clock.monotonic_ns()) / 1e9)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
-        """See `PacketLog`: the simulated autopilot keeps no log."""
+        """Write a packet to the telemetry log. The simulated autopilot keeps no log."""
 
     def on_packet(self, packet: Packet) -> None:
-        """See `PacketLog`: answer what came in."""
+        """Take a packet that was logged, received or sent. Answer what came in."""
         message = packet.message
         if packet.sent:
             return

@@ -35,7 +35,7 @@ class RudeClient(GroundClient):
         self._manners = manners
 
     def send_command(self, message: MavlinkMessage) -> None:
-        """See `MANNERS`."""
+        """Send a command, spoilt by these manners (`MANNERS`)."""
         if "nan" in self._manners:
             for name in ("param5", "param6", "param7"):
                 setattr(message, name, math.nan)

@@ -284,7 +284,7 @@ class _NoDetours(urllib.request.HTTPRedirectHandler):
     """A form that is redirected would arrive without its content: the redirection is an error."""
 
     def redirect_request(self, *_: Any) -> None:
-        """See HTTPRedirectHandler."""
+        """Follow none."""
 
 
 _OPENER = urllib.request.build_opener(_NoDetours)
