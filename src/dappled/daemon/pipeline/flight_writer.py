@@ -91,7 +91,7 @@ class LedgerWriter:
         self._index(index)
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
-        """See FlightWriter. A file that belongs to no shot is kept as a stray, and raises DappledError."""
+        """Make a file safe. One that belongs to no shot is kept as a stray, and raises DappledError."""
         arrived_utc_ns = self._clock.utc_ns()
         recorder = self._recording.recorder
         if index is None:
@@ -130,7 +130,7 @@ class LedgerWriter:
         self._recording.ledger.add_tag(tag)
 
     def law_decided(self, decision: LawDecision) -> None:
-        """See FlightWriter. flight.toml holds it, so that replays and products decode as the flight did."""
+        """Write the law that a frame showed into flight.toml, so that replays and products decode as the flight did."""
         self._recording.add_facts({DECISION: codec.plain(decision)})
         self.event("law", decision.sentence, decision.first)
 
