@@ -278,6 +278,7 @@ class Code(StrEnum):
     THREAD_ENDED = "thread.ended"
     TIME_IMPOSSIBLE = "time.impossible"
     TIME_MACHINE_DIFFERS = "time.machine_differs"
+    TIME_PUT_RIGHT = "time.put_right"
     TIME_TRIGGER_UNUSABLE = "time.trigger_unusable"
     TIME_WEEK_MENDED = "time.week_mended"
     TIME_WEEK_ROLLOVER = "time.week_rollover"

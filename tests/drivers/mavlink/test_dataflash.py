@@ -15,7 +15,7 @@ from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, log_packets
 from dappled.drivers.mavlink.dataflash import DataFlashError
 from dappled.drivers.reader_process import Budget
-from dappled.findings import Level, text
+from dappled.findings import Code, Finding, Level, text
 from dappled.flight import TimeSource
 from dappled.mocks.autopilot.path import FlightPath
 from tests.drivers.mavlink.true_logs import (
@@ -105,9 +105,29 @@ def test_receiver_messages_with_a_wrong_time_move_no_others(tmp_path: Path) -> N
     assert stamps == sorted(stamps)
 
 
-def test_a_receiver_whose_time_changes_in_the_flight_is_refused(tmp_path: Path) -> None:
-    own, _ = written(tmp_path, wrong_ms=(1_000,) * 20)
-    with pytest.raises(DataFlashError, match=r"00000012\.bin: the receiver's time in UTC changes by 1\.1 s .*\.tlog"):
+@pytest.mark.parametrize("off_s", [-37, 1, 3600])
+@pytest.mark.parametrize("steps", [5, 20, 40])
+def test_a_receiver_whose_time_is_put_right_counts_as_it_says_from_then_on(
+    tmp_path: Path, steps: int, off_s: int
+) -> None:
+    own, _ = written(tmp_path, wrong_ms=(1000 * off_s,) * steps)
+    told: list[Finding] = []
+    stamps = [stamp_us for _, stamp_us, _ in dataflash.packets(own, told.append)]
+    assert abs(stamps[0] - UTC_US) < 1000
+    assert stamps == sorted(stamps)
+    assert [(one.code, round(float(str(one.facts["off_s"])))) for one in told] == (
+        [] if steps == 5 else [(Code.TIME_PUT_RIGHT, off_s)]
+    )
+
+
+@pytest.mark.parametrize(
+    "wrong_ms", [(0, 1_000) * 30, (0,) * 20 + (1_000,) * 20, (0,) * 30 + tuple(range(1_000, 31_000, 1_000))]
+)
+def test_a_receiver_whose_time_goes_on_changing_is_refused(tmp_path: Path, wrong_ms: tuple[int, ...]) -> None:
+    own, _ = written(tmp_path, wrong_ms=wrong_ms)
+    with pytest.raises(
+        DataFlashError, match=r"00000012\.bin: the receiver's time in UTC changes by [0-9.]+ s .*\.tlog"
+    ):
         list(dataflash.packets(own))
 
 

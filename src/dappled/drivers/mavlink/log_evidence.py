@@ -220,6 +220,8 @@ def utc_clock(
             clock = log_packets.log_clock(boots_us[these], (true_us - boots_us)[these])
         except AutopilotLogError as error:
             raise AutopilotLogError(f"{path}: {error}") from None
+        if clock.step_us:
+            told.append(finding(Code.TIME_PUT_RIGHT, Subject("log", str(path)), off_s=clock.step_us / 1e6))
         if wanted is not Date.ROLLED_OVER:
             return clock, told
         doubted = doubted or (clock, told)

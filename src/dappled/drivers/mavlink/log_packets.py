@@ -19,6 +19,7 @@ FIX_3D = 3
 _UNKNOWN_16 = 2**16 - 1
 _LATEST_US = 500_000  # a receiver's message is logged within that time, all but always
 _AGREEING = 0.75  # share of a receiver's messages that must give one time
+_STEADY = 0.95
 _DRIFT = 1e-4  # of an autopilot's clock, at most
 
 Timed = tuple[int, MavlinkMessage]  # µs since boot
@@ -45,10 +46,12 @@ class ReceiverFix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogClock:
-    """UTC minus time since boot, `offsets_us` (n,), at `boots_us` (n,), which increase."""
+    """UTC minus time since boot, `offsets_us` (n,), at `boots_us` (n,), which increase. `step_us`: how much later the
+    receiver's UTC was before these than it would be by them; 0 where it was the same."""
 
     boots_us: Floats
     offsets_us: Floats
+    step_us: int = 0
 
     def utc_us(self, boot_us: int) -> int:
         """A time since boot in UTC."""
@@ -87,23 +90,40 @@ def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> Log
     A message is logged some time after it holds, so of messages near each other the largest offset is the truest. What
     another message nearby says counts less by what the two clocks may have drifted apart meanwhile. Messages that are
     half a second away from what most say are left out (a receiver that doesn't know the leap seconds yet, or a damaged
-    message). Raises AutopilotLogError where more than a quarter are.
+    message). Where more than a quarter are, what the receiver says from some time on counts. Raises AutopilotLogError
+    where it goes on changing.
     """
+    order = np.argsort(boots_us, kind="stable")
+    boots_us, offsets_us = boots_us[order], offsets_us[order]
     away = np.abs(offsets_us - int(np.median(offsets_us)))
     good = away < _LATEST_US
+    step_us = 0
     if good.mean() < _AGREEING:
-        raise AutopilotLogError(
-            f"the receiver's time in UTC changes by {float(away.max()) / 1e6:.1f} s within the log, so the time of a "
-            "frame is not certain: give the ground station's .tlog"
-        )
-    order = np.argsort(boots_us[good], kind="stable")
-    times, offsets = boots_us[good][order].astype(np.float64), offsets_us[good][order]
+        good = _since_its_last_step(offsets_us)
+        if not good.any():
+            raise AutopilotLogError(
+                f"the receiver's time in UTC changes by {float(away.max()) / 1e6:.1f} s within the log, so the time of "
+                "a frame is not certain: give the ground station's .tlog"
+            )
+        step_us = int(np.median(offsets_us[: np.flatnonzero(good)[0]])) - int(np.median(offsets_us[good]))
+    times, offsets = boots_us[good].astype(np.float64), offsets_us[good]
     begins = int(offsets[0])
     rising = _DRIFT * times
     values = (offsets - begins).astype(np.float64)
     since = np.maximum.accumulate(values + rising) - rising
     until = np.maximum.accumulate((values - rising)[::-1])[::-1] + rising
-    return LogClock(times, np.maximum(since, until) + begins)
+    return LogClock(times, np.maximum(since, until) + begins, step_us)
+
+
+def _since_its_last_step(offsets_us: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which offsets (n,) in the order of time agree with the last ones, from the time on when all but a few do; none
+    where that is less than a quarter, or others agree before."""
+    good = np.abs(offsets_us - int(np.median(offsets_us[-(len(offsets_us) + 3) // 4 :]))) < _LATEST_US
+    gain = np.concatenate([[0], np.cumsum(np.where(good, -1, 1))])
+    begins = int(np.argmax(gain))
+    after, before = good[begins:], good[:begins]
+    sure = 0 < begins <= _AGREEING * len(good) and after.mean() >= _STEADY and before.mean() <= 1 - _STEADY
+    return good & (np.arange(len(good)) >= begins) & sure
 
 
 def tell(path: Path, found: Iterable[Finding], report: Callable[[Finding], object], *, cut: bool) -> None:
