@@ -123,8 +123,13 @@ def test_the_installed_command_takes_none_either(
     assert done.stdout == f"dappled {dappled.__version__}\n"
 
 
+FEW = ("run", "decode", "depth", "watch", "trigger", "flight offload", "geotag", "batch", "mask kit")
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize(
+    "verb", [*FEW, *(pytest.param(verb, marks=pytest.mark.long) for verb in VERBS if verb not in FEW)]
+)
 def test_no_verb_takes_a_module_from_the_current_folder(hostile: HostileFolder, verb: str) -> None:
     with contextlib.suppress(subprocess.TimeoutExpired):  # `run` and `open` go on
         hostile.call(COMMAND, *verb.split(), timeout_s=6)
