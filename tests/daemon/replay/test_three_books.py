@@ -19,6 +19,7 @@ from dappled.drivers.mavlink.log_packets import AutopilotLogError
 from dappled.errors import DappledError
 from dappled.flight import Cause, Shot, recording
 from dappled.mocks.autopilot.path import FlightPath
+from tests.drivers.mavlink import logs_here
 from tests.drivers.mavlink.true_logs import (
     BOOT_US,
     SPAN_S,
@@ -40,6 +41,13 @@ def requested(
     times_s: Mapping[int, float] = TIMES_S, kind: str = "IMAGE_START_CAPTURE", *, numbers: bool = True
 ) -> list[_Shot]:
     return [(t_s, OWN, kind, number if numbers else None) for number, t_s in times_s.items()]
+
+
+@pytest.fixture(autouse=True)
+def logs_read_here(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a process for each, but for damaged ones."""
+    if "damaged" not in request.node.name:
+        monkeypatch.setattr("dappled.drivers.reader_process.read", logs_here.read)
 
 
 @pytest.fixture

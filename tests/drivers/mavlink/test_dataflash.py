@@ -62,6 +62,7 @@ def test_a_log_that_was_cut_off_is_read_up_to_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", ["bin", "ulg", "tlog"])
+@pytest.mark.usefixtures("logs_read_here")
 @pytest.mark.parametrize("cut", [0, 1, 2, 5])
 def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path) -> None:
     if form == "ulg":

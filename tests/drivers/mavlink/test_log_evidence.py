@@ -19,6 +19,7 @@ from dappled.findings import Code, Finding, Level, text
 from dappled.flight.log_reading import split
 from tests.drivers.mavlink.true_logs import BOOT_US, UTC_US, Row, poses, rewritten, same_fix, ulog_written, written
 
+pytestmark = pytest.mark.usefixtures("logs_read_here")
 NAN, POSITION = math.nan, 33
 Change = Callable[[str, Row], Iterable[tuple[str, Row]]]
 NOW_NS = UTC_US * 1000 + 3600 * 10**9

@@ -38,7 +38,9 @@ def _answer(path: str, words: Sequence[str]) -> ReadArrays:
         for form, ((name, *fields), columns) in enumerate(forms.items())
         for field, column in zip(fields, columns, strict=True)
     )
-    return found, "cut" if _cut_short(log) else ""
+    cut = _cut_short(log)
+    log.close()
+    return found, "cut" if cut else ""
 
 
 def _cut_short(log: Any) -> bool:
