@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.clock import Clock, SystemClock
-from dappled.drivers.reader_process import python_module
+from dappled.drivers.python_command import python_module
 from dappled.workers import Loop
 
 _MESSAGE_BYTES = 131072  # below net.core.wmem_default, 212992, which bounds a packet

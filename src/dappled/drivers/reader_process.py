@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json, stored_size
+from dappled.drivers.python_command import python_module
 from dappled.errors import first_line
 
 _ANSWER_BYTES = 8 << 20  # twice the longest text, for JSON's escapes
@@ -51,12 +52,6 @@ class Budget:
     patience_s: float = 20.0  # a loaded machine takes seconds to start Python
     memory: int = 2 * claims.FREE_BYTES
     ratio: int = claims.RATIO
-
-
-def python_module(module: str, *arguments: str) -> list[str]:
-    """Return the command that runs a module with this Python. `-P`: Python would look for modules in the current folder
-    first, and that may be a stranger's."""
-    return [sys.executable, "-P", "-m", module, *arguments]
 
 
 def read(

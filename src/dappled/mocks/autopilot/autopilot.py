@@ -23,7 +23,7 @@ from typing import Any
 
 from dappled.clock import Clock, SystemClock, TimeOfDayClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
-from dappled.drivers.reader_process import python_module
+from dappled.drivers.python_command import python_module
 from dappled.mocks.autopilot.on_request import OnRequest
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.autopilot.personality import PERSONALITIES, CameraPort, CameraTriggers

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundStationError, Outcome
 from dappled.drivers.mavlink import LinkError, MavlinkMessage, mavlink
-from dappled.drivers.reader_process import python_module
+from dappled.drivers.python_command import python_module
 
 MANNERS = {
     "deaf": "hears no answer: it sends each command four times, always with confirmation 0",

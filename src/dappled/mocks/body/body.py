@@ -24,7 +24,7 @@ from pathlib import Path
 
 from dappled.clock import SystemClock
 from dappled.config import profiles
-from dappled.drivers.reader_process import python_module
+from dappled.drivers.python_command import python_module
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES

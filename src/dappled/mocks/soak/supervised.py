@@ -8,7 +8,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.drivers.reader_process import python_module
+from dappled.drivers.python_command import python_module
 
 END_S = 20.0
 

@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from dappled.config import settings as configuration
-from dappled.drivers.reader_process import python_module
+from dappled.drivers.python_command import python_module
 from dappled.mocks.simulation import Simulation
 from dappled.mocks.soak.supervised import Supervised
 
