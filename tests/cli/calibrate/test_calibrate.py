@@ -148,6 +148,7 @@ def test_a_batch_goes_on_past_bad_frames_and_says_so(
     assert len(calibration_files.load(tmp_path / "c.toml").fits) == 2
 
 
+@pytest.mark.slow
 def test_a_wrong_mask_is_told_in_a_sentence(
     frames: Frames, profile: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

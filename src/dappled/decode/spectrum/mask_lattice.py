@@ -12,10 +12,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from dappled.decode.array_types import Floats
 from dappled.decode.optics import Carrier, Lattice, Order
@@ -155,7 +155,7 @@ def _likeliest(
     peaks: PeakList, predicted: Lattice, asked: Sequence[OrderStrength], hypotheses: Sequence[tuple[float, float]]
 ) -> list[Floats]:
     """The lattices (2, 2) in bins of the hypotheses that most peaks speak for, refitted to those peaks."""
-    tree = cKDTree(peaks.places)
+    tree = _tree(peaks)
     information = -np.log(np.minimum(peaks.rank_density() * math.pi * 9.0, 1.0))
     base = predicted.matrix() * peaks.spectrum.padded
     orders = np.array([one.order for one in asked], dtype=np.float64)
@@ -175,6 +175,13 @@ def _likeliest(
     return [matrix for _, _, matrix in ranked[:_BEST]]
 
 
+def _tree(peaks: PeakList) -> Any:
+    """A k-d tree of the peaks' places. Its library takes a quarter of a start of the daemon, which needs none."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415
+
+    return cKDTree(peaks.places)
+
+
 def _turned(turn_rad: float) -> Floats:
     """Turns orders: (ky, kx) counts from the row axis towards the column axis."""
     c, s = math.cos(turn_rad), math.sin(turn_rad)
@@ -187,7 +194,7 @@ def _judged(
     """A hypothesis with its lattice fitted to its peaks and its odds; None where these lie on no lattice of a mask."""
     spectrum = peaks.spectrum
     bins = np.array(spectrum.padded)
-    tree = cKDTree(peaks.places)
+    tree = _tree(peaks)
     orders = np.array([one.order for one in asked], dtype=np.float64)
     for share in (0.5 * _SKEW, 0.25 * _SKEW, 0.0):
         at = orders @ matrix
