@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dappled.drivers.reader_process import Budget, python_module, read
+from dappled.drivers.python_command import python_module
+from dappled.drivers.reader_process import Budget, read
 
 READER = "tests.drivers.limited_reader"
 MEMORY = 64 << 20
