@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dappled import codec
 from dappled.config.settings import PlannedBody
 from dappled.drivers.camera import (
     EXPOSURES,
@@ -115,16 +116,7 @@ class BodyReport:
 
     def values(self) -> dict[str, Any]:
         """As the health record has it."""
-        return {
-            "read": self.read,
-            "checked": self.checked,
-            "unknown": list(self.unknown),
-            "card_frames": self.card_frames,
-            "battery": self.battery,
-            "battery_percent": self.battery_percent,
-            "battery_low": self.battery_low,
-            "temperature_c": self.temperature_c,
-        }
+        return {name: one for name, one in codec.plain(self).items() if name not in ("wrong", "drift")}
 
 
 class BodyPlan:

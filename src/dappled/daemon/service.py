@@ -36,7 +36,7 @@ from dappled.daemon.flight_control import DecodingParameter, FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.health.record import DecodingState
+from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
 from dappled.daemon.health.standing import StandingEvents, StandingFindings
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
@@ -409,34 +409,33 @@ class Service:
         )
         return health.record(
             self._settings.now,
-            utc_ns=self._clock.utc_ns(),
-            monotonic_ns=self._clock.monotonic_ns(),
-            began_monotonic_ns=self._began_monotonic_ns,
-            shots=self._shots,
-            stages=self._pipeline.statistics(),
-            shutter=self.shutter.statistics(),
-            series=self._distance.statistics(),
-            links=self.links.statistics(),
-            telemetry=navigation.telemetry.statistics(),
-            publisher=self._publisher.statistics(),
-            folder=self.folder,
-            clock=navigation.telemetry.boot_clock(),
-            vehicle=navigation.pose_now(),
-            decoding=DecodingState(
-                self._decoder is not None,
-                self._pipeline.decode_failures,
-                self._events.misfit,
-                self._pipeline.verdicts,
+            ServiceTime(
+                self._clock.utc_ns(), self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known
             ),
-            utc_known=navigation.utc.known,
+            ShootingState(
+                self._shots,
+                self.shutter.statistics(),
+                self._control.lost_triggers,
+                self._distance.statistics(),
+                self._body.report(),
+                codec.plain(self._parameters.all()),
+            ),
+            VehicleState(
+                self.links.statistics(),
+                navigation.telemetry.statistics(),
+                navigation.telemetry.boot_clock(),
+                navigation.pose_now(),
+                self._autopilot.battery(),
+            ),
+            KeepingState(
+                self.folder, self._pipeline.statistics(), self._publisher.statistics(), self._writer.frame_bytes
+            ),
+            decoding=DecodingState(
+                self._decoder is not None, self._pipeline.decode_failures, self._events.misfit, self._pipeline.verdicts
+            ),
             dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
             found=[one for one in found if one is not None],
             standing=self._standing,
-            lost=self._control.lost_triggers,
-            parameters=codec.plain(self._parameters.all()),
-            frame_bytes=self._writer.frame_bytes,
-            body=self._body.report(),
-            battery=self._autopilot.battery(),
         )
 
     # what others may look at, and ask for

@@ -11,7 +11,7 @@ import pytest
 
 from dappled.config.settings import DecodeSettings, MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.health.record import DecodingState
+from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
 from dappled.daemon.navigation import BootClock, Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.pipeline import DecodeFailures
@@ -52,21 +52,19 @@ def record(
         stage.put(number)
     shots = PendingShots(FakeCamera())
     shots.state, shots.reason = cast(BodyState, state), more.pop("reason", "")
+    of_shots = {name: more.pop(name) for name in ("series", "body", "parameters") if name in more}
+    telemetry = replace(Telemetry().statistics(), positions=more.pop("positions", 0))
+    stream = PublisherStatistics({}, {}, 0, 0, 0)
+    links = [link, *more.pop("links", ())]
     return health.record(
         settings,
-        utc_ns=1_800_000_000 * S,
-        monotonic_ns=101 * S,
-        began_monotonic_ns=more.pop("began", 90 * S),
-        shots=shots,
-        stages=[stage.statistics()],
-        shutter=ShutterStatistics(2, 0, 0, 2, 0, 2, None),
-        links=[link, *more.pop("links", ())],
-        telemetry=replace(Telemetry().statistics(), positions=more.pop("positions", 0)),
-        publisher=PublisherStatistics({}, {}, 0, 0, 0),
-        folder=folder,
-        utc_known=more.pop("utc_known", True),
+        ServiceTime(1_800_000_000 * S, 101 * S, more.pop("began", 90 * S), more.pop("utc_known", True)),
+        ShootingState(shots, ShutterStatistics(2, 0, 0, 2, 0, 2, None), **of_shots),
+        VehicleState(links, telemetry, more.pop("clock", CLOCK), more.pop("vehicle", HERE), more.pop("battery", None)),
+        KeepingState(folder, [stage.statistics()], stream, more.pop("frame_bytes", None)),
+        decoding=more.pop("decoding", DecodingState(True)),
         dead_threads=more.pop("dead", ()),
-        **{"decoding": DecodingState(True), "vehicle": HERE, "clock": CLOCK, **more},
+        **more,
     )
 
 

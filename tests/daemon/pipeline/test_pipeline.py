@@ -19,7 +19,7 @@ from PIL import Image
 from dappled import codec, findings
 from dappled.config.settings import DecodeSettings, MaskSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.health.record import DecodingState
+from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
 from dappled.daemon.health.standing import in_record
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline import capture
@@ -466,16 +466,10 @@ def judged(one: Rig) -> list[str]:
     """The check of decoding, as a person sees it."""
     record = health.record(
         Settings(mask=MaskSettings("mask-1"), decode=DecodeSettings(calibration="c.toml")),
-        utc_ns=1,
-        monotonic_ns=1,
-        began_monotonic_ns=0,
-        shots=one.pending,
-        stages=one.pipeline.statistics(),
-        shutter=one.shutter.statistics(),
-        links=(),
-        telemetry=Telemetry().statistics(),
-        publisher=PublisherStatistics({}, {}, 0, 0, 0),
-        folder=one.flight.folder.path,
+        ServiceTime(1, 1, 0),
+        ShootingState(one.pending, one.shutter.statistics()),
+        VehicleState((), Telemetry().statistics()),
+        KeepingState(one.flight.folder.path, one.pipeline.statistics(), PublisherStatistics({}, {}, 0, 0, 0)),
         decoding=DecodingState(True, one.pipeline.decode_failures),
     )
     return [told(one) for one in in_record(record) if one.code.startswith(("decode.", "carriers."))]

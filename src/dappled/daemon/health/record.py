@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -55,68 +55,116 @@ class DecodingState:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class ServiceTime:
+    """When a record is made, whether UTC is known, and since when the links are listened to."""
+
+    utc_ns: int
+    monotonic_ns: int
+    began_monotonic_ns: int
+    utc_known: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class ShootingState:
+    """Camera and shots. `lost` counts the autopilot's triggers that became no request. `series` are photographs by
+    distance, None while none run; `body` is how the camera's settings stand to the plan, None while no camera is ready.
+    `parameters` are the settings of body and decoder."""
+
+    shots: PendingShots
+    shutter: ShutterStatistics
+    lost: int = 0
+    series: SpacingStatistics | None = None
+    body: BodyReport | None = None
+    parameters: Sequence[Mapping[str, Any]] = ()
+
+    def facts(self) -> dict[str, Any]:
+        """The values, as JSON has them."""
+        shutter = self.shutter
+        return {
+            "camera": {"state": self.shots.state, "reason": self.shots.reason},
+            "body": None if self.body is None else self.body.values(),
+            "shots": {
+                "wished": shutter.shots,
+                "safe": shutter.succeeded,
+                "failed": shutter.failed,
+                "pending": shutter.pending,
+                "refused": shutter.refused,
+                "lost": self.lost,
+            },
+            "interval_s": shutter.interval_s,
+            "interval": _interval(shutter, self.series),
+            "settings": list(self.parameters),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleState:
+    """Links, and what came over them. `clock` relates the autopilot's time to UTC, `pose` is the vehicle's, `battery`
+    its battery: None where it isn't known."""
+
+    links: Sequence[LinkStatistics]
+    telemetry: TelemetryStatistics
+    clock: BootClock | None = None
+    pose: Pose | None = None
+    battery: VehicleBattery | None = None
+
+    @property
+    def fresh(self) -> bool:
+        """Whether the vehicle's position was heard a short time ago."""
+        return self.pose is not None and self.pose.age_ms is not None and self.pose.age_ms * 1e6 < SILENT_NS
+
+    def facts(self) -> dict[str, Any]:
+        """The values but the links', as JSON has them."""
+        clock, pose = self.clock, self.pose
+        return {
+            "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
+            "gnss": None if pose is None else _receiver(pose),
+            "vehicle_battery": codec.plain(self.battery),
+            "vehicle": None if pose is None or pose.latitude_rad is None else _place(pose),
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class KeepingState:
+    """Where frames go: the flight's folder, the queues behind it, the stream. `frame_bytes` is the mean size of this
+    flight's frames, None before the first."""
+
+    folder: Path
+    stages: Sequence[Statistics]
+    publisher: PublisherStatistics
+    frame_bytes: float | None = None
+
+
 def record(
     settings: Settings,
+    time: ServiceTime,
+    shooting: ShootingState,
+    vehicle: VehicleState,
+    keeping: KeepingState,
     *,
-    utc_ns: int,
-    monotonic_ns: int,
-    began_monotonic_ns: int,
-    shots: PendingShots,
-    stages: Sequence[Statistics],
-    shutter: ShutterStatistics,
-    links: Sequence[LinkStatistics],
-    telemetry: TelemetryStatistics,
-    publisher: PublisherStatistics,
-    folder: Path,
-    clock: BootClock | None = None,
-    vehicle: Pose | None = None,
-    decoding: DecodingState | None = None,
-    utc_known: bool = True,
+    decoding: DecodingState,
     dead_threads: Sequence[str] = (),
     found: Sequence[Finding] = (),
     standing: StandingFindings | None = None,
-    lost: int = 0,
-    parameters: Sequence[Mapping[str, Any]] = (),
-    frame_bytes: float | None = None,
-    body: BodyReport | None = None,
-    series: SpacingStatistics | None = None,
-    battery: VehicleBattery | None = None,
 ) -> dict[str, Any]:
     """The header of a `health` message. Its `findings` are the one list of the service, worst first, then newest.
 
-    `found` are those of other parts; `standing` knows since when each stands. `dead_threads` have ended without being
-    asked to. `parameters` are the settings of body and decoder; `frame_bytes` is the mean size of this flight's frames,
-    None before the first. `lost` counts the autopilot's triggers that became no request. `body` is how the camera's
-    settings stand to the plan; None while no camera is ready.
-    `series` are photographs by distance, while they run. `battery` is the vehicle's; None while the autopilot doesn't
-    report it.
+    `dead_threads` have ended without being asked to. `found` are the findings of other parts; `standing` knows since
+    when each stands.
     """
-    decoding = decoding or DecodingState()
-    fresh = vehicle is not None and vehicle.age_ms is not None and vehicle.age_ms * 1e6 < SILENT_NS
-    link, silences = _link(settings, links, telemetry, monotonic_ns, began_monotonic_ns, fresh=fresh)
-    disk, shortages = _disk(settings.record, folder)
+    link, silences = _link(settings, vehicle, time)
+    disk, shortages = _disk(settings.record, keeping.folder)
     facts = {
-        "utc_ns": utc_ns,
-        "camera": {"state": shots.state, "reason": shots.reason},
-        "body": None if body is None else body.values(),
+        "utc_ns": time.utc_ns,
+        "utc_known": time.utc_known,
+        **shooting.facts(),
         "link": link,
+        **vehicle.facts(),
         "disk": disk,
-        "shots": {
-            "wished": shutter.shots,
-            "safe": shutter.succeeded,
-            "failed": shutter.failed,
-            "pending": shutter.pending,
-            "refused": shutter.refused,
-            "lost": lost,
-        },
-        "stages": [*(asdict(one) for one in stages), _publish(publisher)],
-        "utc_known": utc_known,
-        "interval_s": shutter.interval_s,
-        "interval": _interval(shutter, series),
-        "clock": None if clock is None else {"source": clock.source, "sigma_ms": clock.sigma_ns / 1e6},
-        "gnss": None if vehicle is None else _receiver(vehicle),
-        "vehicle_battery": None if battery is None else asdict(battery),
-        "vehicle": None if vehicle is None or vehicle.latitude_rad is None else _place(vehicle),
+        "stages": [*codec.plain(list(keeping.stages)), _publish(keeping.publisher)],
+        "min_free_bytes": settings.record.min_free_mb * 1_000_000,
+        "frame_bytes": keeping.frame_bytes,
         "decode": {
             "mask": settings.mask.profile,
             "calibration": settings.decode.calibration,
@@ -127,12 +175,9 @@ def record(
             "misfit": decoding.misfit,
             "judged": decoding.judged(),
         },
-        "min_free_bytes": settings.record.min_free_mb * 1_000_000,
-        "frame_bytes": frame_bytes,
-        "settings": list(parameters),
     }
-    missing = shots.without_camera()
-    deaf = fresh and settings.pose.on_gimbal and vehicle is not None and not vehicle.gimbal_attitude
+    missing, series, body = shooting.shots.without_camera(), shooting.series, shooting.body
+    deaf = vehicle.fresh and settings.pose.on_gimbal and vehicle.pose is not None and not vehicle.pose.gimbal_attitude
     now = [
         *(finding(Code.THREAD_ENDED, Subject("thread", name)) for name in dead_threads),
         *([] if missing is None else [missing]),
@@ -146,8 +191,8 @@ def record(
         *decoding.failures.found,
         *decoding.verdicts.findings(),
     ]
-    opened = (standing or StandingFindings()).refresh(now, monotonic_ns)
-    return facts | {"findings": [one.to_json(monotonic_ns) for one in opened]}
+    opened = (standing or StandingFindings()).refresh(now, time.monotonic_ns)
+    return facts | {"findings": [one.to_json(time.monotonic_ns) for one in opened]}
 
 
 def _silence(link: LinkStatistics, *, heard: bool, fresh: bool, level: Level) -> Finding | None:
@@ -165,24 +210,17 @@ def _silence(link: LinkStatistics, *, heard: bool, fresh: bool, level: Level) ->
     return finding(Code.LINK_SILENT, about, level)
 
 
-def _link(
-    settings: Settings,
-    links: Sequence[LinkStatistics],
-    telemetry: TelemetryStatistics,
-    monotonic_ns: int,
-    began_monotonic_ns: int,
-    *,
-    fresh: bool,
-) -> tuple[dict[str, Any], list[Finding]]:
+def _link(settings: Settings, vehicle: VehicleState, time: ServiceTime) -> tuple[dict[str, Any], list[Finding]]:
     """The state of the links, and a finding for each that should be heard: a stop where all of them are silent."""
+    links, telemetry = vehicle.links, vehicle.telemetry
     silent = [
         link
         for link in links
-        if link.error or monotonic_ns - (link.last_heard_monotonic_ns or began_monotonic_ns) > SILENT_NS
+        if link.error or time.monotonic_ns - (link.last_heard_monotonic_ns or time.began_monotonic_ns) > SILENT_NS
     ]
     heard = telemetry.positions > 0
     level = Level.STOP if len(silent) == len(links) else Level.CAUTION
-    found = [one for link in silent if (one := _silence(link, heard=heard, fresh=fresh, level=level))]
+    found = [one for link in silent if (one := _silence(link, heard=heard, fresh=vehicle.fresh, level=level))]
     facts = {
         "urls": len(links),
         "silent": len(silent),
@@ -232,7 +270,7 @@ def _counters(link: LinkStatistics) -> dict[str, Any]:
         "unsent": link.packets_unsent,
         "unlogged": link.packets_unlogged,
         "unrecorded": link.packets_unrecorded,
-        "signing": None if link.signing is None else asdict(link.signing),
+        "signing": codec.plain(link.signing),
     }
 
 
