@@ -9,7 +9,7 @@ import pytest
 
 from dappled.cli import VERBS, frame_arguments, main
 from dappled.cli.command_line import options, parser
-from dappled.cli.verb import OutputExistsError, Overwriting
+from dappled.cli.verb import Overwriting
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 
@@ -53,7 +53,7 @@ def test_what_is_there_is_refused_by_name_and_with_the_remedy(tmp_path: Path) ->
     there.touch()
     dangling.symlink_to(tmp_path / "nowhere")
     for path in (there, dangling):
-        with pytest.raises(OutputExistsError, match=rf"{path.name} exists already: .*--overwrite"):
+        with pytest.raises(DappledError, match=rf"{path.name} exists already: .*--overwrite"):
             Overwriting().refuse_existing(tmp_path / "new.png", path)
     Overwriting().refuse_existing(tmp_path / "new.png", None)
     Overwriting(overwrite=True).refuse_existing(there)

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from dappled.cli import main, status
-from dappled.cli.status import NotRunningError
+from dappled.errors import DappledError
 from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
@@ -133,6 +133,6 @@ def is_ready(settings: Path) -> bool:
     """Whether the daemon with these settings says that its camera is ready and its autopilot is heard."""
     try:
         record = status.health(status.stream_endpoint(settings), 5)
-    except NotRunningError:
+    except DappledError:
         return False
     return record["camera"]["state"] == "ready" and not any(code.startswith("link.") for code in codes(record))

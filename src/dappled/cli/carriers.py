@@ -24,9 +24,9 @@ from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
 from dappled.decode.spectrum.peaks import Measured, displaced, measure
 from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import padded_shape, transform
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, known_to
+from dappled.drivers.raw.darkroom import Darkroom, known_to
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
-from dappled.errors import counted
+from dappled.errors import DappledError, counted
 from dappled.findings import FRAME, Finding, told
 
 
@@ -120,7 +120,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
             return picture(plane, table, self.look or "magnitude")
         (carrier,) = table.used.carriers([self.around])
         if not carrier.on_sensor:
-            raise DarkroomError(
+            raise DappledError(
                 f"the carrier {carrier.ky} {carrier.kx} falls off the sensor: choose another one with --around"
             )
         return around(plane, (carrier.fy, carrier.fx), look=self.look or "phase")
@@ -156,7 +156,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
             )
             length = self.focal_length or raw.focal_length_mm
             if length is None:
-                raise DarkroomError(f"{frame} doesn't say its focal length: give --focal-length MM")
+                raise DappledError(f"{frame} doesn't say its focal length: give --focal-length MM")
             spectrum = transform(plane, workers=2)
             predicted = decoder.predict(length)
             used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
@@ -205,12 +205,12 @@ CLASSES = {"carriers": ShowCarriers}
 
 
 def _save(shown: Any, path: Path) -> None:
-    """Write a picture, whole or not at all, in the form that its name says. Raises DarkroomError and OSError."""
+    """Write a picture, whole or not at all, in the form that its name says. Raises DappledError and OSError."""
     coded = io.BytesIO()
     try:
         Image.fromarray(shown).save(coded, Image.registered_extensions()[path.suffix.lower()])
     except KeyError:
-        raise DarkroomError(f"{path}: no picture is written under such a name; end it in .png") from None
+        raise DappledError(f"{path}: no picture is written under such a name; end it in .png") from None
     durable.write_file(path, coded.getvalue())
 
 

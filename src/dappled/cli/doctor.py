@@ -34,10 +34,6 @@ _VERDICTS = {"go": "GO", "caution": "GO, with the cautions above", "no-go": "NO 
 HEAR_S = 5.0  # a daemon publishes its health every second
 
 
-class DaemonRunsError(DappledError):
-    """The call needs the camera, but a running daemon holds it."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ExamineMachine(SettingsArgument, Verb):
     """Say what is missing on this machine."""
@@ -93,7 +89,7 @@ def _examined(arguments: ExamineMachine, output: Output) -> Report:
 def _beside(endpoint: str, settings: Settings, arguments: ExamineMachine) -> Report:
     """Judge go or no-go by the health record of the daemon that runs here, as the console does."""
     if arguments.test_shot or arguments.latency:
-        raise DaemonRunsError(
+        raise DappledError(
             f"a daemon runs at {endpoint} and holds the camera: stop it first "
             f"(sudo systemctl stop {status.unit(arguments.config)}), or ask it for a photograph "
             "(dappled trigger, the ground station, the console)"

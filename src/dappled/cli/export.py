@@ -7,7 +7,8 @@ from pathlib import Path
 
 from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, RangingArguments, doubts, opened_field, views_words
-from dappled.cli.verb import CallError, Output, OutputExistsError, Overwriting, Report, Verb, flag, option
+from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
+from dappled.errors import DappledError
 from dappled.products.exports import exports, light_files
 from dappled.products.opened import OpenedLightField
 
@@ -49,7 +50,7 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
         elif self.overwrite:
             raise CallError(f"--overwrite goes with --as {', '.join(_REPLACED)}: remove what is there yourself")
         elif self.kind != "quilt" and self.output.exists():
-            raise OutputExistsError(f"{self.output} exists already: move it away, or choose another name")
+            raise DappledError(f"{self.output} exists already: move it away, or choose another name")
 
     def run(self, output: Output) -> Report:
         """Write light fields for other tools."""

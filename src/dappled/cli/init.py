@@ -29,10 +29,6 @@ _WIRED_BAUD = ",921600"
 _DEFAULT_LINK = "udpin:0.0.0.0:14550"
 
 
-class InitError(DappledError):
-    """There is nobody to ask; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Question:
     """One setting that is asked for: its flag, its words, what is proposed, and what else there is to choose from."""
@@ -81,7 +77,7 @@ class InitSettings(Overwriting, Verb):
             if answer is None:
                 answer = ask(question, input) if asks else question.proposed
             if not answer:
-                raise InitError(f"nobody is there to ask: give {question.flag} ({question.words})")
+                raise DappledError(f"nobody is there to ask: give {question.flag} ({question.words})")
             answers[question.flag] = answer
         text = settings_text(answers)
         write(self.file, text)
@@ -121,7 +117,7 @@ def ask(question: Question, answer: Callable[[str], str]) -> str:
         except EOFError:
             said = ""
             if not question.proposed:
-                raise InitError(f"there was no answer: give {question.flag}") from None
+                raise DappledError(f"there was no answer: give {question.flag}") from None
         if said or question.proposed:
             return said or question.proposed
 
@@ -158,7 +154,7 @@ def write(file: Path, text: str) -> None:
             raise type(error)(str(error).replace(str(part), str(file))) from None
         durable.write_file(file, text.encode())
     except OSError as error:
-        raise InitError(f"{file} can't be written: {error.strerror}") from error
+        raise DappledError(f"{file} can't be written: {error.strerror}") from error
     finally:
         part.unlink(missing_ok=True)
 

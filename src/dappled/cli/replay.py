@@ -23,12 +23,12 @@ from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import playback, replay, runs
 from dappled.daemon.replay.playback import FlownWith
-from dappled.daemon.replay.replay import ReplayError, ReplayProgress
+from dappled.daemon.replay.replay import ReplayProgress
 from dappled.daemon.replay.runs import Run, RunWriter
 from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.errors import counted
+from dappled.errors import DappledError, counted
 from dappled.findings import Finding, first_of_each, in_order
 from dappled.flight import LIVE, TimeSource, layout
 from dappled.flight.checks import flight_check
@@ -214,7 +214,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
             latency = BodyLatency(0.0, 0.0, TimeSource.GIVEN)
             return FlownWith(recipes.names(recipe), latency, configuration.Settings())
         if "settings" not in facts or "names" not in facts:
-            raise ReplayError(f"{self.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")
+            raise DappledError(f"{self.flight}/flight.toml lacks its settings; replay its folder frames/ with --mask")
         recorded = configuration.of_tables(facts["settings"], "flight.toml")
         names = recipes.names(recipe) if self.camera or self.mask else Names(**facts["names"])
         return FlownWith(names, BodyLatency.of(recorded.camera), recorded)

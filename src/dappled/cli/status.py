@@ -25,10 +25,6 @@ from dappled.findings import above_note, told
 SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
 
 
-class NotRunningError(DappledError):
-    """No daemon publishes at the endpoint."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class ShowStatus(Verb):
     """Show the state of the daemon."""
@@ -114,14 +110,14 @@ def stranger(endpoint: str) -> str | None:
 
 
 def health(endpoint: str, timeout_s: float, name: str = "dappled") -> Mapping[str, Any]:
-    """The daemon's next health record; `name` is its service's. Raises NotRunningError after `timeout_s`."""
+    """The daemon's next health record; `name` is its service's. Raises DappledError after `timeout_s`."""
     until = time.monotonic() + timeout_s
     with Subscriber(endpoint, topics=("health",)) as subscriber:
         while (left := until - time.monotonic()) > 0:
             message = subscriber.receive(left)
             if message is not None and message.topic == "health":
                 return message.header
-    raise NotRunningError(
+    raise DappledError(
         f"no daemon was heard on {endpoint} for {timeout_s:g} s: check that it runs (systemctl status {name}) "
         "with these settings (--config)"
     )

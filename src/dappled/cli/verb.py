@@ -27,10 +27,6 @@ class CallError(DappledError):
     exit_code = 2
 
 
-class OutputExistsError(DappledError):
-    """What is to be written is there already; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class Argument:
     """How a field is given on the command line: its rule (meaning, unit, range, choices; as of a setting) and its form.
@@ -151,10 +147,10 @@ class Overwriting:
     overwrite: bool = flag("--overwrite", "replace what is there under that name")
 
     def refuse_existing(self, *outputs: Path | None) -> None:
-        """Refuse to replace an output. Raises OutputExistsError."""
+        """Refuse to replace an output. Raises DappledError."""
         for path in () if self.overwrite else outputs:
             if path is not None and (path.is_symlink() or path.exists()):
-                raise OutputExistsError(f"{path} exists already: choose another name, or --overwrite replaces it")
+                raise DappledError(f"{path} exists already: choose another name, or --overwrite replaces it")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,8 @@ import pytest
 
 from dappled.cli import main
 from dappled.cli.calibrate.target import from_frames
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, DecodeResult, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.errors import DappledError
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.test_depth import target
 
@@ -60,7 +61,7 @@ def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, mo
         return replace(done, light_field=replace(done.light_field, attributes=said))
 
     monkeypatch.setattr(Darkroom, "decode", zoomed)
-    with pytest.raises(DarkroomError, match=r"several focal lengths \(50, 70\)"):
+    with pytest.raises(DappledError, match=r"several focal lengths \(50, 70\)"):
         from_frames(recipe, [folder / "2.dng", folder / "6.dng"], [2.0, 6.0])
 
 

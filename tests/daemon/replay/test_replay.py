@@ -15,7 +15,7 @@ from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.replay import replay
-from dappled.daemon.replay.replay import RecordedTelemetry, ReplayError, ReplayProgress
+from dappled.daemon.replay.replay import RecordedTelemetry, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, Noticed, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
@@ -144,7 +144,7 @@ def test_what_is_no_flight(tmp_path: Path) -> None:
         replay.of_flight(tmp_path / "nothing")
     with rig(tmp_path) as one:
         pass
-    with pytest.raises(ReplayError, match="holds no frames"):
+    with pytest.raises(DappledError, match="holds no frames"):
         replay.of_flight(one.flight.folder.path)
 
 
@@ -191,13 +191,13 @@ def test_an_autopilot_s_own_log_that_can_t_be_read_is_refused(
 
 
 def test_a_folder_without_what_was_named(tmp_path: Path) -> None:
-    with pytest.raises(ReplayError, match="matches"):
+    with pytest.raises(DappledError, match="matches"):
         replay.of_folder(tmp_path, "*.png", None, 0, 1.0)
     (tmp_path / "a.png").write_bytes(b"a")
-    with pytest.raises(ReplayError, match="no such telemetry"):
+    with pytest.raises(DappledError, match="no such telemetry"):
         replay.of_folder(tmp_path, "*", tmp_path / "no.tlog", None, 1.0)
     (tmp_path / "empty.tlog").write_bytes(b"")
-    with pytest.raises(ReplayError, match="holds no position"):
+    with pytest.raises(DappledError, match="holds no position"):
         replay.of_folder(tmp_path, "*.png", tmp_path / "empty.tlog", None, 1.0)
 
 
@@ -207,7 +207,7 @@ def test_the_only_telemetry_beside_the_frames_is_theirs(tmp_path: Path) -> None:
     (tmp_path / "flight.tlog").write_bytes(b"")
     assert replay.of_folder(tmp_path, "*", None, 5, 1.0).telemetry == tmp_path / "flight.tlog"
     (tmp_path / "other.tlog").write_bytes(b"")
-    with pytest.raises(ReplayError, match=r"holds 2 \.tlog files"):
+    with pytest.raises(DappledError, match=r"holds 2 \.tlog files"):
         replay.of_folder(tmp_path, "*", None, 5, 1.0)
     given = replay.of_folder(tmp_path, "*", tmp_path / "other.tlog", 5, 1.0)
     assert given.telemetry == tmp_path / "other.tlog"
@@ -221,7 +221,7 @@ def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:
         def fire(self, shot: Shot) -> None:
             """Never happens."""
 
-    with pytest.raises(ReplayError, match="did not come to an end"):
+    with pytest.raises(DappledError, match="did not come to an end"):
         replay.play(
             recording, Deaf(FakeCamera()), ReplayProgress(), time=replay.clock(recording), pace=None, timeout_s=0.01
         )

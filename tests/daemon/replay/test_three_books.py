@@ -13,7 +13,6 @@ import pytest
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.daemon.replay import three_books
-from dappled.daemon.replay.replay import ReplayError
 from dappled.drivers.mavlink import dataflash, mavlink, pack, ulog
 from dappled.drivers.mavlink.log_packets import AutopilotLogError
 from dappled.errors import DappledError
@@ -335,7 +334,7 @@ def test_a_file_that_is_no_sound_log_is_one_sentence(
 ) -> None:
     if data is not None:
         (tmp_path / name).write_bytes(data)
-    with pytest.raises((DappledError, ReplayError, AutopilotLogError), match=says):
+    with pytest.raises((DappledError, DappledError, AutopilotLogError), match=says):
         three_books.reconcile(fly(requested()), [tmp_path / name])
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import ulog
-from dappled.drivers.mavlink.ulog import ULogError
+from dappled.drivers.mavlink.log_packets import AutopilotLogError
 from dappled.drivers.reader_process import Budget
 from dappled.mocks.autopilot.path import FlightPath
 from tests.drivers.mavlink.true_logs import (
@@ -86,12 +86,12 @@ def test_damaged_messages_are_left_out(tmp_path: Path) -> None:
 def test_a_log_without_a_flight_is_one_sentence(data: bytes, says: str, tmp_path: Path) -> None:
     path = tmp_path / "1.ulg"
     path.write_bytes(b"ULog\x01\x12\x35\x01" + bytes(8) + data)
-    with pytest.raises(ULogError, match=f"1.ulg.*({says})"):
+    with pytest.raises(AutopilotLogError, match=f"1.ulg.*({says})"):
         list(ulog.packets(path))
 
 
 def test_a_log_without_a_fix_has_no_time(tmp_path: Path) -> None:
-    with pytest.raises(ULogError, match="no fix"):
+    with pytest.raises(AutopilotLogError, match="no fix"):
         list(ulog.packets(ulog_written(tmp_path, fix=1)))
 
 
@@ -147,5 +147,5 @@ def test_a_log_that_is_made_to_exhaust_the_machine_is_one_sentence(
     path = tmp_path / "1.ulg"
     path.write_bytes(data)
     assert len(data) < 1000 or not any(data[8:])
-    with pytest.raises(ULogError, match=f"1.ulg.*({says})"):
+    with pytest.raises(AutopilotLogError, match=f"1.ulg.*({says})"):
         list(ulog.packets(path))

@@ -15,7 +15,8 @@ from dappled.decode.lightfield.aperture import at_corner
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError
 from tests.simulated.lytro import container, metadata
 
 LFTOOLBOX_DB = (41.9, 42.4, 42.8, 42.9, 43.2, 41.8, 39.4)
@@ -69,7 +70,7 @@ def test_colour_views_have_the_grey_views_as_their_mean(shared_data: Path) -> No
 
 def test_a_colour_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
     np.save(tmp_path / "frame.npy", np.random.default_rng(0).random((64, 64)).astype(np.float32))
-    with pytest.raises(DarkroomError, match="as in BGGR"):
+    with pytest.raises(DappledError, match="as in BGGR"):
         Darkroom(Recipe("auto", "lenslet", cfa="RGGX")).decode(tmp_path / "frame.npy")
 
 

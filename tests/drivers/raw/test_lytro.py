@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dappled.drivers.raw import lytro, reading
-from dappled.drivers.raw.reading import RawFileError
+from dappled.errors import DappledError
 from tests.simulated.lytro import container, metadata, packed
 
 SHAPE = (12, 16)
@@ -76,14 +76,14 @@ def test_bare_pixels_are_known_by_their_size_or_by_what_lies_beside_them(tmp_pat
     values = _values(12)
     path = tmp_path / "MOD_0001.RAW"
     path.write_bytes(packed(values, 12, "big"))
-    with pytest.raises(RawFileError, match="MOD_0001"):
+    with pytest.raises(DappledError, match="MOD_0001"):
         reading.read(path)
     wrapped = {"master": {"picture": {"frameArray": [{"frame": {"metadata": metadata(SHAPE)}}]}}}
     path.with_suffix(".TXT").write_text(json.dumps(wrapped))
     np.testing.assert_array_equal(reading.read(path).mosaic, values)
     assert reading.read_metadata(path).focal_length_mm == 6.45
     path.with_suffix(".TXT").write_text("no JSON")
-    with pytest.raises(RawFileError, match="MOD_0001"):
+    with pytest.raises(DappledError, match="MOD_0001"):
         reading.read(path)
 
 
@@ -101,14 +101,14 @@ def test_both_cameras_bare_files(kind: Kind, tmp_path: Path) -> None:
 
 def test_a_stack_of_finished_pictures_is_no_frame() -> None:
     whole = container(_values(12), metadata(SHAPE)).replace(b"imageRef", b"imageXef")
-    with pytest.raises(RawFileError, match="only finished pictures"):
+    with pytest.raises(DappledError, match="only finished pictures"):
         reading.read(whole, "a-stk.lfp")
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
 def test_a_file_cut_short_is_told(share: float) -> None:
     whole = container(_values(12, (64, 64)), metadata((64, 64)))
-    with pytest.raises(RawFileError, match=r"a\.lfp"):
+    with pytest.raises(DappledError, match=r"a\.lfp"):
         reading.read(whole[: int(share * len(whole))], "a.lfp")
 
 
@@ -127,7 +127,7 @@ def test_a_file_cut_short_is_told(share: float) -> None:
 def test_metadata_that_makes_no_sense_is_told_in_a_sentence(old: bytes, new: bytes) -> None:
     whole = container(_values(12), metadata(SHAPE))
     assert old in whole
-    with pytest.raises(RawFileError) as told:
+    with pytest.raises(DappledError) as told:
         reading.read(whole.replace(old, new), "a.lfp")
     assert "a.lfp" in str(told.value)
     assert "\n" not in str(told.value)
@@ -140,12 +140,12 @@ def test_any_damage_gives_a_frame_or_a_sentence(data: st.DataObject) -> None:
     for _ in range(data.draw(st.integers(1, 6))):
         whole[data.draw(st.integers(0, len(whole) - 1))] = data.draw(st.integers(0, 255))
     whole = whole[: data.draw(st.integers(8, len(whole)))]
-    with suppress(RawFileError):
+    with suppress(DappledError):
         reading.read(bytes(whole), "a.lfp")
 
 
 @settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=200))
 def test_any_bytes_after_the_beginning_give_a_sentence(data: bytes) -> None:
-    with pytest.raises(RawFileError):
+    with pytest.raises(DappledError):
         reading.read(lytro.START + data, "a.lfp")

@@ -20,7 +20,8 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from dappled.drivers.raw import raw_file, reading
-from dappled.drivers.raw.reading import RawFileError, read, read_metadata
+from dappled.drivers.raw.reading import read, read_metadata
+from dappled.errors import DappledError
 
 RGGB, BGGR = bytes((0, 1, 1, 2)), bytes((2, 1, 1, 0))
 RATIONAL = 5
@@ -246,7 +247,7 @@ def test_a_jpeg_of_four_colours_is_a_jpeg() -> None:
     ],
 )
 def test_what_is_no_frame_is_told_with_its_name(data: bytes, words: str) -> None:
-    with pytest.raises(RawFileError, match=words) as told:
+    with pytest.raises(DappledError, match=words) as told:
         read(data, "a.dng")
     assert "a.dng" in str(told.value)
     assert "\n" not in str(told.value)
@@ -257,14 +258,14 @@ def test_a_deep_colour_png_is_refused_not_cut() -> None:
     header = data[12:24] + bytes((16, 2)) + data[26:29]
     data[12:29] = header
     data[29:33] = zlib.crc32(header).to_bytes(4, "big")
-    with pytest.raises(RawFileError, match="colour PNG of 16 bits"):
+    with pytest.raises(DappledError, match="colour PNG of 16 bits"):
         read(bytes(data))
 
 
 def test_paths_that_lead_nowhere_are_told(tmp_path: Path) -> None:
     for path in (tmp_path / "missing.dng", tmp_path):
         for ask in (read, read_metadata):
-            with pytest.raises(RawFileError, match=str(path)):
+            with pytest.raises(DappledError, match=str(path)):
                 ask(path)
 
 
@@ -276,7 +277,7 @@ def test_paths_that_lead_nowhere_are_told(tmp_path: Path) -> None:
 )
 def test_any_bytes_give_a_frame_or_a_sentence(data: bytes, start: bytes) -> None:
     for ask in (read, read_metadata):
-        with suppress(RawFileError):
+        with suppress(DappledError):
             ask(start + data, "a.tif")
 
 
@@ -300,7 +301,7 @@ def test_files_of_the_two_bodies(
     assert "/".join("".join(frame.colour_names[i] for i in row) for row in frame.cfa) == colours
     told = read_metadata(path)
     assert (told.model, told.focal_length_mm) == (model, lens[0])
-    with pytest.raises(RawFileError, match=name):
+    with pytest.raises(DappledError, match=name):
         read(path.read_bytes()[: path.stat().st_size // 2], name)
 
 
@@ -346,7 +347,7 @@ def test_pixels_that_are_not_stored_are_not_unpacked(name: str) -> None:
         Image.fromarray(values).save(file, "PNG", compress_level=1)
     else:
         tifffile.imwrite(file, values, compression="zlib")
-    with pytest.raises(RawFileError, match=r"its 9000 × 9000 pixels would take 81 MB of memory, and the .* stored"):
+    with pytest.raises(DappledError, match=r"its 9000 × 9000 pixels would take 81 MB of memory, and the .* stored"):
         read(file.getvalue(), name)
 
 
@@ -356,7 +357,7 @@ def test_an_error_does_not_hold_the_file(tmp_path: Path) -> None:
     path.write_bytes(bytes(range(256)) * 40_000)
     tracemalloc.start()
     try:
-        with pytest.raises(RawFileError) as kept:
+        with pytest.raises(DappledError) as kept:
             read_metadata(path)
         held, most = tracemalloc.get_traced_memory()
     finally:

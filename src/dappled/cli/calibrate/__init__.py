@@ -14,8 +14,8 @@ from dappled.config import profiles
 from dappled.decode.calibration import Calibration, report
 from dappled.decode.calibration.law_choice import CALIBRATION
 from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
-from dappled.errors import counted
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.errors import DappledError, counted
 from dappled.findings import Code, finding, told
 
 
@@ -91,7 +91,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
         for _, error in bad:
             output.warn(str(error))
         if not seen:
-            raise DarkroomError("no frame is left to calibrate with: each was refused, for the reason above")
+            raise DappledError("no frame is left to calibrate with: each was refused, for the reason above")
         camera = darkroom.camera(seen[0].model)
         found = fit_views(darkroom, seen, choose_law=not self.law)
         found = self._judged(found, seen, camera.mask_distance_mm)
@@ -109,11 +109,11 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
     def _judged(self, found: Calibration, seen: Sequence[CalibrationView], stated_mm: float) -> Calibration:
         """The calibration with what its law leaves in doubt.
 
-        Raises DarkroomError where its own law does not, or all frames' carriers are weak, without --anyway.
+        Raises DappledError where its own law does not, or all frames' carriers are weak, without --anyway.
         """
         weak = [one.shown.weak for one in seen if one.shown.weak is not None]
         if len(weak) == len(seen) and not self.anyway:
-            raise DarkroomError(f"{told(weak[0], CALIBRATION)}; --anyway writes the calibration with this doubt in it")
+            raise DappledError(f"{told(weak[0], CALIBRATION)}; --anyway writes the calibration with this doubt in it")
         able = [law.law for law in report.law_fits(found, stated_mm) if law.explains]
         if found.law in able:
             return found
@@ -122,7 +122,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
             fits = asked.facts["fits"] if asked is not None else ""
             asked = finding(Code.LAW_ASKED, CALIBRATION, law=found.law, seen=able[0], fits=fits)
         if asked is not None and not self.anyway:
-            raise DarkroomError(f"{told(asked, CALIBRATION)}; --anyway writes the calibration with this doubt in it")
+            raise DappledError(f"{told(asked, CALIBRATION)}; --anyway writes the calibration with this doubt in it")
         return replace(found, overridden=(*found.overridden, asked)) if able and asked is not None else found
 
 

@@ -14,7 +14,7 @@ from dappled.decode.calibration import Calibration
 from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
 from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.decode.optics import MaskedOptics
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError
+from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
 from dappled.errors import DappledError
 from dappled.findings import Finding, Subject, told
@@ -46,10 +46,10 @@ def view_of(darkroom: Darkroom, path: Path, given: Given = _NOTHING) -> Calibrat
     raw = darkroom.read(path)
     length, stop = given.focal_length_mm or raw.focal_length_mm, given.f_number or raw.f_number
     if length is None or stop is None:
-        raise DarkroomError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
+        raise DappledError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
     bent = not_linear(raw, exposure(raw), of=Subject("calibration frame", path.name))
     if bent and not given.anyway:
-        raise DarkroomError(f"{path}: {'; '.join(told(one, one.subject) for one in bent)}; --anyway calibrates with it")
+        raise DappledError(f"{path}: {'; '.join(told(one, one.subject) for one in bent)}; --anyway calibrates with it")
     camera = darkroom.camera(raw.camera_model or "")
     stops = camera.f_numbers
     with darkroom.naming(path):
@@ -74,8 +74,9 @@ def views_of(
             one = view_of(darkroom, path, given)
             if good and (one.shape, one.model) != (good[0].shape, good[0].model):
                 first, this = (f"{s.model} {s.shape[0]} × {s.shape[1]}" for s in (good[0], one))
-                raise DarkroomError(f"{path} is of another camera or size ({this}, the first {first})")
-            good.append(one)
+                bad.append((path, DappledError(f"{path} is of another camera or size ({this}, the first {first})")))
+            else:
+                good.append(one)
         except DappledError as error:
             bad.append((path, error))
     return good, bad

@@ -34,10 +34,6 @@ _AGREE = 3.0  # standard errors between the two masks
 _REMOUNTED_MM = 0.1  # by which a film's distance may differ after it was mounted again
 
 
-class KitError(DappledError):
-    """A kit's folder can't be read; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class MaskResult:
     """What the frames of one mask show: `used` frames, `unseen` ones in which no carrier can be seen at their stop.
@@ -101,17 +97,17 @@ def calibrated(call: KitCall, to: Path | None, output: Output) -> Report:
 
 
 def _asked(folder: Path) -> dict[str, Any]:
-    """What the kit's list asks for: camera, focal lengths, f-numbers. Raises KitError for a folder that is no kit."""
+    """What the kit's list asks for: camera, focal lengths, f-numbers. Raises DappledError for another folder."""
     path = folder / KIT
     if not path.is_file():
-        raise KitError(f"{folder} is no test kit, it has no {KIT}: name the folder that dappled mask kit wrote")
+        raise DappledError(f"{folder} is no test kit, it has no {KIT}: name the folder that dappled mask kit wrote")
     asked = read_toml(path)[0]
     numbers = [asked.get(name) for name in ("focal_lengths_mm", "f_numbers")]
     if not isinstance(asked.get("camera"), str) or not all(
         isinstance(row, list) and row and all(isinstance(one, int | float) and one > 0 for one in row)
         for row in numbers
     ):
-        raise KitError(
+        raise DappledError(
             f"{path} doesn't name camera, focal_lengths_mm and f_numbers: write it again with dappled mask kit"
         )
     return asked

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dappled import durable
 from dappled.cli.verb import Output, Report, flag, option
 from dappled.config import profiles
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
-from dappled.errors import counted
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError, counted
 from dappled.products import chessboard
 
 
@@ -53,7 +53,7 @@ def calibrated(
 ) -> Report:
     """Calibrate from frames, which are decoded if a mask is named. Says the names of frames without the board."""
     if to.suffix != ".toml":
-        raise DarkroomError(f"{to}: the name of a camera profile must end in .toml")
+        raise DappledError(f"{to}: the name of a camera profile must end in .toml")
     darkroom = Darkroom(recipe)
     seen: list[NDArray[np.float64]] = []
     grids: list[NDArray[np.float64]] = []
@@ -62,13 +62,9 @@ def calibrated(
     for path in output.each(frames):
         image, grid, raw_shape, raw_model, raw_length = _picture(darkroom, path, focal_length_mm)
         if shape not in ((0, 0), raw_shape):
-            raise DarkroomError(
-                f"{path} is {_size(raw_shape)}, the others {_size(shape)}: calibrate frames of one size"
-            )
+            raise DappledError(f"{path} is {_size(raw_shape)}, the others {_size(shape)}: calibrate frames of one size")
         if length is not None and raw_length is not None and abs(raw_length / length - 1) > 0.01:
-            raise DarkroomError(
-                f"{path} was taken at {raw_length:g} mm, the others at {length:g}: one length at a time"
-            )
+            raise DappledError(f"{path} was taken at {raw_length:g} mm, the others at {length:g}: one length at a time")
         shape, model, length = raw_shape, raw_model, length or raw_length
         found = chessboard.corners(image, size)
         if found is None:
@@ -77,7 +73,7 @@ def calibrated(
         seen.append(found)
         grids.append(grid)
     if length is None:
-        raise DarkroomError("the frames don't say their focal length: give --focal-length")
+        raise DappledError("the frames don't say their focal length: give --focal-length")
     profile = darkroom.camera(model)
     fit = chessboard.fit(seen, grids, board=size, sensor=profile.sensor(shape), focal_length_mm=length)
     write(recipe.camera if recipe.camera != "auto" else profile.name, fit.lens, to)

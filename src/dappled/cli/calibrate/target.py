@@ -14,8 +14,8 @@ from dappled.config import profiles
 from dappled.decode.depth import RANGING, Ranging
 from dappled.decode.depth.ranging import Target, fit_targets, target_shift
 from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
-from dappled.errors import counted
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.errors import DappledError, counted
 from dappled.products import opened
 from dappled.products.opened import OpenedLightField
 
@@ -31,7 +31,7 @@ def calibrated(
 ) -> Report:
     """Fit the ranging, and write it with the calibration that the frames were decoded with."""
     if to.suffix != ".toml":
-        raise DarkroomError(f"{to}: the name of a calibration with distances must end in .toml")
+        raise DappledError(f"{to}: the name of a calibration with distances must end in .toml")
     found, targets = from_frames(recipe, frames, metres, focal_length_mm, output)
     written = _write(recipe, to, found)
     lines = []
@@ -57,7 +57,7 @@ def from_frames(
     """The ranging that frames of targets show, and what each target showed. Raises DappledError."""
     if len(frames) != len(metres):
         both = f"{counted(len(frames), 'frame')} and {counted(len(metres), 'distance')}"
-        raise DarkroomError(f"{both}: give --target one distance per frame")
+        raise DappledError(f"{both}: give --target one distance per frame")
     darkroom = Darkroom(recipe)
     targets: list[Target] = []
     stops: set[float | None] = set()
@@ -74,7 +74,7 @@ def from_frames(
         lens = opened.lens_ranging(field.field, float("inf"))
     for several, name in ((stops, "f-numbers"), (lengths, "focal lengths")):
         if len(several) > 1:
-            raise DarkroomError(f"the targets were taken at several {name} ({_listed(several)}): take them all at one")
+            raise DappledError(f"the targets were taken at several {name} ({_listed(several)}): take them all at one")
     return fit_targets(targets, f_number=stops.pop(), focal_length_mm=lengths.pop(), lens=lens), targets
 
 

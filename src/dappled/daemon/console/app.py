@@ -23,7 +23,7 @@ from dappled.daemon.console.access import Access, Refusal, RequestGuard, refused
 from dappled.daemon.console.feed import Feed, FeedError
 from dappled.daemon.console.placement import KML_MEDIA_TYPE, Background, latest_kml, network_link_kml
 from dappled.daemon.console.process import ConsoleRequestError, DaemonQuestions
-from dappled.daemon.console.studio import Studio, StudioError
+from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import metrics
 from dappled.decode.geometry.footprint import RectifiedFrame
 from dappled.errors import DappledError
@@ -159,7 +159,7 @@ class ConsoleApp:
         body = await _body(request)
         seconds = body.get("interval_s")
         if not isinstance(seconds, int | float) or isinstance(seconds, bool) or not 0 <= seconds <= 86400:
-            raise StudioError("interval_s must be a number of seconds from 0 to 86400")
+            raise DappledError("interval_s must be a number of seconds from 0 to 86400")
         count = _whole(body, "count", 0, 10**6)
         return await self._do({"do": "interval", **_numbered(body), "interval_s": seconds, "count": count})
 
@@ -171,7 +171,7 @@ class ConsoleApp:
         body = await _body(request)
         name, value = (body.get(key) for key in ("name", "value"))
         if not (isinstance(name, str) and isinstance(value, str) and max(len(name), len(value)) <= _SETTING_CHARACTERS):
-            raise StudioError("name and value must be texts: a setting, and one of its choices")
+            raise DappledError("name and value must be texts: a setting, and one of its choices")
         return await self._do({"do": "set", **_numbered(body), "name": name, "value": value})
 
     async def _live(self, _: Request) -> Response:
@@ -291,7 +291,7 @@ def _file(data: bytes, name: str) -> Response:
 def _whole(body: Mapping[str, Any], name: str, low: int, high: int) -> int:
     value = body.get(name)
     if not isinstance(value, int) or isinstance(value, bool) or not low <= value <= high:
-        raise StudioError(f"{name} must be a whole number from {low} to {high}")
+        raise DappledError(f"{name} must be a whole number from {low} to {high}")
     return value
 
 
@@ -304,7 +304,7 @@ def _pressed(body: Mapping[str, Any]) -> dict[str, Any]:
     """When a button was pressed by the daemon's clock: see `requests`."""
     token = body.get("token", "")
     if not isinstance(token, str) or len(token) > _TOKEN_CHARACTERS:
-        raise StudioError("token must be the one that came with the last state")
+        raise DappledError("token must be the one that came with the last state")
     return {"token": token, "elapsed_ms": _whole(body, "elapsed_ms", 0, 2**31) if "elapsed_ms" in body else 0}
 
 
@@ -322,7 +322,7 @@ def _disparity(request: Request) -> float:
     except ValueError:
         disparity = float("nan")
     if not abs(disparity) <= _DISPARITY_PX:  # NaN too
-        raise StudioError(f"disparity must be a number of pixels from {-_DISPARITY_PX:g} to {_DISPARITY_PX:g}")
+        raise DappledError(f"disparity must be a number of pixels from {-_DISPARITY_PX:g} to {_DISPARITY_PX:g}")
     return disparity
 
 
@@ -332,9 +332,9 @@ async def _body(request: Request) -> dict[str, Any]:
     except ValueError:
         body = None
     except ClientDisconnect:
-        raise StudioError("the request ended before its body was complete") from None
+        raise DappledError("the request ended before its body was complete") from None
     if not isinstance(body, dict):
-        raise StudioError("a request's body must be one JSON object")
+        raise DappledError("a request's body must be one JSON object")
     return body
 
 

@@ -18,7 +18,7 @@ from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
 from dappled.daemon.console.feed import Event, Feed, FeedError, Hub
 from dappled.daemon.console.recorded import FrameSource
-from dappled.daemon.console.studio import Studio, StudioError
+from dappled.daemon.console.studio import Studio
 from dappled.daemon.stream.wire import Message
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.darkroom import Recipe
@@ -52,7 +52,7 @@ class RecordedStudio(Studio):
         if field is None:
             return super()._light_field(message)
         if not field.views.size:
-            raise StudioError("this light field has no views, only slices: decode it with a calibration")
+            raise DappledError("this light field has no views, only slices: decode it with a calibration")
         attributes = {"views_from": "the file", **field.attributes}
         return replace(field, attributes=attributes)
 

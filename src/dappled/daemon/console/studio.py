@@ -31,10 +31,6 @@ SLICES_PX = 1600
 _ALIKE = 0.05  # sensors whose sides differ by less have the same footprint
 
 
-class StudioError(DappledError):
-    """A request or picture that can't be made of this frame; one sentence."""
-
-
 class Studio:
     """Use it from one thread. A frame is given as its `slices` message; `mount` leads from camera to body axes."""
 
@@ -84,7 +80,7 @@ class Studio:
         """The mosaic of the views as JPEG, and its layout: size and place of each view, the source of the phases,
         and the lens' aperture in disparities.
 
-        Raises StudioError for a frame without views.
+        Raises DappledError for a frame without views.
         """
 
         def make() -> tuple[dict[str, Any], bytes]:
@@ -157,9 +153,9 @@ class Studio:
     def _light_field(self, message: Message) -> LightField:
         header = message.header
         if self._darkroom is None:
-            raise StudioError("no mask is configured: frames are not decoded")
+            raise DappledError("no mask is configured: frames are not decoded")
         if self._darkroom.recipe.mask == profiles.LENSLET:
-            raise StudioError("the views of a lenslet frame are made after the flight: dappled decode")
+            raise DappledError("the views of a lenslet frame are made after the flight: dappled decode")
         rows, columns = header["frame_shape"]
         decoder = self._darkroom.decoder((rows, columns), header["camera"], colours=header["mosaic"])
         assert isinstance(decoder, MaskDecoder)
@@ -182,7 +178,7 @@ class Studio:
             noise_rms=header["noise_rms"] or 0.0,
         )
         if not made.values.size:
-            raise StudioError(
+            raise DappledError(
                 "this frame has no views: without a calibration, its f-number and visible carriers are needed"
             )
         carriers = np.array(header["carriers"])

@@ -52,7 +52,7 @@ def run(
     """Play the recording to its end (see `replay.play`), and close what was opened for it.
 
     `writer` takes the results, `report` what is to be said of the telemetry. Without a recipe nothing is decoded,
-    without `publish` nothing is published. Raises ReplayError, DecodeError, WireError, DappledError.
+    without `publish` nothing is published. Raises DappledError.
     """
     time = replay.clock(recording)
     body = flown.settings.body

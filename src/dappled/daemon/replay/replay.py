@@ -45,10 +45,6 @@ _DATED = 8  # frames whose own time is asked
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 
 
-class ReplayError(DappledError):
-    """There is nothing to replay, or not like this; one sentence."""
-
-
 @dataclass(frozen=True, slots=True)
 class RecordedFlight:
     """What is to be replayed: shots in order with their files, the telemetry beside them, and what was recorded of
@@ -104,7 +100,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         )
         files.append(_file(flight, row, frame, doubts.get(index)))
     if not frames:
-        raise ReplayError(f"{folder} holds no frames: there is nothing to replay")
+        raise DappledError(f"{folder} holds no frames: there is nothing to replay")
     telemetry = flight.telemetry if flight.telemetry.is_file() else None
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
     elsewhere = _elsewhere(made_by.get("software", {}))
@@ -141,13 +137,13 @@ def of_folder(
     named. `vehicle`: the system id of the one whose telemetry counts (see `vehicle_of`). `now_ns`: no log is of a
     later time."""
     if telemetry is not None and not telemetry.is_file():
-        raise ReplayError(f"{telemetry}: there is no such telemetry file; check --telemetry")
+        raise DappledError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
     named = [path for path in folder.glob(match) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     ordered = picture_order.by_time(named, Path.as_posix, _taken_s)
     paths = ordered.items
     if not paths:
-        raise ReplayError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
+        raise DappledError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     system, told = _vehicle(telemetry, vehicle)
     bounds = _bounds(paths, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
     if start_utc_ns is None:
@@ -166,7 +162,7 @@ def of_folder(
             confined.parts(name, folder, f"the pattern {match!r}")
             frame = Frame(index, name, path.name, path.stat().st_size, durable.hash_file(path), utc_ns)
         except OSError as error:
-            raise ReplayError(f"{path} can't be read: {error.strerror}") from None
+            raise DappledError(f"{path} can't be read: {error.strerror}") from None
         shots.append(shot)
         files.append(RecordedShot(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
@@ -180,7 +176,7 @@ def of_folder(
 
 
 def _vehicle(telemetry: Path | None, vehicle: int | None) -> tuple[int | None, list[Finding]]:
-    """Whose telemetry counts, and what is to be said of it. Raises VehicleError and ReplayError."""
+    """Whose telemetry counts, and what is to be said of it. Raises VehicleError and DappledError."""
     if telemetry is not None and own_log(telemetry) is None:
         return vehicle_of(telemetry, vehicle)
     if vehicle is not None:
@@ -200,7 +196,7 @@ def _taken_s(path: Path) -> float | None:
         with open(path, "rb", opener=durable.plain_file) as file:
             return seconds(read_exif(file).taken)
     except OSError as error:
-        raise ReplayError(f"{path} can't be read: {error.strerror}") from None
+        raise DappledError(f"{path} can't be read: {error.strerror}") from None
 
 
 def _only_log(folder: Path) -> Path | None:
@@ -211,7 +207,7 @@ def _only_log(folder: Path) -> Path | None:
         named = [*folder.glob("*.[bB][iI][nN]"), *folder.glob("*.[uU][lL][gG]")]
         logs = sorted(path for path in named if path.is_file() and own_log(path))
     if len(logs) > 1:
-        raise ReplayError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
+        raise DappledError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
     return logs[0] if logs else None
 
 
@@ -381,12 +377,12 @@ def play(
         time.advance_to(shot.wished_utc_ns)
         shots.fire(shot)
         if pace is None and not progress.ended.acquire(timeout=timeout_s):
-            raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+            raise DappledError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
         before = shot
     if pace:
         for shot in recording.shots:
             if not progress.ended.acquire(timeout=timeout_s):
-                raise ReplayError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+                raise DappledError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
 
 
 def verifier(recording: RecordedFlight, keep: ResultWriter | None = None) -> ReplayVerifier:
@@ -440,7 +436,7 @@ def _first_position_utc_ns(path: Path, bounds: UtcBounds, system: int | None) ->
     mine = (one for one in heard if system is None or one[2].get_srcSystem() == system)
     utc_ns = first_position_utc_ns(mine)
     if utc_ns is None:
-        raise ReplayError(f"{path} holds no position: give --start, the time of the first frame")
+        raise DappledError(f"{path} holds no position: give --start, the time of the first frame")
     return utc_ns
 
 
@@ -450,11 +446,11 @@ _OWN_LOGS = {b"\xa3\x95\x80\x80": "dataflash", b"ULog\x01\x12\x35": "ulog"}
 def own_log(path: Path) -> str | None:
     """Whose own log a file is, by its first bytes: "dataflash" of ArduPilot, "ulog" of PX4; None for a .tlog.
 
-    Raises ReplayError where it can't be read.
+    Raises DappledError where it can't be read.
     """
     try:
         with open(path, "rb", opener=durable.plain_file) as file:
             begins = file.read(7)
     except OSError as error:
-        raise ReplayError(f"{path} can't be read: {error.strerror}") from error
+        raise DappledError(f"{path} can't be read: {error.strerror}") from error
     return next((name for magic, name in _OWN_LOGS.items() if begins.startswith(magic)), None)

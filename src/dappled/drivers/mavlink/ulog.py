@@ -49,15 +49,11 @@ _GAP_US = 1_000_000  # an estimate further away says no place
 Columns = Mapping[str, Any]  # name of a field → its values (n,)
 
 
-class ULogError(AutopilotLogError):
-    """A log of PX4 can't be used; one sentence."""
-
-
 def packets(
     path: Path, report: Callable[[Finding], object] = lambda _: None, bounds: UtcBounds | None = None
 ) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. `report` gets what is to be said of the log;
-    `bounds` say which dates can be true (None: up to now). Raises ULogError."""
+    `bounds` say which dates can be true (None: up to now). Raises AutopilotLogError."""
     missing = Missing()
     with _sound(path):
         log = _Topics.read(path, [_PLACES, _SPEEDS, _TURNS, _HOME])
@@ -73,14 +69,14 @@ def packets(
 
 def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
     """The camera's triggers: camera_trigger, of which some may be contacts of a feedback pin, or without it
-    camera_capture. Raises ULogError."""
+    camera_capture. Raises AutopilotLogError."""
     with _sound(path):
         log = _Topics.read(path, [_PLACES, _TRIGGERS, _CAPTURES])
         clock, _, _ = _clock(path, log, bounds)
         topics = log.first
         given = topics.get(_TRIGGERS, topics.get(_CAPTURES))
         if given is None or "seq" not in given:
-            raise ULogError(
+            raise AutopilotLogError(
                 f"{path} holds no trigger ({_TRIGGERS} or {_CAPTURES}): was TRIG_MODE set, and are they logged?"
             )
         at, numbers = log.times(given, "timestamp"), given["seq"].astype(np.int64)
@@ -90,7 +86,7 @@ def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
             LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(log, int(at[n]))) for n in np.flatnonzero(told & ~back)
         ]
         if not found:
-            raise ULogError(
+            raise AutopilotLogError(
                 f"{path} holds no trigger ({_TRIGGERS}), only contacts of a feedback pin: nothing to compare"
             )
         all_us = np.concatenate([log.times(topic, "timestamp") for topic in topics.values()])
@@ -106,7 +102,7 @@ def _sound(path: Path) -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError, KeyError, IndexError, ArithmeticError) as error:
-        raise ULogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
+        raise AutopilotLogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
 
 
 def _cut_short(data: bytes) -> bool:
@@ -166,17 +162,17 @@ class _Topics:
 def _opened(path: Path, names: Sequence[str]) -> dict[tuple[str, int], dict[str, Any]]:
     """These topics and the receivers', by name and instance."""
     if importlib.util.find_spec("pyulog") is None:  # an extra; only this log needs it
-        raise ULogError(f"{path} is a log of PX4, and that needs pyulog; {install_extra('ground')}")
+        raise AutopilotLogError(f"{path} is a log of PX4, and that needs pyulog; {install_extra('ground')}")
     try:
         arrays, _ = reader_process.read(
             "dappled.drivers.mavlink.ulog_reader", path, (*names, *_RECEIVERS), library="pyulog", budget=_BUDGET
         )
     except OSError as error:
-        raise ULogError(f"{path} can't be read: {error.strerror}") from None
+        raise AutopilotLogError(f"{path} can't be read: {error.strerror}") from None
     except MemoryError as error:
-        raise ULogError(f"{path} is damaged as a log of PX4, or made to exhaust memory: {error}") from None
+        raise AutopilotLogError(f"{path} is damaged as a log of PX4, or made to exhaust memory: {error}") from None
     except ValueError as error:
-        raise ULogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
+        raise AutopilotLogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
     topics: dict[tuple[str, int], dict[str, Any]] = {}
     for name, values in arrays.items():
         topic, instance, field = name.split("/", 2)
@@ -189,7 +185,7 @@ def _clock(
 ) -> tuple[LogClock, list[tuple[Receiver, Chosen]], list[Finding]]:
     """The autopilot's clock, the receiver's messages that count, and what is to be said of both. What PX4 chose or
     blended (`vehicle_gps_position`) counts where it has a fix, else the best of its receivers; UTC is of the first that
-    has it. Raises ULogError without one."""
+    has it. Raises AutopilotLogError without one."""
     needed = ("timestamp", "time_utc_usec", "fix_type", "satellites_used")
     given = [
         [
@@ -201,12 +197,12 @@ def _clock(
     ]
     merged, own = given
     if not merged and not own:
-        raise ULogError(f"{path} holds no messages of a satellite receiver: its time in UTC is not known")
+        raise AutopilotLogError(f"{path} holds no messages of a satellite receiver: its time in UTC is not known")
     try:
         counting, told = log_evidence.chosen(path, merged if any(one.fixed.any() for one in merged) else own or merged)
         clock, doubts = log_evidence.utc_clock(path, counting, [*merged, *own], bounds)
     except AutopilotLogError as error:
-        raise ULogError(str(error)) from None
+        raise AutopilotLogError(str(error)) from None
     return clock, counting, [*told, *doubts]
 
 
@@ -242,7 +238,8 @@ def _receiver_place(path: Path, topic: Columns) -> tuple[Floats, Floats, Floats]
     else:
         names, scales = ("lat", "lon", "alt"), (1e-7, 1e-7, 1e-3)
     if any(name not in topic for name in names):
-        raise ULogError(f"{path} holds no places of the satellite receiver in a form of PX4's: was it made by PX4?")
+        made = "in a form of PX4's: was it made by PX4?"
+        raise AutopilotLogError(f"{path} holds no places of the satellite receiver {made}")
     first, second, third = (topic[name] * scale for name, scale in zip(names, scales, strict=True))
     return first, second, third
 
@@ -256,7 +253,7 @@ def _positions(path: Path, log: _Topics, missing: Missing) -> Iterator[Timed]:
         or any(name not in places for name in needed)
         or any(name not in speeds for name in ("vx", "vy", "vz", "z"))
     ):
-        raise ULogError(
+        raise AutopilotLogError(
             f"{path} holds no positions with velocities ({_PLACES} and {_SPEEDS}): log them (SDLOG_PROFILE, bit 0)"
         )
     at, times = log.sampled(places), log.sampled(speeds)
@@ -303,7 +300,7 @@ def _attitudes(path: Path, log: _Topics, missing: Missing) -> Iterator[Timed]:
     topic = log.first.get(_TURNS)
     names = [f"q[{n}]" for n in range(4)]
     if topic is None or any(name not in topic for name in names):
-        raise ULogError(f"{path} holds no attitudes ({_TURNS}): log them (SDLOG_PROFILE, bit 0)")
+        raise AutopilotLogError(f"{path} holds no attitudes ({_TURNS}): log them (SDLOG_PROFILE, bit 0)")
     turned = np.stack([_column(topic, name) for name in names], axis=-1)
     yield from log_evidence.attitudes(_TURNS, log.sampled(topic), turned, missing)
 

@@ -44,23 +44,19 @@ from dappled.findings import Finding, Subject
 Painter = Callable[[LightField], NDArray[np.float32]]  # views in colour of a light field with grey ones
 
 
-class DarkroomError(DappledError):
-    """A frame or a recipe can't be decoded; one sentence."""
-
-
 def read(path: Path | str, recipe: Recipe) -> RawFile:
     """Read a frame's file, with the values that the recipe overrides. Raises DappledError."""
     return override(reading.read(Path(path)), recipe)
 
 
 def override(raw: RawFile, recipe: Recipe) -> RawFile:
-    """Replace the values that the recipe gives. Raises DarkroomError for a wrong colour pattern."""
+    """Replace the values that the recipe gives. Raises DappledError for a wrong colour pattern."""
     changed: dict[str, Any] = {}
     if recipe.cfa:
         side = math.isqrt(len(recipe.cfa))
         pattern = recipe.cfa.upper()
         if side < 2 or side * side != len(pattern) or set(pattern) != set("RGB"):
-            raise DarkroomError(
+            raise DappledError(
                 f"--cfa {recipe.cfa} is not a colour pattern: give its letters R, G, B row by row, as in BGGR"
             )
         changed["cfa"] = np.array(["RGB".index(letter) for letter in pattern], dtype=np.int64).reshape(side, side)
@@ -85,30 +81,30 @@ def camera_name(camera: str, model: str | None) -> str:
 
 
 def camera_profile(recipe: Recipe, model: str) -> CameraProfile:
-    """Return the camera's profile: the recipe's, or by model. Raises DarkroomError where no profile knows the model."""
+    """Return the camera's profile: the recipe's, or by model. Raises DappledError where no profile knows the model."""
     if recipe.camera != "auto":
         return profiles.camera(recipe.camera)
     found = profiles.camera_for_model(model)
     if found is None:
         named = f"the frame says {model!r}" if model else "the frame names no camera"
-        raise DarkroomError(f"{named}, and no profile fits it: name one with --camera")
+        raise DappledError(f"{named}, and no profile fits it: name one with --camera")
     return found
 
 
 @contextmanager
 def naming(path: Path | str) -> Iterator[None]:
-    """Context in which a DecodeError becomes a DarkroomError with the file's name."""
+    """Context in which a DecodeError becomes a DappledError with the file's name."""
     try:
         yield
     except DecodeError as error:
-        raise DarkroomError(f"{path}: {error}") from error
+        raise DappledError(f"{path}: {error}") from error
 
 
 __all__ = [
     "FILES",
     "FOLDER",
+    "DappledError",
     "Darkroom",
-    "DarkroomError",
     "DecodeResult",
     "LawDecision",
     "Recipe",
@@ -189,13 +185,13 @@ class Darkroom:
         if self.recipe.mask != profiles.LENSLET:
             profiles.mask(self.recipe.mask)
         if (wrong := calibration_files.misfit(self.recipe)) is not None:
-            raise DarkroomError(wrong)
+            raise DappledError(wrong)
         if self.recipe.taper and self.recipe.mask == profiles.LENSLET:
-            raise DarkroomError(
+            raise DappledError(
                 "a taper is for the bands of a printed mask; the bands of lenslets fill the whole spectrum"
             )
         if not 0 <= self.recipe.taper <= 1:
-            raise DarkroomError(f"the taper is {self.recipe.taper:g}: it must be a share of the band, from 0 to 1")
+            raise DappledError(f"the taper is {self.recipe.taper:g}: it must be a share of the band, from 0 to 1")
         for path in (self.recipe.white, self.recipe.dark):
             if path:
                 reading.read_metadata(Path(path))
@@ -304,14 +300,14 @@ class Darkroom:
         return self._decoders[key]
 
     def mask_decoder(self, shape: tuple[int, int], model: str) -> MaskDecoder:
-        """Return the decoder of a camera with a printed mask. Raises DarkroomError for lenslets."""
+        """Return the decoder of a camera with a printed mask. Raises DappledError for lenslets."""
         decoder = self.decoder(shape, model)
         if not isinstance(decoder, MaskDecoder):
-            raise DarkroomError("lenslets have no mask to predict carriers of")
+            raise DappledError("lenslets have no mask to predict carriers of")
         return decoder
 
     def naming(self, path: Path | str) -> AbstractContextManager[None]:
-        """Context in which a DecodeError becomes a DarkroomError with the file's name."""
+        """Context in which a DecodeError becomes a DappledError with the file's name."""
         return naming(path)
 
     def camera(self, model: str) -> CameraProfile:

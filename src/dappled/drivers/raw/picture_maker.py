@@ -23,8 +23,9 @@ from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
 from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of, shadow_of
 from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Darkroom, DarkroomError, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
+from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding
 
 _TURNED, _SCALED = 0.03, 0.02  # radians, and of the period: how far a mask may lie from a law's prediction
@@ -61,7 +62,7 @@ class PictureMaker:
     def check(self) -> None:
         """Raise DappledError when the recipe names something that is missing or wrong, or lenslets."""
         if self._recipe.mask == profiles.LENSLET:
-            raise DarkroomError("a picture of full resolution is made behind printed masks, not behind lenslets")
+            raise DappledError("a picture of full resolution is made behind printed masks, not behind lenslets")
         Darkroom(self._recipe).check()
 
     def picture(
@@ -71,7 +72,7 @@ class PictureMaker:
         raw = self._darkroom.read(path)
         focal_length_mm, f_number = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
         if focal_length_mm is None:
-            raise DarkroomError(f"{path}: its focal length is unknown: give it with --focal-length")
+            raise DappledError(f"{path}: its focal length is unknown: give it with --focal-length")
         with self._darkroom.naming(path):
             mosaic = self._mosaic(raw)
             decoder = self._darkroom.mask_decoder(mosaic.shape, raw.camera_model or "")

@@ -33,21 +33,17 @@ from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, RawSource, p
 from dappled.durable import plain_file
 from dappled.errors import DappledError
 
-__all__ = ["ExposureSettings", "RawFile", "RawFileError", "RawSource", "read", "read_metadata"]
+__all__ = ["DappledError", "ExposureSettings", "RawFile", "RawSource", "read", "read_metadata"]
 
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _DNG_VERSION, _MAX_SAMPLE = 50706, 281  # TIFF tags
 _LINEAR_FROM = 0.95  # a PNG's gamma: 1 is linear, 0.45455 is usual
 
 
-class RawFileError(DappledError):
-    """A file can't be read as a frame; one sentence with its name."""
-
-
 def read(source: RawSource, name: str | None = None) -> RawFile:
     """Read a frame from a path, or from bytes (`name` stands for the file in error sentences).
 
-    Raises RawFileError when it is missing, empty, truncated, damaged or of a kind that holds no frame.
+    Raises DappledError when it is missing, empty, truncated, damaged or of a kind that holds no frame.
     """
     label = _label(source, name)
     with _open(source, label) as file, _sentences(label):
@@ -66,7 +62,7 @@ def read(source: RawSource, name: str | None = None) -> RawFile:
 def read_metadata(source: RawSource, name: str | None = None) -> ExposureSettings:
     """Read camera and exposure alone, without unpacking the pixels (milliseconds).
 
-    A kind of file without metadata gives None throughout. Raises RawFileError as `read` does.
+    A kind of file without metadata gives None throughout. Raises DappledError as `read` does.
     """
     label = _label(source, name)
     with _open(source, label) as file, _sentences(label):
@@ -107,14 +103,14 @@ def _open(source: RawSource, label: str) -> Iterator[BinaryIO]:
         else:
             file = io.BytesIO(source)
     except OSError as error:
-        raise RawFileError(f"cannot open the frame {label}: {error.strerror}; check the path") from error
+        raise DappledError(f"cannot open the frame {label}: {error.strerror}; check the path") from error
     with file:
         try:
             size = _length(file) if isinstance(file, io.BytesIO) else check_stored(file.fileno())
         except ClaimError as error:
-            raise RawFileError(_sentence(label, error)) from error
+            raise DappledError(_sentence(label, error)) from error
         if size == 0:
-            raise RawFileError(f"the frame {label} is empty; fetch it from the camera again")
+            raise DappledError(f"the frame {label} is empty; fetch it from the camera again")
         yield file
 
 
@@ -125,7 +121,7 @@ def _sentences(label: str) -> Iterator[None]:
         yield
     except Exception as error:  # the readers raise anything on damaged bytes
         traceback.clear_frames(error.__traceback__)
-        raise RawFileError(_sentence(label, error)) from error
+        raise DappledError(_sentence(label, error)) from error
 
 
 def _sentence(label: str, error: Exception) -> str:
