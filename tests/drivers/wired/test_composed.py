@@ -12,13 +12,24 @@ from typing import Any
 import pytest
 
 from dappled.clock import RecordedClock, SystemClock
-from dappled.drivers.camera import Arrival, CameraError, Companion, Deferred, Fired, Identity, ShotFailed, StateChanged
+from dappled.drivers.camera import (
+    Arrival,
+    CameraError,
+    Companion,
+    Deferred,
+    Fired,
+    Identity,
+    Noticed,
+    ShotFailed,
+    StateChanged,
+)
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot, ReplayCamera
 from dappled.drivers.wired import composed, folder, fujifilm, matching
 from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import GpioLine, HalfPressedLine, OutsideLine
 from dappled.drivers.wired.sources import FolderSource, FoundFile, StorageSource
+from dappled.findings import Code
 from dappled.mocks import simulated
 from dappled.mocks.body.body import pattern
 from dappled.mocks.body.eos450d import thumbnail
@@ -326,6 +337,36 @@ def test_a_card_that_appears_after_many_shots_brings_them_all_in_order(flight: F
     flight.body.plug()
     assert flight.brought(6) == {shot: f"DSCF{shot + 1:04d}.RAF" for shot in range(6)}
     flight.brings_nothing()
+
+
+def test_a_card_changed_in_flight_that_numbers_from_1_again_is_brought_too_and_told(flight: Flight) -> None:
+    flight.body.plug()
+    flight.camera.start()
+    until_state(flight.camera, "ready")
+    names = [f"DSCF{number:04d}.RAF" for number in (1, 2, 3)]
+    told: list[Code] = []
+    for first in (0, 3):
+        flight.body.unplug()
+        for shot, step_s in zip(range(first, first + 3), (5, 7, 11), strict=True):
+            flight.shoot(shot, step_s)
+        flight.written(3)
+        for number, name in enumerate(names, first + 1):
+            (flight.card / f"DSCF{number:04d}.RAF").rename(flight.card / name)
+        flight.body.plug()
+        found: dict[int | None, str] = {}
+        while len(found) < 3:
+            for event in until(flight.camera, lambda event: isinstance(event, Arrival)):
+                if isinstance(event, Noticed):
+                    told.append(event.finding.code)
+                elif isinstance(event, Arrival):
+                    found[event.shot] = event.name
+                    event.blob.close()
+        assert found == dict(enumerate(names, first))
+        flight.body.unplug()
+        flight.brings_nothing()
+        for name in names:
+            (flight.card / name).unlink()
+    assert told == [Code.CARD_CHANGED]
 
 
 def test_a_card_seen_before_the_flight_brings_what_is_sure_where_one_is_missing(flight: Flight) -> None:
