@@ -87,6 +87,16 @@ def _smooth(values: Singles, sizes: list[int]) -> Singles:
     return made
 
 
+def block_sums(values: Singles, down: NDArray[np.intp], across: NDArray[np.intp]) -> Floats:
+    """Sums over blocks that begin at these rows and columns."""
+    left, right = (
+        (np.arange(length) >= starts[:, None]).astype(np.float32)
+        - (np.arange(length) >= np.append(starts[1:], length)[:, None])
+        for starts, length in zip((down, across), values.shape, strict=True)
+    )
+    return np.asarray((left.astype(np.float32) @ values).astype(np.float64) @ right.T)
+
+
 def wave_sums(
     values: Singles,
     rows: Floats,

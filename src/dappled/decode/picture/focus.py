@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.array_types import Floats, Singles
-from dappled.decode.picture.blocks import PatternPlace, wave_sums
+from dappled.decode.picture.blocks import PatternPlace, block_sums, wave_sums
 from dappled.decode.picture.shadow import Shadow, period_of
 
 _BLOCK_PX, _BLOCK_PERIODS = 64, 8  # a block's side is at least both
@@ -67,7 +67,7 @@ def mixed(samples: Sequence[Sharp], shadow: Shadow) -> tuple[list[Singles], Floa
     side = max(_BLOCK_PX, round(_BLOCK_PERIODS * period_of(shadow.lattice)))
     lengths = [-(-side // one) * one for one in step]
     blocks = [max(1, whole // one) for whole, one in zip(shape, lengths, strict=True)]
-    edges = tuple(np.arange(number) * (one // each) for number, one, each in zip(blocks, lengths, step, strict=True))
+    edges = [np.arange(number) * (one // each) for number, one, each in zip(blocks, lengths, step, strict=True)]
     carriers, between, nearest = _frequencies(shadow)
     count = len(carriers)
     ghost, detail = np.zeros((2, *blocks))
@@ -81,7 +81,7 @@ def mixed(samples: Sequence[Sharp], shadow: Shadow) -> tuple[list[Singles], Floa
         slopes = [np.gradient(band, axis=axis).astype(np.float32) for axis in (0, 1)]
         both = np.concatenate([carriers, between])
         sums = [wave_sums(rest * slope, rows, columns, both, (edges[0], edges[1])) for slope in slopes]
-        yy, yx, xx = (_sums(a * b, edges) for a, b in ((slopes[0],) * 2, slopes, (slopes[1],) * 2))
+        yy, yx, xx = (block_sums(a * b, *edges) for a, b in ((slopes[0],) * 2, slopes, (slopes[1],) * 2))
         own = np.maximum(yy * xx - yx * yx, 1e-12 * (yy + xx) ** 2 + 1e-30)[..., None]
         power = (
             xx[..., None] * np.abs(sums[0]) ** 2
@@ -91,9 +91,10 @@ def mixed(samples: Sequence[Sharp], shadow: Shadow) -> tuple[list[Singles], Floa
         around = np.exp(np.log(power[..., count:][..., nearest] + 1e-30).mean(axis=-1))
         ghost += power[..., :count].sum(axis=-1)
         detail += _GEOMETRIC * around.sum(axis=-1)
-        total += _sums(rest * rest, edges)
-        noise += one.noise * _sums(np.ones_like(rest), edges)
-        pixels += _sums(np.ones_like(rest), edges)
+        area = block_sums(np.ones_like(rest), *edges)
+        total += block_sums(rest * rest, *edges)
+        noise += one.noise * area
+        pixels += area
     gain = _GAIN * lengths[0] * lengths[1] / period_of(shadow.lattice) ** 2
     weights = _weights(ghost / np.maximum(detail, 1e-30), gain, total / pixels, noise / pixels)
     smooth = [
@@ -125,12 +126,6 @@ def _frequencies(shadow: Shadow) -> tuple[Floats, Floats, NDArray[np.intp]]:
     points, index = np.unique(flipped.reshape(-1, 2), axis=0, return_inverse=True)
     matrix = shadow.lattice.matrix()
     return orders @ matrix, points @ matrix, index.reshape(len(orders), 4)
-
-
-def _sums(values: Singles, edges: Sequence[NDArray[np.intp]]) -> Floats:
-    """Sums over blocks that begin at `edges`."""
-    lines = np.add.reduceat(values, edges[0], axis=0, dtype=np.float64)
-    return np.asarray(np.add.reduceat(lines, edges[1], axis=1))
 
 
 def _between(places: Floats, length: int, count: int) -> Floats:

@@ -21,7 +21,7 @@ from scipy import fft, ndimage
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.optics import Lattice, Order
-from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, local_mean, wave_sums
+from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, local_mean, wave_sums
 
 Coefficients = NDArray[np.complex128]
 _BLOCK_PX, _BLOCK_PERIODS = 64, 4  # a block's side is at least both
@@ -127,8 +127,11 @@ def shadow_of(
         if held > gain + _SURE:
             best, gain = equations.fitted(degree), held
     none = equations.explained(None)
+    known: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
     for one in others:
-        there = _Equations.of(means, one.lattice, one.orders)
+        if (where := (one.lattice, one.orders)) not in known:
+            known[where] = _Equations.of(means, *where)
+        there = known[where]
         if (told := there.explained(one, equations.weights) - none) > gain:
             best, gain = one, told
     return best
@@ -275,8 +278,7 @@ class _Equations:
             sums = wave_sums(weight * mean, rows, columns, unique @ matrix, (edges[0], edges[1]))
             gram[place.colour] += sums.reshape(shape[1], -1)
             for values, into in ((high * high, energy), (keep, count)):
-                lines = np.add.reduceat(values, edges[0], axis=0, dtype=np.float64)
-                into[place.colour] += np.add.reduceat(lines, edges[1], axis=1).ravel()
+                into[place.colour] += block_sums(values, edges[0], edges[1]).ravel()
         right[..., half:] = right[..., 1:half].conj()
         whole = gram[..., index]
         whole = np.where(sign > 0, whole, whole.conj())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from dappled.products.extras import need
 from dappled.products.maps.map_grid import MapError, MapGrid
 
 TILE = 512
+_LEVELS = 65535  # of linear values: a twentieth of what 8 bits in sRGB's curve tell apart in the dark
+_DEFLATE = 1  # of 9: a map of the sensor's own fineness is mostly noise, which no effort makes smaller
 
 
 def display(image: Singles, gain: float) -> NDArray[np.uint8]:
@@ -25,9 +28,21 @@ def display(image: Singles, gain: float) -> NDArray[np.uint8]:
 
     NaN becomes transparent black.
     """
-    known = np.asarray(np.isfinite(image).all(axis=2))
-    linear = np.clip(np.where(known[..., None], image, 0.0) * gain, 0.0, 1.0)
-    return np.concatenate([np.round(srgb.encoded(linear) * 255), known[..., None] * 255], axis=2).astype(np.uint8)
+    known = np.isfinite(image[..., 0])
+    made = np.zeros((*known.shape, image.shape[2] + 1), dtype=np.uint8)
+    for band in range(1, image.shape[2]):
+        known &= np.isfinite(image[..., band])
+    for band in range(image.shape[2]):
+        level = np.clip(image[..., band] * np.float32(gain * _LEVELS), 0, _LEVELS)
+        made[..., band] = _shown()[np.where(known, level, 0).astype(np.uint16)]
+    made[..., -1] = known * np.uint8(255)
+    return made
+
+
+@cache
+def _shown() -> NDArray[np.uint8]:
+    """The 8 bits in sRGB's curve of each of `_LEVELS` linear ones."""
+    return np.asarray(np.round(srgb.encoded(np.arange(_LEVELS + 1) / _LEVELS) * 255), dtype=np.uint8)
 
 
 def gain_of(images: Iterable[Singles]) -> float:
@@ -87,6 +102,7 @@ def write_pieces(
                 part,
                 driver="COG",
                 compress="deflate",
+                level=_DEFLATE,
                 predictor="yes",
                 blocksize=TILE,
                 overview_resampling="average",

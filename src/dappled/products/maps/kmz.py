@@ -154,7 +154,7 @@ def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
     """Add the picture as PNG to the archive's files; returns its name."""
     mode = "LA" if picture.shape[2] == 2 else "RGBA"
     memory = io.BytesIO()
-    Pictures.fromarray(np.ascontiguousarray(picture), mode).save(memory, "PNG")
+    Pictures.fromarray(np.ascontiguousarray(picture), mode).save(memory, "PNG", compress_level=1)
     name = f"{place}.png"
     files[name] = memory.getvalue()
     return name
@@ -164,13 +164,9 @@ def _shrunk(picture: Pixels, step: int) -> Pixels:
     """Means over step × step cells, weighted by alpha."""
     if step == 1:
         return picture
-    rows, columns = (-(-side // step) * step for side in picture.shape[:2])
-    padded = np.zeros((rows, columns, picture.shape[2]), dtype=np.float32)
-    padded[: picture.shape[0], : picture.shape[1]] = picture
-    padded[..., :-1] *= padded[..., -1:] / 255
-    means = padded.reshape(rows // step, step, columns // step, step, -1).mean(axis=(1, 3))
-    means[..., :-1] /= np.maximum(means[..., -1:], 1e-6) / 255
-    return np.asarray(np.round(np.clip(means, 0, 255)), dtype=np.uint8)
+    straight, weighted = ("LA", "La") if picture.shape[2] == 2 else ("RGBA", "RGBa")
+    whole = Pictures.fromarray(np.ascontiguousarray(picture), straight).convert(weighted)
+    return np.asarray(whole.reduce(step).convert(straight), dtype=np.uint8)
 
 
 def _zipped(files: dict[str, bytes]) -> bytes:
