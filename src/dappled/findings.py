@@ -225,6 +225,7 @@ class Code(StrEnum):
     PEER_OTHER_HOST = "peer.other_host"
     PEER_OTHER_PROTOCOL = "peer.other_protocol"
     PEER_READS_NOTHING = "peer.reads_nothing"
+    PEER_SAYS_TOO_MUCH = "peer.says_too_much"
     PEER_SILENT = "peer.silent"
     PEER_TOO_MANY = "peer.too_many"
     PEER_WRONG_REQUEST = "peer.wrong_request"

@@ -16,13 +16,17 @@ MOST_PIXELS = 500_000_000
 """Of one picture. Survey cameras have up to 280 million."""
 FREE_PIXELS = 32_000_000  # need no proof: a white card packs to nearly nothing
 _CHANNELS = {"I;16": 2, "I;16B": 2, "I": 4, "F": 4, "RGB": 3, "RGBA": 4, "CMYK": 4, "YCbCr": 3, "LAB": 3, "LA": 2}
+_JPEG = b"\xff\xd8\xff"
 _MARKS = (
     (b"\x89PNG", PngImagePlugin.PngImageFile),
-    (b"\xff\xd8\xff", JpegImagePlugin.JpegImageFile),
+    (_JPEG, JpegImagePlugin.JpegImageFile),
     (b"II*\0", TiffImagePlugin.TiffImageFile),
     (b"MM\0*", TiffImagePlugin.TiffImageFile),
 )
 _DEFLATED = (8, 32946)
+_MOST_CHUNKS = 200_000  # of a PNG: 500 million pixels in chunks of 8 kB
+_MOST_SEGMENTS, _MOST_LOOSE = 4096, 4096  # of a JPEG's head, and bytes beside them; profiles take some hundred segments
+_LAST = (0xD9, 0xDA)  # the end, and the scan, behind which there is no head
 _PLAIN = (1, 5, 32773, *_DEFLATED)  # none, LZW, PackBits, deflate: what they unpack to is limited
 
 
@@ -38,6 +42,8 @@ def open_picture(file: BinaryIO, *, ratio: int = claims.RATIO, free_pixels: int 
         raise UnidentifiedImageError("it is neither PNG, nor JPEG, nor TIFF")
     if start == b"\x89PNG":
         _check_png_chunks(file)
+    elif start.startswith(_JPEG):
+        _check_jpeg_head(file)
     try:
         # Not Image.open: its limit of pixels is a global of Pillow, below the size of today's survey cameras.
         picture: Image.Image = kind(file)
@@ -95,13 +101,35 @@ def check_tiff_page(page: Any, file: BinaryIO, *, ratio: int = claims.RATIO, fre
 
 def _check_png_chunks(file: BinaryIO) -> None:
     """Check that each chunk ends inside the file: Pillow takes memory for what its length claims. Raises ClaimError."""
-    size, at = _length(file), 8
+    size, at, count = _length(file), 8, 0
     while at + 8 <= size:
+        count += 1
+        if count > _MOST_CHUNKS:
+            raise ClaimError(f"it has more than {_MOST_CHUNKS} chunks, made to take time: save it anew")
         file.seek(at)
         at += 12 + int.from_bytes(file.read(4), "big")
         if at > size:
             raise ClaimError("one of its chunks ends after the file does: it is damaged or cut short; make it anew")
     file.seek(0)
+
+
+def _check_jpeg_head(file: BinaryIO) -> None:
+    """Check that little stands before a JPEG's scan: Pillow reads what is in no segment byte by byte, and loads each
+    segment. Raises ClaimError."""
+    size, at, loose = _length(file), 2, 0
+    for _ in range(_MOST_SEGMENTS):
+        file.seek(at)
+        head = file.read(_MOST_LOOSE + 4)
+        rest = head[head.find(b"\xff") :].lstrip(b"\xff") if b"\xff" in head else b""
+        loose += len(head) - len(rest)
+        if loose > _MOST_LOOSE + _MOST_SEGMENTS or (not rest and at + len(head) < size):
+            break
+        if not rest or rest[0] in _LAST:
+            file.seek(0)
+            return
+        segment = JpegImagePlugin.MARKER.get(0xFF00 | rest[0], ("", "", None))[2] is not None
+        at += len(head) - len(rest) + 1 + (int.from_bytes(rest[1:3], "big") if segment else 0)
+    raise ClaimError("its head has more segments or fill bytes than a picture's, made to take time: save it anew")
 
 
 def _length(file: BinaryIO) -> int:

@@ -184,6 +184,30 @@ def test_who_reads_nothing_holds_up_the_daemon_s_end_and_is_closed(rig: Rig) -> 
     viewer.close()
 
 
+def test_who_sends_more_than_questions_take_is_closed(rig: Rig) -> None:
+    """ZeroMQ keeps the parts of a message that never ends."""
+    viewer, daemon = rig.let_in()
+    part = b"\x03\xff" + bytes(255)  # one more follows
+    daemon.setblocking(False)
+    for _ in range(LIMITS.said_bytes // len(part) // 2):
+        viewer.sendall(part)
+        rig.relay.turn(0.0)
+        with contextlib.suppress(BlockingIOError):
+            daemon.recv(1 << 20)
+    assert rig.reasons() == {}
+    viewer.setblocking(False)
+    with contextlib.suppress(ConnectionError):
+        for _ in range(100_000):
+            with contextlib.suppress(BlockingIOError):
+                viewer.send(part * 100)
+            rig.relay.turn(0.0)
+            with contextlib.suppress(BlockingIOError):
+                daemon.recv(1 << 20)
+            if not rig.relay.busy:
+                break
+    assert rig.reasons() == {Code.PEER_SAYS_TOO_MUCH: 1}
+
+
 def test_what_the_daemon_sent_last_still_arrives(rig: Rig) -> None:
     viewer, daemon = rig.let_in()
     stranger = rig.viewer()

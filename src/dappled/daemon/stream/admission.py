@@ -17,7 +17,9 @@ _HANDSHAKE_BYTES = 4096  # libzmq's own is below 600
 @dataclass(frozen=True, slots=True)
 class ConnectionLimits:
     """How many connections are kept: `opening` before the end of the handshake, for `handshake_s` at most, and `open`
-    after it. A viewer that also asks for slices needs two. One whose peer reads nothing for `unread_s` is closed."""
+    after it. A viewer that also asks for slices needs two. One whose peer reads nothing for `unread_s` is closed, and
+    one that sends more than `said_bytes`, and `said_b_s` for each second since: ZeroMQ keeps the parts of a message
+    until its last has come, and all subscriptions."""
 
     opening: int = 48
     opening_per_address: int = 24
@@ -25,6 +27,8 @@ class ConnectionLimits:
     open_per_address: int = 32
     handshake_s: float = 10.0
     unread_s: float = 30.0
+    said_bytes: int = 1 << 20
+    said_b_s: float = 4000.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,6 +44,7 @@ class Flow:
     def __init__(self, source: socket.socket, sink: socket.socket, waiting: bytes = b"") -> None:
         self.source, self.sink, self.waiting = source, sink, waiting
         self.ended = False
+        self.read_bytes = len(waiting)
 
     def pump(self, scratch: memoryview, handshake: Handshake | None = None) -> bool:
         """Move what can be moved without waiting; whether anything was. Raises OSError where one end is gone."""
@@ -62,6 +63,7 @@ class Flow:
     def _read(self, scratch: memoryview, handshake: Handshake | None) -> bool:
         count = self.source.recv_into(scratch)
         self.ended = not count
+        self.read_bytes += count
         read = scratch[:count]
         if handshake is not None:
             handshake.feed(read)
@@ -238,12 +240,18 @@ class Relay:
         inward.pump(self._scratch)
         if moved or not was_waiting:
             one.read_ns = self._clock.monotonic_ns()
-        if inward.ended or (outward.ended and not outward.waiting):
+        if self._says_too_much(one, inward):
+            self._close(one, Code.PEER_SAYS_TOO_MUCH)
+        elif inward.ended or (outward.ended and not outward.waiting):
             self._close(one, None if one.handshake.complete else Code.PEER_HANDSHAKE_FAILED)
         elif one.handshake.complete and not was_open and self._is_over(one.network):
             self._close(one, Code.PEER_TOO_MANY)
         else:
             self._await(one, inward, outward)
+
+    def _says_too_much(self, one: ViewerConnection, inward: Flow) -> bool:
+        age_s = (self._clock.monotonic_ns() - one.began_ns) / 1e9
+        return inward.read_bytes > self._limits.said_bytes + self._limits.said_b_s * age_s
 
     def _is_over(self, network: str) -> bool:
         networks = [one.network for one in self._kept.values() if one.opening is None]

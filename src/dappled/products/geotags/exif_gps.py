@@ -7,6 +7,7 @@ its JPEG preview.
 
 from __future__ import annotations
 
+import re
 import struct
 import zlib
 from collections.abc import Sequence
@@ -28,6 +29,7 @@ _EXIF = b"Exif\0\0"
 _PNG = b"\x89PNG\r\n\x1a\n"
 _SOI, _APP0, _APP1, _SOS = 0xD8, 0xE0, 0xE1, 0xDA
 _SEGMENT = 0xFFFF
+_FILL = re.compile(rb"\xff+")
 EMPTY = b"II*\0" + struct.pack("<IHI", 8, 0, 0)
 """A TIFF without an entry, little endian."""
 
@@ -125,9 +127,7 @@ def _jpeg(data: bytes, where: Place) -> bytes:
     marker) stay."""
     at, insert = 2, 2
     while data[at] == 0xFF:
-        marker = at
-        while data[marker + 1] == 0xFF:
-            marker += 1
+        marker = at + len(_FILL.match(data, at)[0]) - 1  # type: ignore[index]  # one is there
         if data[marker + 1] in (_SOS, 0xD9):
             break
         (length,) = struct.unpack_from(">H", data, marker + 2)
