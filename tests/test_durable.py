@@ -42,7 +42,7 @@ def test_what_stands_under_the_temporary_name_is_neither_waited_for_nor_written_
 
 @pytest.mark.parametrize("call", ["sendfile", "fsync", "replace"])
 def test_a_fault_before_the_rename_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
-    def refuse(*_: object) -> None:
+    def refuse(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "no space")
 
     with held(b"abc") as blob:
@@ -61,9 +61,9 @@ def test_the_order_is_file_then_name_then_folder(tmp_path: Path, monkeypatch: py
         seen.append(f"fsync {Path(os.readlink(f'/proc/self/fd/{fd}')).name}")
         fsync(fd)
 
-    def watched_rename(old: Any, new: Any) -> None:
+    def watched_rename(old: Any, new: Any, **folders: Any) -> None:
         seen.append(f"rename {Path(old).name} {Path(new).name}")
-        rename(old, new)
+        rename(old, new, **folders)
 
     monkeypatch.setattr(os, "fsync", watched_fsync)
     monkeypatch.setattr(os, "replace", watched_rename)

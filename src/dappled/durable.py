@@ -73,12 +73,14 @@ def make_folder(path: Path) -> None:
 def write_file(path: Path, data: bytes, mode: int = 0o644) -> None:
     """Put `data` under `path`, replacing what was there, whole or not at all. Raises OSError."""
 
-    def fill(fd: int) -> None:
-        view = memoryview(data)
-        while view:
-            view = view[os.write(fd, view) :]
+    fill_file(path, lambda fd: write_all(fd, data), mode)
 
-    fill_file(path, fill, mode)
+
+def write_all(fd: int, data: bytes | memoryview) -> None:
+    """Write all of `data` where the descriptor stands. Raises OSError."""
+    view = memoryview(data)
+    while view:
+        view = view[os.write(fd, view) :]
 
 
 def copy_in(source_fd: int, size: int, path: Path) -> str:
@@ -185,30 +187,34 @@ def pieces(fd: int, size: int) -> Iterator[memoryview]:
         done += got
 
 
-def fill_file(path: Path, fill: Callable[[int], None], mode: int = 0o644) -> None:
-    """`write_file` where `fill` writes into a descriptor; what it raises leaves `path` as it was. Raises OSError."""
+def fill_file(path: Path, fill: Callable[[int], None], mode: int = 0o644, *, folder: int | None = None) -> None:
+    """`write_file` where `fill` writes into a descriptor; what it raises leaves `path` as it was. `folder`: the
+    descriptor of the open folder that `path` is relative to. Raises OSError."""
     part = temporary(path)
     try:
-        fd = _new(part, mode)
+        fd = _new(part, mode, folder)
         try:
             fill(fd)
             os.fsync(fd)
         finally:
             os.close(fd)
-        os.replace(part, path)
-        sync_folder(path.parent)
+        os.replace(part, path, src_dir_fd=folder, dst_dir_fd=folder)
+        if folder is None:
+            sync_folder(path.parent)
+        else:
+            os.fsync(folder)
     except BaseException:
         with contextlib.suppress(OSError):
-            os.unlink(part)
+            os.unlink(part, dir_fd=folder)
         raise
 
 
-def _new(part: Path, mode: int) -> int:
+def _new(part: Path, mode: int, folder: int | None) -> int:
     """Make a temporary file and open it; what an earlier attempt left, or somebody put there, is removed first: a pipe
     would be waited for, a file that has a second name be changed under that too."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _NOFOLLOW | _CLOEXEC
     try:
-        return os.open(part, flags, mode)
+        return os.open(part, flags, mode, dir_fd=folder)
     except FileExistsError:
-        os.unlink(part)
-        return os.open(part, flags, mode)
+        os.unlink(part, dir_fd=folder)
+        return os.open(part, flags, mode, dir_fd=folder)

@@ -128,15 +128,15 @@ def test_a_power_cut_at_any_step_of_a_verb_can_be_finished(folder: Path, name: s
     assert states > 20
 
 
-IMPORTS = "import os; from types import SimpleNamespace; from dappled.flight import read_back, trees"
-NO_FSYNC = "SimpleNamespace(**{**vars(os), 'fsync': lambda fd: None})"
+IMPORTS = "import os, types; from dappled import durable; from dappled.flight import read_back, trees"
+NO_FSYNC = "types.SimpleNamespace(**{**vars(os), 'fsync': lambda fd: None})"
 
 
 @pytest.mark.parametrize(
     ("name", "forgotten"),
     [
-        ("offload", f"trees.os = {NO_FSYNC}; read_back.os = {NO_FSYNC}"),
-        pytest.param("offload", "trees.Tree.sync = lambda self: None", marks=pytest.mark.slow),
+        ("offload", f"durable.os = {NO_FSYNC}; trees.os = {NO_FSYNC}; read_back.os = {NO_FSYNC}"),
+        pytest.param("offload of what is there already", "trees.Tree.sync = lambda self: None", marks=pytest.mark.slow),
         pytest.param("offload of what is there already", f"read_back.os = {NO_FSYNC}", marks=pytest.mark.slow),
     ],
 )

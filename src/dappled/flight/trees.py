@@ -23,7 +23,6 @@ _CLOEXEC, _HERE, _NONBLOCK = (getattr(os, name, 0) for name in ("O_CLOEXEC", "O_
 """Flags that Windows lacks. It has no `dir_fd` either: a Tree can't be opened there, but light fields can be read."""
 _FOLDER = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | _HERE | _CLOEXEC
 _READ = os.O_RDONLY | _HERE | _NONBLOCK | _CLOEXEC
-_WRITE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _HERE | _CLOEXEC
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,26 +133,15 @@ class Tree:
                 return None
 
     def write(self, name: str, pieces: Iterable[bytes | memoryview]) -> None:
-        """Put a file under a name, whole or not at all; `sync` makes the name durable. Raises FlightError."""
+        """Put a file under a name, durably, whole or not at all. Raises FlightError."""
         parent, last = self._at(name)
-        part = durable.temporary(Path(last)).name
-        self.remove_part(name)
+
+        def fill(fd: int) -> None:
+            for piece in pieces:
+                durable.write_all(fd, piece)
+
         with self._saying("write", name):
-            try:
-                fd = os.open(part, _WRITE, 0o644, dir_fd=parent)
-                try:
-                    for piece in pieces:
-                        view = memoryview(piece)
-                        while view:
-                            view = view[os.write(fd, view) :]
-                    os.fsync(fd)
-                finally:
-                    os.close(fd)
-                os.rename(part, last, src_dir_fd=parent, dst_dir_fd=parent)
-            except BaseException:
-                with contextlib.suppress(OSError):
-                    os.unlink(part, dir_fd=parent)
-                raise
+            durable.fill_file(Path(last), fill, folder=parent)
 
     def remove_part(self, name: str) -> None:
         """Remove what an attempt to write a file left half-written, if there is something. Raises FlightError."""

@@ -1,7 +1,7 @@
 """Bring a file's bytes to another folder, and prove that they are on the disk there.
 
-This is the one way to another disk: written whole under a temporary name, fsynced, renamed, read back past the page
-cache, and compared. The caller syncs the folders (`Tree.sync`) before it relies on the names.
+This is the one way to another disk: written whole under a temporary name, fsynced, renamed, the folder fsynced, then
+read back past the page cache and compared. The caller syncs the folders of what was there already (`Tree.sync`).
 """
 
 from __future__ import annotations

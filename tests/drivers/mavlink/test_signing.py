@@ -159,9 +159,9 @@ class Disk:
             self.calls.append("folder" if stat.S_ISDIR(facts.st_mode) else facts.st_size)
             fsync(fd)
 
-        def watched_rename(old: Path, new: Path) -> None:
+        def watched_rename(old: Path, new: Path, **folders: int | None) -> None:
             self.calls.append("rename")
-            rename(old, new)
+            rename(old, new, **folders)
 
         monkeypatch.setattr(os, "fsync", watched_fsync)
         monkeypatch.setattr(os, "replace", watched_rename)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,9 +39,7 @@ class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
             packets = (packet for _, _, packet in log_reading.read_telemetry(folder.telemetry, doubts.append))
             for data in recorded.stream(packets):
                 size += len(data)
-                view = memoryview(data)
-                while view:
-                    view = view[os.write(fd, view) :]
+                durable.write_all(fd, data)
                 kinds.update(message.kind for message in stream.feed(data))
             if not size:
                 raise FlightError(
