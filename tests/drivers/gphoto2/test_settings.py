@@ -4,6 +4,7 @@ from typing import Any
 
 import pytest
 
+from dappled import codec
 from dappled.drivers.camera import CameraError
 from dappled.drivers.gphoto2.settings import GPhoto2Settings, Timeouts, parse_settings
 
@@ -15,7 +16,7 @@ def test_an_empty_table_is_a_working_camera() -> None:
 
 def test_settings_survive_encoding() -> None:
     settings = GPhoto2Settings("usb:", "123", "ram", True, Timeouts(busy_s=1.5))
-    assert parse_settings(settings.to_json()) == settings
+    assert parse_settings(codec.plain(settings)) == settings
 
 
 @pytest.mark.parametrize(

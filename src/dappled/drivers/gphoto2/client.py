@@ -7,7 +7,6 @@ answering, and starts it again, at most five times a minute.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import os
 import subprocess
@@ -16,6 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
+from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.drivers import usb_bus
 from dappled.drivers.attribution import Claim
@@ -68,8 +68,8 @@ def spawn_process(settings: GPhoto2Settings, carryover: Carryover) -> tuple[subp
     """Start the camera's process; it dies with the calling thread. Raises OSError."""
     return start_child(
         "dappled.drivers.gphoto2.process",
-        json.dumps(settings.to_json()),
-        json.dumps(carryover.to_json()),
+        codec.canonical(settings).decode(),
+        codec.canonical(carryover).decode(),
         environment=NO_HOME,
     )
 

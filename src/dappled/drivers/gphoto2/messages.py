@@ -7,28 +7,21 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import get_args
 
 from dappled import codec
 from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
-    Blob,
     BodyState,
     CameraEvent,
     Companion,
-    Deferred,
-    Fired,
-    Identity,
-    Noticed,
-    Setting,
     SettingsChanged,
     ShotFailed,
     StateChanged,
 )
 from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel
-from dappled.findings import Finding
 
 LATE_LIMIT = 16
 """How many late shots are remembered."""
@@ -38,6 +31,8 @@ _SEND_S = 5.0
 
 
 SeenFile = tuple[str, str, int, int | None]
+_KIND = "is"  # beside an event's own values
+_EVENTS: Mapping[str, type[CameraEvent]] = {one.__name__: one for one in get_args(CameraEvent)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,17 +68,6 @@ class Carryover:
     def died(self, fired: Iterable[Claim]) -> Carryover:
         """After the end of the process, which had fired these shots and brought no file of them."""
         return replace(self, late=(*self.late, *fired)[-LATE_LIMIT:])
-
-    def to_json(self) -> dict[str, Any]:
-        """Convert to plain values."""
-        return asdict(self)
-
-    @classmethod
-    def of_json(cls, value: Mapping[str, Any]) -> Carryover:
-        """Read what `to_json` made."""
-        late = tuple(Claim(**each) for each in value["late"])
-        seen = tuple((folder, name, size, taken_s) for folder, name, size, taken_s in value["seen"])
-        return cls(value["serial"], late, tuple(value["offsets_s"]), seen, value["since_ns"])
 
 
 class EventSender:
@@ -131,24 +115,8 @@ def _instead(event: CameraEvent, error: MessageSizeError) -> CameraEvent:
 
 def event_message(event: CameraEvent) -> ChannelMessage:
     """Encode an event; a file's blob is the message's only descriptor, which the caller still owns."""
-    match event:
-        case StateChanged(state, reason, at_ns, identity):
-            who = None if identity is None else asdict(identity)
-            return ChannelMessage({"is": "state", "state": state, "reason": reason, "ns": at_ns, "identity": who})
-        case Fired(shot, called_ns, returned_ns):
-            return ChannelMessage({"is": "fired", "shot": shot, "called_ns": called_ns, "returned_ns": returned_ns})
-        case ShotFailed(shot, reason, at_ns) | Deferred(shot, reason, at_ns):
-            kind = "failed" if isinstance(event, ShotFailed) else "deferred"
-            return ChannelMessage({"is": kind, "shot": shot, "reason": reason, "ns": at_ns})
-        case Noticed(found, at_ns):
-            return ChannelMessage({"is": "noticed", "finding": codec.plain(found), "ns": at_ns})
-        case SettingsChanged(settings, at_ns, refused):
-            each = [asdict(one) for one in settings]
-            return ChannelMessage({"is": "settings", "settings": each, "ns": at_ns, "refused": refused})
-        case Arrival(shot_or_none, name, blob, at_ns, facts) | Companion(shot_or_none, name, blob, at_ns, facts):
-            kind = "arrival" if isinstance(event, Arrival) else "companion"
-            body = {"is": kind, "shot": shot_or_none, "name": name, "size": blob.size, "ns": at_ns}
-            return ChannelMessage({**body, "facts": dict(facts)}, (blob.fd,))
+    fds = (event.blob.fd,) if isinstance(event, Arrival | Companion) else ()
+    return ChannelMessage({_KIND: type(event).__name__, **codec.plain(event)}, fds)
 
 
 def lost_file(message: ChannelMessage) -> tuple[int | None, str]:
@@ -161,7 +129,7 @@ def lost_file(message: ChannelMessage) -> tuple[int | None, str]:
         folder, name = body["facts"].get("folder"), body["facts"].get("name")
         stays = "" if folder in (None, "/") else f"; it stays on the card as {folder}/{name}"
         reason = f"{body['name']} could not be received: {message.lost}{stays}"
-        return body["shot"] if body["is"] == "arrival" else None, reason
+        return body["shot"] if body[_KIND] == Arrival.__name__ else None, reason
     except (KeyError, AttributeError) as error:
         raise ChannelError(f"a message could not be understood: {error!r}") from error
 
@@ -169,31 +137,13 @@ def lost_file(message: ChannelMessage) -> tuple[int | None, str]:
 def message_event(message: ChannelMessage) -> CameraEvent:
     """Decode an event. Raises ChannelError for anything else, and closes the message's descriptors then."""
     try:
-        return _event(message.body, message.fds)
+        values = dict(message.body)
+        kind = _EVENTS[values.pop(_KIND)]
+        if "blob" in values:
+            (fd,) = message.fds
+            values["blob"] |= {"fd": fd}
+        return codec.read(kind, values)
     except (KeyError, TypeError, ValueError) as error:
         for fd in message.fds:
             os.close(fd)
         raise ChannelError(f"a message could not be understood: {error!r}") from error
-
-
-def _event(body: Mapping[str, Any], fds: tuple[int, ...]) -> CameraEvent:
-    match body["is"]:
-        case "state":
-            who = None if body["identity"] is None else Identity(**body["identity"])
-            return StateChanged(body["state"], body["reason"], body["ns"], who)
-        case "fired":
-            return Fired(body["shot"], body["called_ns"], body["returned_ns"])
-        case "failed" | "deferred" as kind:
-            ended = ShotFailed if kind == "failed" else Deferred
-            return ended(body["shot"], body["reason"], body["ns"])
-        case "settings":
-            read = tuple(Setting(each["name"], each["value"], tuple(each["choices"])) for each in body["settings"])
-            return SettingsChanged(read, body["ns"], body["refused"])
-        case "noticed":
-            return Noticed(codec.read(Finding, body["finding"]), body["ns"])
-        case "arrival" | "companion" as kind:
-            (fd,) = fds
-            made = Arrival if kind == "arrival" else Companion
-            return made(body["shot"], body["name"], Blob(fd, body["size"]), body["ns"], body["facts"])
-        case other:
-            raise ValueError(f"unknown event {other!r}")

@@ -12,7 +12,6 @@ order.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import signal
 import socket
@@ -20,6 +19,7 @@ import sys
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 
+from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.drivers.attribution import true_name
 from dappled.drivers.camera import Arrival, BodyState, SettingName, SettingsChanged, ShotFailed, StateChanged
@@ -38,7 +38,7 @@ from dappled.drivers.gphoto2.protocol import (
     SettingTurned,
 )
 from dappled.drivers.gphoto2.session import open_session
-from dappled.drivers.gphoto2.settings import GPhoto2Settings, parse_settings
+from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.gphoto2.state import CameraState
 from dappled.drivers.gphoto2.viewfinder import Viewfinder
 from dappled.shown import guard_output
@@ -321,7 +321,9 @@ def main() -> None:
     _silence_library()
     guard_output()
     channel = ProcessChannel(socket.socket(fileno=int(fd)))
-    loop = CameraLoop(channel, parse_settings(json.loads(settings)), carryover=Carryover.of_json(json.loads(carryover)))
+    loop = CameraLoop(
+        channel, codec.read_json(GPhoto2Settings, settings), carryover=codec.read_json(Carryover, carryover)
+    )
     try:
         loop.run()
     except ChannelError:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from dappled.drivers.camera import CameraError, check_options
@@ -46,10 +46,6 @@ class GPhoto2Settings:
     capture_target: CaptureTarget = "card"
     delete_after_download: bool = False
     timeouts: Timeouts = field(default_factory=Timeouts)
-
-    def to_json(self) -> dict[str, Any]:
-        """Convert to plain values; `parse_settings` reads them back."""
-        return asdict(self)
 
 
 def parse_settings(settings: Mapping[str, Any]) -> GPhoto2Settings:
