@@ -246,6 +246,41 @@ def test_a_frame_that_changes_between_copy_and_prune_stays(
     assert frames(closed) == ["000001.cr2"]
 
 
+PROVED = {
+    "frames/000000.cr2": "is not the file any more that was read back: frames/000000.cr2 stays here",
+    "flight.sqlite": "changed while it was checked: nothing was removed",
+    "seals.jsonl": "changed while it was checked: nothing was removed",
+}
+
+
+@pytest.mark.parametrize("name", PROVED)
+@pytest.mark.parametrize("change", ["bytes", "another file", "cut off"])
+def test_a_copy_that_changes_after_it_was_proved_counts_for_nothing(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, change: str
+) -> None:
+    """A server or another program writes there once more, between the proof and the first removal."""
+    whole = check
+    copy = tmp_path / "disk" / closed.name / name
+
+    def meanwhile(path: Path) -> object:
+        found = whole(path)
+        stamp, data = copy.stat(), copy.read_bytes()
+        if change == "bytes":
+            flip(copy, 3)
+        elif change == "cut off":
+            os.truncate(copy, len(data) - 1)
+        else:
+            copy.unlink()
+            copy.write_bytes(data)
+        os.utime(copy, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+        return found
+
+    monkeypatch.setattr(checks, "check", meanwhile)
+    with pytest.raises(FlightError, match=PROVED[name]):
+        go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
+
+
 def test_what_is_there_already_is_read_back_from_the_disk_too(
     closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
