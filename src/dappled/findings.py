@@ -280,6 +280,7 @@ class Code(StrEnum):
     TIME_IMPOSSIBLE = "time.impossible"
     TIME_MACHINE_DIFFERS = "time.machine_differs"
     TIME_PUT_RIGHT = "time.put_right"
+    TIME_RECEIVERS_DIFFER = "time.receivers_differ"
     TIME_TRIGGER_UNUSABLE = "time.trigger_unusable"
     TIME_WEEK_MENDED = "time.week_mended"
     TIME_WEEK_ROLLOVER = "time.week_rollover"

@@ -165,6 +165,23 @@ def test_of_two_receivers_with_a_fix_the_one_in_use_counts(tmp_path: Path) -> No
     assert all(same_fix(here, there) for here, there in zip(poses(log), poses(link), strict=True))
 
 
+@pytest.mark.parametrize("off_ms", [-37_000, 0, 18_000])
+def test_a_receiver_whose_utc_contradicts_that_which_counts_is_told(tmp_path: Path, off_ms: int) -> None:
+    """A 3D fix, heard first, beside one by RTK."""
+    log, link = written(tmp_path)
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        other = (row[0], 0, 3, row[3] + off_ms, *row[4:])
+        return [(kind, other), (kind, (row[0], 1, *row[2:]))] if kind == "GPS" else [(kind, row)]
+
+    told = found_in(rewritten(log, change))
+    assert [(one.code, one.facts["receiver"]) for one in told] == [
+        (Code.LOG_RECEIVER_BETTER, 2),
+        *([(Code.TIME_RECEIVERS_DIFFER, 1)] if off_ms else []),
+    ]
+    assert all(away_m(here, there) < 0.01 for here, there in zip(poses(log), poses(link), strict=True))
+
+
 @pytest.mark.parametrize("said", [True, False])
 def test_the_core_that_flew_counts(tmp_path: Path, said: bool) -> None:
     """By XKF4, else by what agrees with the positions: the first core has gone astray."""

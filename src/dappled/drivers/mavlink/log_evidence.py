@@ -33,6 +33,8 @@ _HIGHEST_DOP = 600.0
 _EXTRAPOLATED = 8  # of PX4; MAVLink's 8 is another
 _GAP_US = 1_000_000  # a velocity further away is not that of a position
 _DAY_US = 86400 * 10**6
+_ONE_UTC_US = 900_000  # two receivers' times differ by less: a message is logged some time after it holds
+_LAST = 25
 Chosen = NDArray[np.bool_]
 
 
@@ -198,11 +200,12 @@ def chosen(path: Path, receivers: Sequence[Receiver]) -> tuple[list[tuple[Receiv
 def utc_clock(
     path: Path, ranked: Sequence[tuple[Receiver, Chosen]], others: Sequence[Receiver], bounds: UtcBounds | None
 ) -> tuple[LogClock, list[Finding]]:
-    """The autopilot's clock by the receiver that counts; by another one where that one told no UTC that can be true.
-    Raises AutopilotLogError without any."""
+    """The autopilot's clock by the receiver that counts; where that one told no UTC that can be true, by the best other
+    one. Raises AutopilotLogError without any."""
     bounds = bounds or UtcBounds.of_log(TimeOfDayClock().utc_ns())
     doubted: tuple[LogClock, list[Finding]] | None = None
     any_fix = False
+    others = sorted(others, key=Receiver._rank, reverse=True)
     of_others = [[(one, np.ones(len(one.boots_us), dtype=bool))] for one in others]
     for group in (ranked, *of_others):
         rows = [(one, which & one.fixed) for one, which in group]
@@ -223,7 +226,7 @@ def utc_clock(
         if clock.step_us:
             told.append(finding(Code.TIME_PUT_RIGHT, Subject("log", str(path)), off_s=clock.step_us / 1e6))
         if wanted is not Date.ROLLED_OVER:
-            return clock, told
+            return clock, [*told, *_contradicting(path, clock, others, bounds)]
         doubted = doubted or (clock, told)
     if doubted is not None:
         return doubted
@@ -232,6 +235,18 @@ def utc_clock(
             f"{path} holds fixes of a satellite receiver, but no date that can be true: its time in UTC is not known"
         )
     raise AutopilotLogError(f"{path} holds no fix of a satellite receiver: its time in UTC is not known")
+
+
+def _contradicting(path: Path, clock: LogClock, others: Sequence[Receiver], bounds: UtcBounds) -> Iterator[Finding]:
+    """The receivers with a fix whose UTC is another one than the clock's at the end of what they say."""
+    for one in others:
+        boots_us, utc_us, later_us = (each[one.fixed] for each in (one.boots_us, one.utc_us, one.later_us))
+        date, true_us, _ = _dated(path, utc_us - boots_us, utc_us, later_us, bounds)
+        last = np.flatnonzero((true_us > 0) & (date is Date.TRUE))[-_LAST:]
+        if last.size and abs(off_us := int(np.median((true_us - boots_us)[last]) - clock.offsets_us[-1])) > _ONE_UTC_US:
+            yield finding(
+                Code.TIME_RECEIVERS_DIFFER, Subject("log", str(path)), receiver=one.number, off_s=off_us / 1e6
+            )
 
 
 def _dated(
