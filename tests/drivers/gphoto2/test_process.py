@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 
 from dappled.clock import RecordedClock
+from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
     Blob,
@@ -582,6 +583,23 @@ def test_a_process_that_never_saw_the_card_of_the_one_before_says_so_at_the_end(
     while (message := harness.channel.receive(0.0)) is not None:
         events.append(message_event(message))
     assert noticed(events) == [(Code.CARD_NOT_LISTED, "")]
+
+
+@pytest.mark.parametrize("owed", [True, False])
+def test_a_picture_that_the_count_calls_new_and_the_clock_old_is_not_passed_over(harness: Harness, owed: bool) -> None:
+    """The body's clock was set back and the process died before the file was announced."""
+    camera, now_ns = harness.camera, harness.clock.monotonic_ns()
+    for number, taken_s in ((3, 990), (4, 1000 - 3600)):
+        camera.adds(on_card(number), b"picture %d" % number, tells=False)
+        camera.taken[on_card(number)] = taken_s
+    late = (Claim(4, now_ns - 10**9),) if owed else ()
+    seen = ((FOLDER, on_card(3).name, len(camera.card[on_card(3)]), 990),)
+    before = Carryover(camera.identity.serial, late, (0.0,) * 4, seen, now_ns - 5 * 10**9)
+    harness.loop = CameraLoop(harness.loop_channel, GPhoto2Settings(), camera.open, harness.clock, before)
+    events = harness.turn()
+    name = f"{FOLDER}/{on_card(4).name}"
+    assert brought(events) == ([(None, b"picture 4", False)] if owed else [])
+    assert noticed(events) == ([] if owed else [(Code.PICTURE_ON_CARD, name)])
 
 
 def test_an_announced_file_on_a_card_that_was_taken_out_is_named(ready: Harness) -> None:

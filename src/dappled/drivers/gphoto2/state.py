@@ -251,8 +251,9 @@ class CameraState:
         only_recent = not self._card.is_listed
         strange = [file for file, facts in found.files.items() if not self._card.has(file, facts)]
         made = {file: self._made_since(found.files[file][1]) for file in strange}
-        if only_recent:  # where time says nothing, the camera's count may
-            made |= {file: self._card.is_newer(file) for file in strange if made[file] is None}
+        newer = [file for file in strange if only_recent and not made[file] and self._card.is_newer(file)]
+        owed = self.current is not None or bool(self._late)  # the body's clock may have been set before its file
+        made |= {file: True for file in newer if made[file] is None or owed}  # where time says nothing, the count may
         old = any(self._made_since(taken_s) is False for _, taken_s in found.files.values())
         if self._card.is_other(found, has_old=old and self._card.is_listed):
             only_recent = True
@@ -262,6 +263,8 @@ class CameraState:
             self._to_fetch |= {file: one for file, one in self._suspects.items() if file in found.files}
             unsure = [file for file in strange if not made[file] and file not in self._to_fetch]
             told += [_on_card(file, now_ns) for file in (unsure if len(unsure) <= LATE_LIMIT else ())]
+            newer = []
+        told += [_on_card(file, now_ns) for file in newer[:LATE_LIMIT] if not made[file]]
         told += [_on_card(file, now_ns) for file in self._cut_off if file not in found.files]
         fresh = [file for file in strange if made[file] or not only_recent]
         self._cut_off = ()
