@@ -7,13 +7,13 @@ neither does, work went on at both, and nothing is replaced.
 from __future__ import annotations
 
 import hashlib
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import durable
-from dappled.bounds.claims import ClaimError, check_size
+from dappled.bounds.claims import ClaimError
+from dappled.bounds.parsing import check_stored
 from dappled.flight import seals
 from dappled.flight.chain import Column
 from dappled.flight.checks import chain_check
@@ -137,12 +137,10 @@ def _content(tree: Tree, name: str) -> bytes:
     if tree.stat(name) is None:
         return b""
     with tree.reading(name) as fd:
-        found = os.fstat(fd)
         try:
-            check_size(found.st_size, durable.stored_bytes(fd), "content")
+            return b"".join(bytes(piece) for piece in durable.pieces(fd, check_stored(fd)))
         except ClaimError as error:
             raise FlightError(f"{tree.path / name} can't be read: {error}") from error
-        return b"".join(bytes(piece) for piece in durable.pieces(fd, found.st_size))
 
 
 def _proved(source: Tree, there: Tree, name: str, image: bytes) -> Proved:
