@@ -7,7 +7,7 @@ from dappled.decode.geometry import Gnss, GroundHeight, Pose
 from dappled.decode.lightfield.refocus import StereoPair
 from dappled.findings import Code, Finding, Level, Subject, Value
 from dappled.flight import Tag, TimeSource
-from dappled.products.opened import Opened, OpenedFlight, OpenedFrame, OpenedLightField
+from dappled.products.opened import Opened, OpenedFlight, OpenedFrame, OpenedLightField, SharpPicture
 
 __all__ = [
     "Code",
@@ -23,6 +23,7 @@ __all__ = [
     "OpenedFrame",
     "OpenedLightField",
     "Pose",
+    "SharpPicture",
     "StereoPair",
     "Subject",
     "Subscription",

@@ -36,6 +36,9 @@ def test_a_flight_is_its_frames(flown: Flown) -> None:
     assert frame.refocus(disparity=0.1).shape == frame.views.shape[2:4]
     depth = frame.depth("contrast", between=(-0.3, 0.5))
     assert depth.known_share() > 0.5
+    picture = frame.picture()
+    assert (picture.pixels.shape, picture.sigma.shape) == ((1388, 1844, 3), (1388, 1844))
+    assert frame.picture(colour=False).pixels.mean() == pytest.approx(float(picture.pixels[..., 1].mean()), rel=0.1)
     with pytest.raises(IndexError, match="has no safe frame of image index 999") as missing:
         flight[999]
     assert isinstance(missing.value, KeyError)

@@ -32,7 +32,9 @@ from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield import refocus as refocusing
 from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
 from dappled.decode.optics import Sensor
+from dappled.drivers.raw import developing
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, of_flight
+from dappled.drivers.raw.picture_maker import PictureMaker
 from dappled.errors import DappledError, counted
 from dappled.findings import FRAME, Finding, told
 from dappled.flight import Tag, flight_report, layout
@@ -260,6 +262,19 @@ class OpenedLightField(Refocusable):
         light_files.save(Path(path), self.field, overwrite=overwrite)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class SharpPicture:
+    """A frame at the sensor's own resolution, the mask's shadow divided out.
+
+    `pixels` float32 (H, W), or (H, W, 3) in linear sRGB, 1.0 = white. `sigma` float32 (H, W) is the standard error of
+    the sensor's samples as a share of white, NaN where they are not trusted; `findings` are what was found, notes too.
+    """
+
+    pixels: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    findings: tuple[Finding, ...]
+
+
 @dataclass(frozen=True, repr=False)
 class OpenedFrame(Refocusable):
     """A raw frame, decoded once, by `light_field`. `tag` says when and where it was taken; None outside a flight."""
@@ -273,9 +288,24 @@ class OpenedFrame(Refocusable):
     @cached_property
     def light_field(self) -> OpenedLightField:
         """The decoded frame. Raises DappledError."""
-        length, stop = (None, None) if self.tag is None else (self.tag.focal_length_mm, self.tag.f_number)
+        length, stop = self._optics
         made = self.darkroom.decode(self.path, focal_length_mm=length, f_number=stop)
         return OpenedLightField(made.light_field, self.path, self.focus_m)
+
+    def picture(self, *, colour: bool = True) -> SharpPicture:
+        """Return the frame's picture with every pixel of the sensor; no light field is decoded for it. A frame of a
+        grey sensor has no `colour`. Raises DappledError, also behind lenslets."""
+        maker = PictureMaker(self.darkroom.recipe)
+        maker.check()
+        length, stop = self._optics
+        made = maker.picture(self.path, focal_length_mm=length, f_number=stop)
+        sigma = np.where(made.picture.trusted, made.picture.sigma, np.float32(np.nan))
+        return SharpPicture(developing.linear(made, colour=colour), sigma, made.findings)
+
+    @property
+    def _optics(self) -> tuple[float | None, float | None]:
+        """Focal length and f-number as the tag has them; None: as the file has."""
+        return (None, None) if self.tag is None else (self.tag.focal_length_mm, self.tag.f_number)
 
     def _decoded(self) -> OpenedLightField:
         return self.light_field
@@ -471,4 +501,13 @@ def _recipe(plain: Recipe, given: Mapping[str, Any], path: Path) -> Recipe:
     return made
 
 
-__all__ = ["DecodeError", "Opened", "OpenedFlight", "OpenedFrame", "OpenedLightField", "light_field", "open"]
+__all__ = [
+    "DecodeError",
+    "Opened",
+    "OpenedFlight",
+    "OpenedFrame",
+    "OpenedLightField",
+    "SharpPicture",
+    "light_field",
+    "open",
+]
