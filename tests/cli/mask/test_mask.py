@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +14,9 @@ from dappled.cli import main
 from tests.decode.thesis_tables import TABLE_11, TABLE_14_LENGTHS, TABLE_14_V
 
 
-def _json(words: list[str], capsys: pytest.CaptureFixture[str], code: int = 0) -> dict[str, object]:
+def _json(words: list[str], capsys: pytest.CaptureFixture[str], code: int = 0) -> dict[str, Any]:
     assert main([*words, "--json"]) == code
-    told: dict[str, object] = json.loads(capsys.readouterr().out)
+    told: dict[str, Any] = json.loads(capsys.readouterr().out)
     return told
 
 
@@ -100,6 +101,21 @@ def test_design_from_altitude_to_film(tmp_path: Path, capsys: pytest.CaptureFixt
     assert "frames per minute" in out
     assert "the lens of fujifilm-s5200 only stops down to f/8" in out
     assert "no shadow can be finer than the mask" in out
+
+
+def test_a_plan_says_what_one_frame_brings(capsys: pytest.CaptureFixture[str]) -> None:
+    """50 mm at f/7.4: f²/(N·Z) is 3.4 µm at 100 m, a third of a pixel; no relief is told from there."""
+    words = ["plan", "--camera", "reference-36mm", "--mask", "reference-5x5", "--speed", "8", "--f-number", "7.4"]
+    far = _json([*words, "--altitude", "100"], capsys)
+    assert far["ground_sample_m"] == pytest.approx(0.02, rel=0.01)
+    assert far["view_sample_m"] == pytest.approx(0.13, rel=0.05)
+    assert far["frame_depth"]["stop_px"] == pytest.approx(0.338, rel=0.01)
+    assert far["frame_depth"]["relief_px"] == pytest.approx(0.00338, rel=0.01)
+    assert far["frame_depth"]["sigma_m"] > 10
+    assert any(text.startswith("one frame tells no relief from 100 m") for text in far["warnings"])
+    near = _json([*words, "--altitude", "2"], capsys)
+    assert near["frame_depth"]["sigma_m"] == pytest.approx(far["frame_depth"]["sigma_m"] * (2 / 100) ** 2, rel=0.05)
+    assert not any(text.startswith("one frame tells") for text in near["warnings"])
 
 
 def test_design_knows_cover_glass_and_stops(capsys: pytest.CaptureFixture[str]) -> None:

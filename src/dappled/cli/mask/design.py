@@ -15,6 +15,7 @@ from dappled.cli.verb import Output, Overwriting, Report, Verb, option
 from dappled.config import profiles
 from dappled.decode.optics import MaskedOptics, carrier_tables
 from dappled.decode.optics.film import FILMS
+from dappled.decode.optics.lenses import SHIFT_SIGMA_PX
 from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
 from dappled.decode.spectrum import pictures
 
@@ -38,7 +39,7 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         "--room", "largest distance of the mask from the sensor", None, metavar="MM", otherwise="10",
     )  # fmt: skip
     wavelength: float = option("--wavelength", "wavelength of the light", 550.0, unit="nm")
-    shift_error: float = option("--shift-error", "σ of a measured shift between views", 0.02, unit="px")
+    shift_error: float = option("--shift-error", "σ of a measured shift between views", SHIFT_SIGMA_PX, unit="px")
     mask: str | None = option("--mask", "print the best focal length of this installed mask instead", None)
     picture: Path | None = option("--picture", "draw the carriers on the spectrum", None, metavar="FILE.png")
 
@@ -127,6 +128,7 @@ def _lines(made: Design, instead: Design | None) -> list[str]:
         f"distance   {made.mask_distance_mm:.3f} mm before the sensor",
         f"aperture   {wanted.aperture_mm:.2f} mm (f/{wanted.f_number:g}), {made.baseline_mm:.2f} mm from view to view",
         f"a view     ±{made.bandwidth_per_mm:.2f} cycles/mm, {made.ground_sample_m * 100:.1f} cm of ground per pixel",
+        f"picture    {made.picture_sample_m * 100:.2g} cm of ground per pixel (dappled picture)",
         f"spectrum   {100 * made.spectrum_used:.{0 if made.spectrum_used >= 0.01 else 2}f} % used",
         (
             f"depth      ±{made.depth_sigma_m:.2g} m at {wanted.altitude_m:g} m, "

@@ -11,7 +11,10 @@ from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode.optics import MaskedOptics, carrier_tables, lenses
+from dappled.decode.optics.lenses import SingleFrameDepth
 from dappled.decode.optics.mask_design import SMALL_VIEW_PX
+
+_SHALLOW = 0.05  # of the altitude: a house is no higher
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -29,7 +32,10 @@ class PlanFlight(AltitudeArguments, Verb):
     exposure: float = option("--exposure", "exposure time", 0.001, unit="s")
     hours: float = option("--hours", "flight time", 1.0, unit="h")
     frame_mb: float = option("--frame-mb", "size of a raw file", 18.0, unit="MB", low=1e-3, high=10_000)
-    mask: str | None = option("--mask", "mask profile, for the ground sample distance of the views", None)
+    mask: str | None = option("--mask", "mask profile, for what its views and one frame's depth are worth", None)
+    f_number: float | None = option(
+        "--f-number", "f-number of the lens", None, above=0.0, otherwise="the mask's ideal one",
+    )  # fmt: skip
     sideways: bool = flag("--sideways", "the width of the frame, not its height, lies along the flight line")
 
     def check(self) -> None:
@@ -41,12 +47,23 @@ class PlanFlight(AltitudeArguments, Verb):
     def run(self, output: Output) -> Report:
         """Plan a flight."""
         camera, sensor, length = self.camera_set()
-        columns, warnings = None, list[str]()
+        columns, warnings, depth = None, list[str](), None
         if self.mask:
             optics = MaskedOptics(sensor, profiles.mask(self.mask).mask, camera.law, camera.mask_distance_mm)
             size = carrier_tables.slice_size(carrier_tables.lattice_of(optics, length), sensor.shape)
             columns = size[1] if size else None
             warnings = list(_warnings(camera, optics, length))
+            if columns is not None:
+                width_mm, ideal = sensor.size_mm[1], optics.mask.frequency_per_mm * optics.distance_mm
+                depth = lenses.frame_depth(
+                    focal_length_mm=length,
+                    f_number=self.f_number or ideal,
+                    distance_m=self.altitude,
+                    pixel_mm=width_mm / sensor.shape[1],
+                    view_pixel_mm=width_mm / columns,
+                    views=optics.mask.views_per_axis,
+                )
+                warnings += _shallow(depth, self.altitude)
         made = lenses.plan_survey(
             sensor,
             focal_length_mm=length,
@@ -60,20 +77,42 @@ class PlanFlight(AltitudeArguments, Verb):
             view_columns=columns,
             sideways=self.sideways,
         )
-        views = "" if made.view_sample_m is None else f", {made.view_sample_m * 100:.1f} cm per pixel of a view"
+        views = "" if made.view_sample_m is None else f" of the picture, {made.view_sample_m * 100:.1f} cm of a view"
         lines = [
             f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight",
             f"ground     {made.ground_sample_m * 100:.2f} cm per pixel{views}",
+            *(() if depth is None else [_depth_line(depth)]),
             f"interval   {made.interval_s:.2f} s, {made.spacing_m:.2f} m; lines {made.line_m:.1f} m apart",
             f"body       must sustain {made.frames_per_minute:.1f} frames per minute",
             f"blur       {made.blur_px:.2f} px; one pixel at {made.longest_exposure_s * 1e3:.2f} ms",
             f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB, on the card and again on the disk",
             *(f"warning: {warning}" for warning in warnings),
         ]
-        return Report({**codec.plain(made), "warnings": warnings}, lines)
+        said = {**codec.plain(made), "frame_depth": codec.plain(depth), "warnings": warnings}
+        return Report(said, lines)
 
 
 CLASSES = {"plan": PlanFlight, "mask plan": PlanFlight}
+
+
+def _depth_line(depth: SingleFrameDepth) -> str:
+    """What one frame tells of heights."""
+    return (
+        f"one frame  over the stop (f/{depth.f_number:.3g}) the ground moves by {depth.stop_px:.2g} px, a metre of "
+        f"relief by {depth.relief_px:.2g} px more; a height is known to ±{_two_digits(depth.sigma_m)} m"
+    )
+
+
+def _two_digits(value: float) -> str:
+    return f"{float(f'{value:.2g}'):g}"
+
+
+def _shallow(depth: SingleFrameDepth, altitude_m: float) -> Iterator[str]:
+    if depth.sigma_m > _SHALLOW * altitude_m:
+        yield (
+            f"one frame tells no relief from {altitude_m:g} m (±{_two_digits(depth.sigma_m)} m): it brings a picture; "
+            "heights come from overlapping frames (dappled georeference --as terrain)"
+        )
 
 
 def _warnings(camera: CameraProfile, optics: MaskedOptics, focal_length_mm: float) -> Iterator[str]:

@@ -86,6 +86,32 @@ def ground_sample_m(pitch_mm: float, focal_length_mm: float, altitude_m: float) 
     return pitch_mm * altitude_m / image_distance_mm(focal_length_mm, altitude_m)
 
 
+SHIFT_SIGMA_PX = 0.02  # of a view: a good matcher's error of a shift from view to view
+
+
+@dataclass(frozen=True, slots=True)
+class SingleFrameDepth:
+    """What one frame tells of depth from a distance. `stop_px` is how far the picture of a place moves over the whole
+    stop, pixels of the frame (against infinity: what blurs it where the lens is focused there), `relief_px` what a
+    metre of relief adds to it, `sigma_m` the standard error of a distance (Eq 5)."""
+
+    f_number: float
+    stop_px: float
+    relief_px: float
+    sigma_m: float
+
+
+def frame_depth(
+    *, focal_length_mm: float, f_number: float, distance_m: float, pixel_mm: float, view_pixel_mm: float, views: int
+) -> SingleFrameDepth:
+    """The depth in one frame of `views` a side, whose pixels are as large on the sensor as told. Raises DecodeError."""
+    within("f-number", f_number, "", 0.5, 1000)
+    aperture_mm, image_mm = focal_length_mm / f_number, image_distance_mm(focal_length_mm, distance_m)
+    stop_px = aperture_mm * image_mm / (1e3 * distance_m) / pixel_mm
+    sigma_m = depth_sigma_m(distance_m, image_mm, aperture_mm / views, SHIFT_SIGMA_PX * view_pixel_mm)
+    return SingleFrameDepth(f_number, stop_px, stop_px / distance_m, sigma_m)
+
+
 @dataclass(frozen=True, slots=True)
 class SurveyPlan:
     """A flight over flat ground. Along is the direction of flight, the frame's rows unless it flies sideways.

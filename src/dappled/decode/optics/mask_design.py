@@ -20,7 +20,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carrier_tables import beyond_mask, fresnel_number, lattice_of
 from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Sensor
 from dappled.decode.optics.film import FILMS, Film
-from dappled.decode.optics.lenses import depth_sigma_m, ground_sample_m, image_distance_mm, within
+from dappled.decode.optics.lenses import SHIFT_SIGMA_PX, depth_sigma_m, ground_sample_m, image_distance_mm, within
 
 FRESNEL_LIMIT = 0.25  # of λ·d·(p·f_m)²: diffraction then leaves cos(π/4) = 0.71 of the contrast
 LEAST_VIEW_PX, SMALL_VIEW_PX = 16, 64  # a side: below the first a view is no picture, below the second a poor one
@@ -44,7 +44,7 @@ class DesignRequirements:
     film: Film
     views: int = 5
     wavelength_nm: float = 550.0
-    shift_sigma_px: float = 0.02
+    shift_sigma_px: float = SHIFT_SIGMA_PX
     mask_distance_mm: float | None = None
     largest_distance_mm: float = 10.0
     least_distance_mm: float = 0.0
@@ -110,7 +110,7 @@ class Design:
 
     `view_shape` (rows, columns) of one view, `bandwidth_per_mm` (±, on the sensor) of one view, `spectrum_used` the
     share of the frame's spectrum that slices cover, `baseline_mm` between neighbouring views on the aperture,
-    `depth_sigma_m` at the altitude (Eq 5), `ground_sample_m` of a view,
+    `depth_sigma_m` at the altitude (Eq 5), `ground_sample_m` of a view, `picture_sample_m` of the picture,
     `films` the formats of Table 2 that can print it. `warnings` say what a working design is still bad at.
     """
 
@@ -125,6 +125,7 @@ class Design:
     baseline_mm: float
     depth_sigma_m: float
     ground_sample_m: float
+    picture_sample_m: float
     film_period_px: float
     films: tuple[str, ...]
     problem: str | None
@@ -236,6 +237,9 @@ def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float
         baseline_mm=baseline,
         depth_sigma_m=depth_sigma_m(wanted.altitude_m, wanted.image_mm, baseline, wanted.shift_sigma_px * pitch_mm),
         ground_sample_m=ground_sample_m(pitch_mm, wanted.focal_length_mm, wanted.altitude_m),
+        picture_sample_m=ground_sample_m(
+            wanted.sensor.size_mm[1] / wanted.sensor.shape[1], wanted.focal_length_mm, wanted.altitude_m
+        ),
         film_period_px=min(wanted.film.px_per_mm) / mask.frequency_per_mm,
         films=tuple(name for name, film in FILMS.items() if _prints(film, wanted, mask)),
         problem=problem,
