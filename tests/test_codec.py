@@ -37,15 +37,22 @@ from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Cause, Frame, Result, Shot, Stray, Tag
 from dappled.flight.pruning import Removed
+from dappled.flight.records import Judgement
 from dappled.flight.seals import Seal
 from dappled.products.batch.batch import Done
+from dappled.products.handover.view_cameras import FrameCameras, ViewCamera
 
 _ALL = (
-    Carryover, Cause, Done, Finding, Frame, GPhoto2Settings, LatticeFit, LawDecision, Mask, MaskPlace, Names,
-    PictureFacts, Pose, Ranging, Recipe, Removed, Result, Seal, Sensor, Shot, Stray, SweptDistance, Tag,
+    Carryover, Cause, Done, Finding, Frame, FrameCameras, GPhoto2Settings, Judgement, LatticeFit, LawDecision, Mask,
+    MaskPlace, Names, PictureFacts, Pose, Ranging,
+    Recipe, Removed, Result, Seal, Sensor, Shot, Stray, SweptDistance, Tag,
 )  # fmt: skip
 RECORDS: Mapping[str, type] = {one.__name__: one for one in _ALL}
+_TURN, _BENT = (0.5,) * 9, (0.5,) * 5
 OWN: Mapping[tuple[Any, str], Sequence[Any]] = {  # fields that take less than their type says
+    (FrameCameras, "camera_to_ned"): (_TURN,),
+    (FrameCameras, "distortion"): (_BENT,),
+    (FrameCameras, "views"): ((ViewCamera("a", (1.0, 2.0), (0.5, 0.5), (0.0, 0.1, 0.2)),),),
     (LawDecision, "law"): tuple(LAWS),
     (Ranging, "gain_px_m"): (0.25, 80.0),
 }

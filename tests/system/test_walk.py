@@ -86,10 +86,10 @@ def test_the_readme_leads_to_a_flight_report_with_a_simulated_450d(
         verdicts = [result.verdict for result in ledger.results().values()]
     assert len(verdicts) == 3
     unsure = [
-        found for found in verdicts if found is None or Code.FRAME_FOCUS_UNKNOWN in {one.code for one in found[1]}
+        found for found in verdicts if found is None or Code.FRAME_FOCUS_UNKNOWN in {one.code for one in found.reasons}
     ]
     assert len(unsure) <= 1, verdicts  # over faint ground a flight's first frame can't be told from a soft one
-    assert all(found is not None and found[0] != "bad" for found in verdicts), verdicts
+    assert all(found is not None and found.state != "bad" for found in verdicts), verdicts
     recorded = dappled.open(flight)
     assert isinstance(recorded, OpenedFlight)
     views = recorded[0].light_field.field.views

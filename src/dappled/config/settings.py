@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.config.schema import BadSetting, Rule, TomlSource, examine, read_toml, refuse, setting
 
 DEPTH_METHODS = ("contrast", "combined")
@@ -398,10 +399,8 @@ def of_tables(tables: Mapping[str, Any], name: str) -> Settings:
 
 def to_tables(settings: Settings) -> dict[str, Any]:
     """Settings as plain TOML values."""
-    return {
-        name: {k: list(value) if isinstance(value, tuple) else value for k, value in table.items() if value is not None}
-        for name, table in dataclasses.asdict(settings).items()
-    }
+    tables: dict[str, Any] = codec.table(settings)
+    return tables
 
 
 def describe() -> list[tuple[str, str, Any, Rule]]:

@@ -21,6 +21,7 @@ from dappled.flight.records import (
     NOTICED,
     REFUSED,
     Frame,
+    Judgement,
     LedgerEvent,
     Result,
     ShotRow,
@@ -37,9 +38,6 @@ class StoodFinding:
     finding: Finding
     began_utc_ns: int | None
     ended_utc_ns: int | None
-
-
-FrameVerdict = tuple[str, tuple[Finding, ...]]  # a frame's state, and why
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,25 +185,24 @@ def _stood(events: Iterable[LedgerEvent], correction_ns: int | None) -> tuple[St
     return tuple(stood)
 
 
-def _reasons(wanted: str, judged: Mapping[int, FrameVerdict], frames: Sequence[Frame]) -> tuple[Finding, ...]:
+def _reasons(wanted: str, judged: Mapping[int, Judgement], frames: Sequence[Frame]) -> tuple[Finding, ...]:
     """Why each frame has this verdict; none where the flight's frames were not judged."""
     if not judged:
         return ()
-    none: FrameVerdict = ("unknown", (finding(Code.FRAME_UNJUDGED, FRAME, why="not judged in flight"),))
-    each = ((frame.index, *judged.get(frame.index, none)) for frame in frames)
+    none = Judgement("unknown", (finding(Code.FRAME_UNJUDGED, FRAME, why="not judged in flight"),))
     return tuple(
-        replace(one, subject=Subject("frame", index))
-        for index, state, reasons in each
-        if state == wanted
-        for one in reasons
+        replace(one, subject=Subject("frame", frame.index))
+        for frame in frames
+        if (found := judged.get(frame.index, none)).state == wanted
+        for one in found.reasons
     )
 
 
-def _by_verdict(judged: Mapping[int, FrameVerdict], frames: int) -> dict[str, int]:
+def _by_verdict(judged: Mapping[int, Judgement], frames: int) -> dict[str, int]:
     """How many frames have each verdict; empty where the flight's frames were not judged."""
     if not judged:
         return {}
-    states = Counter(state for state, _ in judged.values())
+    states = Counter(one.state for one in judged.values())
     return {
         "good": states["good"],
         "usable": states["usable"],

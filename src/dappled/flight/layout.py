@@ -21,7 +21,7 @@ from typing import Any, Self
 
 import tomli_w
 
-from dappled import confined, durable, file_lock
+from dappled import codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_toml, read_log
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
@@ -241,7 +241,7 @@ def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:
 
 def facts_as_toml(facts: Mapping[str, Any]) -> bytes:
     """Encode facts as flight.toml holds them. Raises TypeError for a value that TOML can't hold."""
-    return tomli_w.dumps(_plain(facts)).encode()
+    return tomli_w.dumps(codec.table(facts)).encode()
 
 
 def read_facts(folder: FlightFolder) -> dict[str, Any]:
@@ -252,14 +252,6 @@ def read_facts(folder: FlightFolder) -> dict[str, Any]:
         raise disk_error("read", folder.settings, error) from error
     except ValueError as error:
         raise FlightError(f"{folder.settings} is not readable as TOML: {error}") from error
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items() if item is not None}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value if item is not None]
-    return str(value) if isinstance(value, os.PathLike) else value
 
 
 class LockHeldError(FlightError):

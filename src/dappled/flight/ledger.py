@@ -154,8 +154,6 @@ class LedgerReader(Database):
 
     def companions(self) -> list[Frame]:
         """Files beside frames, such as the JPEG of a raw frame; each has the index of its frame."""
-        if not self._rows("SELECT 1 FROM sqlite_master WHERE name = 'companions'"):
-            return []  # recorded by a version without companions
         columns = "idx, name, camera_name, size, sha256, arrived_utc_ns"
         return [Frame(*row) for row in self._rows(f"SELECT {columns} FROM companions ORDER BY name")]  # noqa: S608  constant
 

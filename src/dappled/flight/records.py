@@ -120,6 +120,15 @@ class ShotRow:
     fired_returned_monotonic_ns: int | None
 
 
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """How a frame was judged in flight: good, usable, bad or unknown; why it isn't good; by what it was judged."""
+
+    state: str
+    reasons: tuple[Finding, ...]
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
 @dataclass(frozen=True)
 class Result:
     """The result of decoding a frame. `run` is "live" for the flight itself; later runs have names of their own.
@@ -139,16 +148,14 @@ class Result:
     details: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Raises CodecError for a verdict with other reasons than findings."""
+        """Raises CodecError for a verdict that is none."""
         self.verdict  # noqa: B018  kept
 
     @cached_property
-    def verdict(self) -> tuple[str, tuple[Finding, ...]] | None:
+    def verdict(self) -> Judgement | None:
         """How the frame was judged in flight, and why; None where it was not."""
         found = self.details.get("verdict")
-        if not isinstance(found, Mapping) or not isinstance(found.get("reasons"), list):
-            return None
-        return str(found.get("state")), codec.read(tuple[Finding, ...], found["reasons"])
+        return None if found is None else codec.read(Judgement, found)
 
 
 @dataclass(frozen=True, slots=True)

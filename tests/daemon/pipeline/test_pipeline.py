@@ -253,9 +253,8 @@ def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> Non
         found = one.flight.ledger.result(0)
         assert found is not None
         assert found.verdict is not None
-        state, reasons = found.verdict
-        assert state == "unknown"
-        assert "could not be judged" in text(reasons[0])
+        assert found.verdict.state == "unknown"
+        assert "could not be judged" in text(found.verdict.reasons[0])
 
 
 def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path) -> None:

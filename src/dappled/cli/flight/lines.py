@@ -62,7 +62,7 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
         found = "-" if line.result.carriers_found is None else line.result.carriers_found
         words.append(f"{found}/{line.result.carriers_predicted} carriers")
         if line.result.verdict is not None:
-            words.append(line.result.verdict[0])
+            words.append(line.result.verdict.state)
     return "  ".join(words)
 
 

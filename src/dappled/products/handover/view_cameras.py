@@ -68,6 +68,12 @@ class FrameCameras:
     focus_m: float | None = None
     doubts: tuple[Finding, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for a frame without views, a rotation or a distortion of another size."""
+        sizes = len(self.camera_to_ned), len(self.distortion)
+        if not self.views or sizes != (9, 5):
+            raise ValueError(f"{len(self.views)} views, {sizes} numbers of rotation and distortion: not (9, 5)")
+
     def encoded(self) -> bytes:
         """The record as JSON."""
         return (json.dumps(codec.plain(self), indent=1, allow_nan=False) + "\n").encode()
@@ -168,41 +174,11 @@ def upright(matrix: Floats, name: str) -> tuple[tuple[float, float], Floats]:
 def decoded(data: bytes, where: str) -> FrameCameras:
     """A record that was written. Raises DappledError."""
     try:
-        row: dict[str, Any] = parse_json(data, _RECORD_BYTES)
-        views = tuple(
-            ViewCamera(
-                str(one["name"]),
-                (float(one["focal_px"][0]), float(one["focal_px"][1])),
-                (float(one["principal_px"][0]), float(one["principal_px"][1])),
-                (float(one["centre_m"][0]), float(one["centre_m"][1]), float(one["centre_m"][2])),
-            )
-            for one in row.pop("views")
-        )
-        rows, columns = row.pop("shape")
-        turn, distortion = row.pop("camera_to_ned"), row.pop("distortion")
-        doubts = codec.read(tuple[Finding, ...], row.pop("doubts", ()))
-        made = FrameCameras(
-            **row,
-            camera_to_ned=tuple(map(float, turn)),
-            shape=(int(rows), int(columns)),
-            distortion=tuple(map(float, distortion)),
-            views=views,
-            doubts=doubts,
-        )
-    except (ValueError, TypeError, KeyError, IndexError):
-        raise DappledError(f"{where} is no record of a frame's cameras: remove it, and run the batch again") from None
-    if not made.views or len(made.camera_to_ned) != 9 or len(made.distortion) != 5 or not _numbers(made):
-        raise DappledError(f"{where} is no record of a frame's cameras: remove it, and run the batch again")
-    return made
-
-
-def _numbers(made: FrameCameras) -> bool:
-    """Whether what is calculated with are numbers, or unknown where they may be."""
-    known = (made.latitude_deg, made.longitude_deg, made.altitude_m)
-    sigmas = (made.position_sigma_m, made.vertical_sigma_m, made.attitude_sigma_rad)
-    unknown = (made.height_m, made.utc_ns, *sigmas, made.aperture_m, made.aperture_sigma_m, made.focus_m)
-    given = (*known, *(value for value in unknown if value is not None))
-    return all(isinstance(value, int | float) and math.isfinite(value) for value in given)
+        return codec.read(FrameCameras, parse_json(data, _RECORD_BYTES))
+    except ValueError as error:
+        raise DappledError(
+            f"{where} is no record of a frame's cameras: remove it, and run the batch again ({error})"
+        ) from None
 
 
 def of_one_aperture(frames: Sequence[FrameCameras]) -> list[FrameCameras]:

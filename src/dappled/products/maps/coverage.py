@@ -100,7 +100,7 @@ def of_flight(
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
         results = ledger.results()
-    states = {index: one.verdict[0] for index, one in results.items() if one.verdict is not None}
+    states = {index: one.verdict.state for index, one in results.items() if one.verdict is not None}
     mounting = Mounting.of(layout.read_facts(folder))
     placed, unplaced = stations(flight, mounting)
     left = [finding(Code.FRAME_UNPLACED, Subject("frame", name), why=why) for name, why in unplaced]

@@ -44,7 +44,7 @@ class Sightings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensSolution:
-    """The lens with the sigmas of `NAMES` (7,) and those that it was given, the moved eyes, the points' places.
+    """The lens with the sigmas of `NAMES` (7,), the moved eyes, the points' places.
 
     `inliers` (n,) are the sightings that agree; `sigma_px` is their scatter along an axis, `before_px` the same with
     the lens as given.
@@ -52,7 +52,6 @@ class LensSolution:
 
     lens: Lens
     sigmas: Floats
-    prior_sigmas: Floats
     eyes: tuple[Eye, ...]
     places: Floats
     inliers: NDArray[np.bool_]
@@ -139,7 +138,7 @@ def solve(
     )
     moved = tuple(_eye(eye, state.lens, solved, state.turns[n], state.centres[n]) for n, eye in enumerate(eyes))
     own = np.sqrt(np.diag(covariance)) * units
-    return LensSolution(solved, own, lens_sigmas, moved, state.places, inliers, sigma_px, before_px)
+    return LensSolution(solved, own, moved, state.places, inliers, sigma_px, before_px)
 
 
 def _eye(eye: Eye, lens: Floats, solved: Lens, rotation: Floats, centre: Floats) -> Eye:
