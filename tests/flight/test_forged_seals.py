@@ -13,7 +13,7 @@ import pytest
 
 from dappled.clock import RecordedClock
 from dappled.findings import Code
-from dappled.flight import Recording, chain, layout, seal_key, seals
+from dappled.flight import FlightError, Ledger, Recording, chain, layout, seal_key, seals
 from dappled.flight.checks.flight_check import check
 from dappled.flight.seal_key import SealKey
 from tests.flight.conftest import START_UTC_NS
@@ -116,3 +116,25 @@ def test_a_view_in_place_of_a_table_is_refused(sealed: Path, key: SealKey, sql: 
         db.execute(f"CREATE VIEW strays AS {sql}")
         db.commit()
     assert any("the view 'strays'" in text for text in check(sealed, key).problems)
+
+
+@pytest.mark.parametrize(
+    ("sql", "words"),
+    [
+        ("CREATE TABLE strays (a, b, c, d, e AS (hex(zeroblob(8000000))))", "the computed column 'e'"),
+        ("CREATE VIRTUAL TABLE strays USING rtree(a, b, c)", "the virtual table 'strays'"),
+        ("CREATE TRIGGER mine AFTER INSERT ON facts BEGIN DELETE FROM frames; END", "the trigger 'mine'"),
+    ],
+    ids=["column", "virtual", "trigger"],
+)
+def test_a_ledger_that_computes_is_neither_read_nor_written(sealed: Path, key: SealKey, sql: str, words: str) -> None:
+    """A thousand rows of such a column are 16 GB, and a trigger would do what it likes when a seal is added."""
+    ledger = sealed / "flight.sqlite"
+    with closing(sqlite3.connect(ledger)) as db:
+        if "strays" in sql:
+            db.execute("DROP TABLE strays")
+        db.execute(sql)
+        db.commit()
+    assert any(words in text for text in check(sealed, key).problems)
+    with pytest.raises(FlightError, match=words):
+        Ledger(ledger, RecordedClock(START_UTC_NS))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import dappled
 from dappled.cli import VERBS
 from tests.system.test_hostile_folder import HostileFolder
 
@@ -88,3 +89,37 @@ def test_a_package_is_built_for_each_architecture_and_its_command_runs(tmp_path:
         f"import sys; sys.path[:0] = [{str(home)!r}]; from dappled import errors; print(errors.install_extra('ground'))"
     )
     assert "on the ground, in an environment of its own" in ask(*run, code)
+
+
+@pytest.mark.long
+@pytest.mark.timeout(1800)
+def test_a_package_installs_in_a_bare_root_and_runs_in_a_hostile_folder_there(tmp_path: Path) -> None:
+    """Debian's smallest system and Python, nothing else: what the package needs, it brings or depends on."""
+    suite = SUITES.get(sys.version_info[:2], "bookworm")
+    machine = {"x86_64": "amd64", "aarch64": "arm64"}.get(os.uname().machine)
+    if shutil.which("mmdebstrap") is None or machine is None:
+        pytest.skip("mmdebstrap is missing: no bare root can be made here")
+    ask(sys.executable, TOOL, "--suite", suite, "--arch", machine, "--out", tmp_path)
+    (deb,) = tmp_path.glob("*.deb")
+    (tmp_path / "hostile").mkdir()
+    hostile = HostileFolder(tmp_path / "hostile")
+    verbs = [*VERBS, "open nothing.h5", "doctor --json"]
+    tried = [
+        f"cd {hostile.path}; export PYTHONPATH=: HOME={hostile.path}; exec </dev/null; set -x",
+        "dappled --version; timeout 120 dappled run --simulate --frames 2",
+        *(f"timeout 6 dappled {verb} >out 2>&1; case $? in 0|1|2|124) ;; *) cat out; exit 9; esac" for verb in verbs),
+        "test ! -e ran",
+    ]
+    (tmp_path / "try.sh").write_text("\n".join(tried), encoding="utf-8")
+    inside = f'"$1"{hostile.path}'
+    hooks = [
+        f'mkdir -p {inside} && cp {hostile.path}/*.py {tmp_path}/try.sh {inside} && cp {deb} "$1/tmp/dappled.deb"',
+        'chroot "$1" dpkg -i /tmp/dappled.deb',
+        f'chroot "$1" sh {hostile.path}/try.sh',
+    ]
+    said = ask(
+        "mmdebstrap", "--variant=minbase", "--include=python3,systemd-standalone-sysusers",
+        *(f"--customize-hook={hook}" for hook in hooks), "--format=null", suite, "/dev/null",
+    )  # fmt: skip
+    assert f"dappled {dappled.__version__}\n" in said
+    assert "2 shots: 2 frames safe, 2 decoded, 0 with a problem" in said

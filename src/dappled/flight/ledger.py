@@ -38,6 +38,14 @@ LIVE = "live"
 BUSY_S = 10.0
 _MOST_VALUE = 16 << 20  # bytes of a value or row; the longest that dappled writes takes some kB
 _Record = TypeVar("_Record")
+_COMPUTES = (
+    "SELECT iif(type = 'table', 'virtual table', type), name FROM sqlite_master "
+    "WHERE type NOT IN ('table', 'index') OR type = 'table' AND rootpage = 0"
+)
+_COMPUTED = (
+    "SELECT 'computed column', made.name FROM sqlite_master, pragma_table_xinfo(sqlite_master.name) AS made "
+    "WHERE sqlite_master.type = 'table' AND made.hidden"
+)
 
 
 def advance(index: int, old: ShotState, new: ShotState) -> ShotState:
@@ -62,6 +70,7 @@ class Database(ABC):
         try:
             with self._speaking():
                 self._identify()
+                self._refuse_what_computes()
         except BaseException:
             self._db.close()
             raise
@@ -90,6 +99,15 @@ class Database(ABC):
         empty = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0] == 0
         application = self._db.execute("PRAGMA application_id").fetchone()[0]
         return empty, application, self._db.execute("PRAGMA user_version").fetchone()[0]
+
+    def _refuse_what_computes(self) -> None:
+        """Views, triggers, virtual tables and generated columns compute without end, or more than memory holds."""
+        strange = self._db.execute(_COMPUTES).fetchone() or self._db.execute(_COMPUTED).fetchone()
+        if strange:
+            kind, name = strange
+            raise FlightError(
+                f"{self.path} holds the {kind} {name!r}, which dappled didn't make: use another copy of it"
+            )
 
     def _rows(self, sql: str, *values: object) -> list[Any]:
         with self._lock, self._speaking():
@@ -129,11 +147,6 @@ class LedgerReader(Database):
                 raise
             reader = cls(path, uri=f"{path.absolute().as_uri()}?mode=ro&immutable=1")
         reader._rows("PRAGMA query_only=ON")
-        made = reader._rows("SELECT type, name FROM sqlite_master WHERE type NOT IN ('table', 'index')")
-        if made:  # a view or a trigger can compute without end, or more than memory holds
-            reader.close()
-            kind, name = made[0]
-            raise FlightError(f"{path} holds the {kind} {name!r}, which dappled didn't make: use another copy of it")
         return reader
 
     def shots(self) -> list[ShotRow]:

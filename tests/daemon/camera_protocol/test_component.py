@@ -166,6 +166,38 @@ class Rig:
         return [m.get_type() for m in self.sent]
 
 
+@pytest.mark.parametrize("exposed", [True, False])
+def test_what_strangers_ask_for_is_answered_at_a_rate_and_all_others_always(exposed: bool) -> None:
+    """One packet may ask for 32 of a file, or for all parameters; and its name may be words for the pilot."""
+    rig = Rig()
+    rig.exposed = exposed
+    rig.hear(ftp(4, 0, b"camera.xml", number=0))
+    for number in range(1, 200):
+        rig.hear(ftp(15, 0, number=number))
+    for _ in range(200):
+        rig.packer.seq = (rig.packer.seq + 1) % 256
+        rig.hear(mavlink.MAVLink_param_ext_request_list_message(1, 100))
+    for number in range(200):
+        name = b"TURN BACK %d" % number
+        rig.hear(mavlink.MAVLink_param_ext_set_message(1, 100, name, bytes(128), mavlink.MAV_PARAM_EXT_TYPE_UINT32))
+    counts = [
+        len(rig.of(kind)) for kind in ("FILE_TRANSFER_PROTOCOL", "PARAM_EXT_VALUE", "PARAM_EXT_ACK", "STATUSTEXT")
+    ]
+    assert counts[2] == 200  # one for one
+    assert (counts[0] + counts[1] <= 500) == exposed
+    assert (counts[3] <= 1) == exposed
+    assert rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259) == mavlink.MAV_RESULT_ACCEPTED
+    rig.clock.advance(4)
+    rig.sent.clear()
+    rig.hear(mavlink.MAVLink_param_ext_request_list_message(1, 100))
+    assert len(rig.of("PARAM_EXT_VALUE")) == 3
+
+
+def ftp(opcode: int, session: int, data: bytes = b"", *, number: int) -> MavlinkMessage:
+    payload = struct.pack("<HBBBBBxI", number, session, opcode, len(data), 0, 0, 0) + data
+    return mavlink.MAVLink_file_transfer_protocol_message(0, 1, 100, payload.ljust(251, b"\0"))
+
+
 def test_one_request_one_shot_acknowledged_at_once() -> None:
     rig = Rig()
     assert rig.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1) == mavlink.MAV_RESULT_ACCEPTED

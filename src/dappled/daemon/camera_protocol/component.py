@@ -10,6 +10,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime
 
 from dappled.clock import Clock
@@ -32,6 +33,7 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
+from dappled.drivers.mavlink.log_budget import Rate
 from dappled.findings import Code, Finding, Subject, Value, finding, told
 
 PROOF_NS = 500_000_000
@@ -43,6 +45,7 @@ _REPORTS = 256
 HEARTBEAT_NS = 10**9
 STATUS_NS = 600_000_000  # at most twice a second, and the last state within a second
 _OLD_IMAGES_A_TICK = 2
+_ANSWERS_A_S, _WORDS_A_S = 250.0, 0.5  # over unsigned links that strangers reach; twice as much at once
 _SAME_IDS_NS = 15 * 10**9
 
 
@@ -169,6 +172,7 @@ class Component:
         )
         self._parameters = ParameterServer(parameters)
         self._files = FtpServer(self._status)
+        self._answers, self._words = Rate(_ANSWERS_A_S), Rate(_WORDS_A_S)
         self._dedup, self._routes = PacketDedup(), ReportRoutes()
         self._lines, self._stations = PilotMessages(), GroundStations()
         self._rivals: Mapping[str, Value] = {}  # the other vehicles that were told of
@@ -353,18 +357,28 @@ class Component:
         name = message.get_type()
         if name == "PARAM_EXT_REQUEST_LIST":
             reply = self._parameters.listing()
+            if not self._may_answer(packet, len(reply.messages)):
+                return
         elif name == "PARAM_EXT_REQUEST_READ":
             reply = self._parameters.read(message)
         else:
             self._send_changed_parameters()  # earlier changes first, so that the reply follows them
             reply = self._parameters.set(message, packet.link, self._clock.monotonic_ns(), exposed=packet.exposed)
+        if packet.exposed and reply.words is not None and not self._words.takes(1, self._clock.monotonic_ns()):
+            reply = replace(reply, words=None)  # the pilot's screen is not the strangers'
         self._send_reply(reply, packet.link)
         self._send_changed_parameters()
 
     def _file(self, packet: Packet) -> None:
         if packet.message.target_component == self._links.component_id and self._is_for_us(packet.message):
-            for reply in self._files.answer(packet.message, self._clock.monotonic_ns()):
+            replies = self._files.answer(packet.message, self._clock.monotonic_ns())
+            for reply in replies if self._may_answer(packet, len(replies)) else ():
                 self._links.send(reply, packet.link)
+
+    def _may_answer(self, packet: Packet, count: int) -> bool:
+        """Whether so many messages may follow one: where strangers ask, they are few, so that the others' commands are
+        acknowledged meanwhile."""
+        return not packet.exposed or self._answers.takes(count, self._clock.monotonic_ns())
 
     def _is_for_us(self, message: MavlinkMessage) -> bool:
         """Our system or all, our component or all."""
