@@ -25,7 +25,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.child_process import ChannelError, ProcessChannel
-from dappled.drivers.gphoto2.messages import Carryover, message_event
+from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, message_event
 from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -142,6 +142,7 @@ class Harness:
     def __init__(self) -> None:
         self.clock = RecordedClock(1_000_000_000_000)
         self.camera = FakeCamera()
+        self.carryover = Carryover()
         self.channel, there = ProcessChannel.pair()
         self.loop_channel = ProcessChannel(there)
         self.loop = CameraLoop(self.loop_channel, GPhoto2Settings(), self.camera.open, self.clock)
@@ -161,6 +162,8 @@ class Harness:
         while (message := self.channel.receive(0.0)) is not None:
             if message.body["is"] == "pong":
                 pongs += 1
+            elif message.body["is"] == CUT_OFF:
+                self.carryover = self.carryover.cut(message.body)
             else:
                 events.append(message_event(message))
         assert pongs == steps
@@ -602,14 +605,21 @@ def test_a_picture_that_the_count_calls_new_and_the_clock_old_is_not_passed_over
     assert noticed(events) == ([] if owed else [(Code.PICTURE_ON_CARD, name)])
 
 
-def test_an_announced_file_on_a_card_that_was_taken_out_is_named(ready: Harness) -> None:
+@pytest.mark.parametrize("died", [False, True])
+def test_an_announced_file_on_a_card_that_was_taken_out_is_named(ready: Harness, died: bool) -> None:
+    """Also by the next process, where this one died before it saw the card again."""
     three_shots(ready)
     made(ready, 4, b"by hand")
     ready.camera.errors["fetch"] = [LostError("the door is open")]
     ready.turn(steps=1)
     ready.camera.changes_card()
-    events = ready.turn(0.3)
-    assert noticed(events) == [(Code.CARD_CHANGED, ""), (Code.PICTURE_ON_CARD, f"{FOLDER}/IMG_0004.CR2")]
+    if died:
+        before = replace(ready.carryover, serial=ready.camera.identity.serial)
+        ready.loop = CameraLoop(ready.loop_channel, GPhoto2Settings(), ready.camera.open, ready.clock, before)
+    told = noticed(ready.turn(0.3))
+    assert told[-1] == (Code.PICTURE_ON_CARD, f"{FOLDER}/IMG_0004.CR2")
+    assert told[:-1] == ([] if died else [(Code.CARD_CHANGED, "")])
+    assert ready.carryover.cut_off == ()
 
 
 def test_a_bad_picture_by_hand_does_not_cost_the_shot_s_own(ready: Harness) -> None:

@@ -30,7 +30,7 @@ from dappled.drivers.camera import (
     ShotFailed,
 )
 from dappled.drivers.child_process import ChannelMessage, ProcessChannel
-from dappled.drivers.gphoto2.messages import Carryover, message_event
+from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, message_event
 from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -103,8 +103,11 @@ class Body:
     keeps_files = True
     identity = Identity("Canon", "450D", "1", "usb:1,2")
 
-    def __init__(self, clock: RecordedClock, chance: random.Random, *, dated: bool = True) -> None:
-        self.clock, self.chance, self.dated = clock, chance, dated
+    def __init__(
+        self, clock: RecordedClock, chance: random.Random, *, dated: bool = True, latest_s: float = 0.2
+    ) -> None:
+        """`latest_s`: how long the body takes to expose, at most."""
+        self.clock, self.chance, self.dated, self.latest_s = clock, chance, dated, latest_s
         self.offset_s = chance.uniform(0, 10**6)
         self.card = Card()
         self.pictures: list[Picture] = []
@@ -144,7 +147,7 @@ class Body:
         """Make a picture now; it is announced half a second later, unless that is lost or late."""
         self.card.number += 1
         file = CameraFile(FOLDER, f"IMG_{self.card.number:04d}.CR2")
-        made_s = self.now_s + self.chance.uniform(0.05, 0.2)
+        made_s = self.now_s + self.chance.uniform(0.05, self.latest_s)
         data = b"%06d" % len(self.pictures) + b"." * (0 if self.dated else len(self.pictures))
         taken_s = int(made_s + self.offset_s) if self.dated else None
         self.card.files[file] = (data, taken_s)
@@ -152,9 +155,9 @@ class Body:
         self.pictures.append(picture)
         fate, self.fate = self.fate, ""
         if fate != "lose" and not self._dead:
-            at_s = self.now_s + self.chance.uniform(0.3, 0.7) + 8 * (fate == "late")
+            at_s = made_s + self.chance.uniform(0.2, 0.5) + 8 * (fate == "late")
             self._coming.append((at_s, FileAdded(file), picture))
-        self._coming.append((self.now_s + 0.8, CaptureComplete(), None))
+        self._coming.append((made_s + 0.6, CaptureComplete(), None))
         self._busy_until_s = self.now_s + 0.3
 
     def trigger(self) -> None:
@@ -233,12 +236,16 @@ class Pipe:
     def __init__(self) -> None:
         self.commands: deque[Mapping[str, Any]] = deque()
         self.said: list[tuple[CameraEvent, bytes]] = []
+        self.cut_off: Mapping[str, Any] = {"files": ()}
 
     def receive(self, _timeout_s: float) -> ChannelMessage | None:
         return ChannelMessage(dict(self.commands.popleft())) if self.commands else None
 
     def send(self, body: Mapping[str, Any], fds: tuple[int, ...] = (), timeout_s: float = 0.0) -> None:
         del timeout_s
+        if body["is"] == CUT_OFF:
+            self.cut_off = dict(body)
+            return
         data = b"".join(os.pread(fd, 6, 0) for fd in fds)
         self.said.append((message_event(ChannelMessage(dict(body), fds)), data))
 
@@ -256,7 +263,9 @@ class World:
 
     def __init__(self, seed: int) -> None:
         self.clock = RecordedClock(1_000_000_000_000)
-        self.body = Body(self.clock, random.Random(seed), dated=seed % 8 != 7)  # noqa: S311  a simulation
+        latest_s = 1.0 if seed % 3 == 1 else 0.2
+        chance = random.Random(seed)  # noqa: S311  a simulation
+        self.body = Body(self.clock, chance, dated=seed % 8 != 7, latest_s=latest_s)
         self.carryover = Carryover()
         self.events: list[tuple[float, CameraEvent, bytes]] = []
         self.pending: dict[int, int | None] = {}
@@ -325,7 +334,7 @@ class World:
         self.body.close()
         self._hear()
         fired = [Claim(shot, at_ns) for shot, at_ns in self.pending.items() if at_ns is not None]
-        self.carryover = self.carryover.died(fired)
+        self.carryover = self.carryover.died(fired).cut(self.pipe.cut_off)
         self.pending.clear()
         self.restarted = True
         self._begin()

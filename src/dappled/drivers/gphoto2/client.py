@@ -44,7 +44,7 @@ from dappled.drivers.child_process import (
     end_child,
     start_child,
 )
-from dappled.drivers.gphoto2.messages import Carryover, lost_file, message_event
+from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, lost_file, message_event
 from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings, parse_settings
 from dappled.findings import Code, Subject, finding
 from dappled.workers import Loop
@@ -249,6 +249,8 @@ class GPhoto2Camera(QueuedCamera):
                         self._lose_file(message)
                     elif message.body.get("is") == "live":
                         self._show(message)
+                    elif message.body.get("is") == CUT_OFF:
+                        self._carryover = self._carryover.cut(message.body)
                     elif message.body.get("is") != "pong":
                         self._pass_on(message_event(message))
                 elif channel.starved:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import get_args
+from typing import Any, get_args
 
 from dappled import codec
 from dappled.drivers.attribution import Claim
@@ -22,12 +22,14 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.child_process import ChannelError, ChannelMessage, MessageSizeError, ProcessChannel
+from dappled.drivers.gphoto2.protocol import CameraFile
 
 LATE_LIMIT = 16
 """How many late shots are remembered."""
 SEEN_LIMIT = 512
 """How many files a dead process' successor is told of: all of them are one argument of its command line."""
 _SEND_S = 5.0
+CUT_OFF = "cut off"
 
 
 SeenFile = tuple[str, str, int, int | None]
@@ -39,13 +41,19 @@ _EVENTS: Mapping[str, type[CameraEvent]] = {one.__name__: one for one in get_arg
 class Carryover:
     """What a process that died leaves to the next: the body's serial number, the shots that were fired and have no file
     yet, the offsets of the body's clock, and folder, name, size and time of the files that came last. Pictures made
-    after `since_ns` (monotonic; None: unknown) are among these, or were not brought."""
+    after `since_ns` (monotonic; None: unknown) are among these, or were not brought. `cut_off`: folder and name of
+    those that were announced, and not brought when the link broke."""
 
     serial: str | None = None
     late: tuple[Claim, ...] = ()
     offsets_s: tuple[float, ...] = ()
     seen: tuple[SeenFile, ...] = ()
     since_ns: int | None = None
+    cut_off: tuple[tuple[str, str], ...] = ()
+
+    def cut(self, body: Mapping[str, Any]) -> Carryover:
+        """After the process' word on what was cut off."""
+        return replace(self, cut_off=tuple((folder, name) for folder, name in body["files"]))
 
     def heard(self, event: CameraEvent) -> Carryover:
         """After an event of the process. Another body has another clock and other files."""
@@ -96,6 +104,10 @@ class EventSender:
             finally:
                 for fd in message.fds:
                     os.close(fd)
+
+    def cut_off(self, files: Iterable[CameraFile]) -> None:
+        """Say which files were announced and not brought: all of them each time."""
+        self._channel.send({"is": CUT_OFF, "files": [(file.folder, file.name) for file in files]}, timeout_s=_SEND_S)
 
     def pong(self) -> None:
         """Answer a ping."""

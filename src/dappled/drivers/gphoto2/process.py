@@ -5,8 +5,8 @@ and the parent can always kill it.
 
 Commands: {"do": "fire", "shot": n}, {"do": "delete", "folder", "name"}, {"do": "change", "name", "value"},
 {"do": "look"} (through the viewfinder), {"do": "ping"}, {"do": "stop"}. Answers are the camera's events (`messages`),
-{"is": "live"} with a JPEG or a reason, and {"is": "pong"}. One shot is at the camera at a time; further ones wait in
-order.
+{"is": "live"} with a JPEG or a reason, {"is": "cut off"} with the files that were announced and not brought when the
+link broke, and {"is": "pong"}. One shot is at the camera at a time; further ones wait in order.
 """
 
 from __future__ import annotations
@@ -242,7 +242,10 @@ class CameraLoop:
         self._session, self._keeps_files = session, session.keeps_files
         self._state.opened(session.identity.serial, self._now_ns())
         if session.keeps_files:
+            cut_off = self._state.cut_off
             self._sender.send(*self._state.listed(session.contents(), self._now_ns()))
+            if cut_off:
+                self._sender.cut_off(())
 
     def _lose(self, reason: str) -> None:
         """Close a session that is of no use any more."""
@@ -254,6 +257,8 @@ class CameraLoop:
         self._open_at_ns = self._now_ns() + round(_REOPEN_S * 1e9)
         self._sender.send(*self._state.lost(reason, self._now_ns(), keeps_files=keeps_files))
         self._send_state("faulted", reason)
+        if self._state.cut_off:
+            self._sender.cut_off(self._state.cut_off)
 
     def _trigger(self, session: Session) -> None:
         state = self._state

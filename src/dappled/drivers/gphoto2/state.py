@@ -89,7 +89,7 @@ class CameraState:
         self._to_compare: dict[CameraFile, None] = {}  # announced, and of a name that is known
         self._tries: dict[CameraFile, int] = {}
         self._suspects: dict[CameraFile, _Announced] = {}  # announced, and other than was listed under their names
-        self._cut_off: tuple[CameraFile, ...] = ()  # announced and not fetched when the link broke
+        self.cut_off = tuple(CameraFile(*one) for one in carryover.cut_off)  # announced, and not fetched at a break
         self._missed = False  # a picture may have been missed
         self._quiet_ns = 0  # when something was last heard of a shot or a file
         self._framed: deque[FramedShot] = deque(maxlen=LATE_LIMIT)  # the last shots whose frames have come
@@ -117,7 +117,7 @@ class CameraState:
 
     def lost(self, reason: str, now_ns: int, *, keeps_files: bool) -> list[CameraEvent]:
         """The session is gone. A fired shot whose file is on the card stays current; any other has failed."""
-        self._cut_off = (*self._cut_off, *(file for file in (*self._to_fetch, *self._suspects) if not file.in_memory))
+        self.cut_off = (*self.cut_off, *(file for file in (*self._to_fetch, *self._suspects) if not file.in_memory))
         open_since = [one.since_ns for one in (*self._to_fetch.values(), *self._suspects.values()) if one.since_ns]
         if self._since_ns is not None:
             self._since_ns = min([self._since_ns, *open_since])  # these are not known yet
@@ -264,10 +264,11 @@ class CameraState:
             unsure = [file for file in strange if not made[file] and file not in self._to_fetch]
             told += [_on_card(file, now_ns) for file in (unsure if len(unsure) <= LATE_LIMIT else ())]
             newer = []
+            told += [_on_card(file, now_ns) for file in self.cut_off if file in found.files]
         told += [_on_card(file, now_ns) for file in newer[:LATE_LIMIT] if not made[file]]
-        told += [_on_card(file, now_ns) for file in self._cut_off if file not in found.files]
+        told += [_on_card(file, now_ns) for file in self.cut_off if file not in found.files]
         fresh = [file for file in strange if made[file] or not only_recent]
-        self._cut_off = ()
+        self.cut_off = ()
         self._suspects.clear()
         self._queue(picture_order.by_name(fresh, lambda file: f"{file.folder}/{file.name}"), now_ns)
         self._card.list(found, self._to_fetch)
