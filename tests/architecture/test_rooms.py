@@ -38,6 +38,7 @@ UNREAD = {
     "horizontal_mm": "in a carrier table, by asdict",
     "vertical_mm": "in a carrier table, by asdict",
     "frequency_scale": "in the laser bench's findings, by asdict",
+    "periods_sigma": "in a light field, by the codec",
     "turn_deg": "in the report of a map's refinement, by asdict",
     "angular_frequency_per_mm": "in the file of a simulated frame's truth, field by field",
     "srcComponent": "pymavlink's",

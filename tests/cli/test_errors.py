@@ -13,10 +13,12 @@ import pytest
 import dappled
 from dappled import cli
 from dappled.cli.verb import CallError
+from dappled.config.schema import ConfigError
 from dappled.errors import DappledError
 
 INTERNAL = {  # caught where they arise, and told as another error or as an event
     "dappled.bounds.claims.ClaimError",
+    "dappled.codec.CodecError",
     "dappled.drivers.child_process.ChannelError",
     "dappled.durable.NoPlainFileError",
     "dappled.drivers.gphoto2.protocol.SessionError",
@@ -68,7 +70,10 @@ def test_it_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], one: type[DappledError]
 ) -> None:
     error = one.__new__(one)  # some want more than a sentence
-    Exception.__init__(error, "the disk is full; free some space")
+    if isinstance(error, ConfigError):
+        ConfigError.__init__(error, "the disk is full; free some space")
+    else:
+        Exception.__init__(error, "the disk is full; free some space")
     assert ended(monkeypatch, error) == one.exit_code
     out, err = capfd.readouterr()
     assert out == ""

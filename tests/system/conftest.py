@@ -31,7 +31,7 @@ class Flown:
     watched: str
 
 
-def dappled(*arguments: str, cwd: Path | None = None, timeout_s: float = 110) -> subprocess.CompletedProcess[str]:
+def dappled(*arguments: str, cwd: Path | None = None, timeout_s: float = 240) -> subprocess.CompletedProcess[str]:
     """The `dappled` command in a process of its own."""
     command = [sys.executable, "-m", "dappled", *arguments]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout_s, check=False)
@@ -68,7 +68,7 @@ def _fly(folder: Path, sockets: Path) -> Flown:
     (folder / "dappled.toml").write_text(f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\n')
     watch = subprocess.Popen(
         [sys.executable, "-m", "dappled", "watch", endpoint, "--save", str(folder / "received"),
-         "--count", str(FRAMES), "--timeout", "120"],
+         "--count", str(FRAMES), "--timeout", "240"],
         stdout=subprocess.PIPE, text=True,
     )  # fmt: skip
     try:
@@ -76,7 +76,7 @@ def _fly(folder: Path, sockets: Path) -> Flown:
         run = dappled(
             "run", "--simulate", "--seed", "5", "--frames", str(FRAMES), "--config", "dappled.toml", cwd=folder
         )
-        watched, _ = watch.communicate(timeout=120)
+        watched, _ = watch.communicate(timeout=240)
     finally:
         watch.kill()
     assert run.returncode == 0, run.stderr

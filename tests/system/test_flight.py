@@ -76,6 +76,12 @@ def test_replay_verifies(flown: Flown) -> None:
     assert f"verified {FRAMES} frames: all hashes the same" in done.stdout
 
 
+def refused(flight: Path, capfd: pytest.CaptureFixture[str]) -> str:
+    """What `replay --verify` says of a flight that it refuses."""
+    assert main(["replay", str(flight), "--verify"]) == 1
+    return capfd.readouterr().err
+
+
 ANOTHER_MACHINE = """
 import platform
 platform.machine = lambda: "aarch64"
@@ -109,34 +115,31 @@ def test_replay_verifies_numbers_on_another_machine(
     assert f"recorded on {platform.machine()}" in done.stdout + done.stderr
 
 
-def test_one_flipped_byte_of_a_raw_file_is_found(copied: Path) -> None:
+def test_one_flipped_byte_of_a_raw_file_is_found(copied: Path, capfd: pytest.CaptureFixture[str]) -> None:
     flip(sorted((copied / "frames").glob("*.dng"))[1], 2_000_000)
-    done = dappled("replay", str(copied), "--verify")
-    assert done.returncode == 1
-    assert "000001.dng" in done.stderr
+    assert "000001.dng" in refused(copied, capfd)
 
 
 @pytest.mark.parametrize("share", [0.6, *(pytest.param(share, marks=pytest.mark.slow) for share in (0.02, 0.98))])
-def test_one_flipped_byte_of_the_telemetry_is_found(copied: Path, share: float) -> None:
+def test_one_flipped_byte_of_the_telemetry_is_found(
+    copied: Path, share: float, capfd: pytest.CaptureFixture[str]
+) -> None:
     telemetry = copied / "telemetry.tlog"
     flip(telemetry, int(telemetry.stat().st_size * share))
-    done = dappled("replay", str(copied), "--verify")
-    assert done.returncode == 1
-    assert "telemetry" in done.stderr
+    assert "telemetry" in refused(copied, capfd)
 
 
-def test_each_missing_hash_is_found(copied: Path) -> None:
+def test_each_missing_hash_is_found(copied: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger, ledger:
         for index, table in enumerate(("poses", "tags", "results")):
             ledger.execute(f"DELETE FROM {table} WHERE idx = {index}")  # noqa: S608  # a table's name from this test
     ledger.close()
-    done = dappled("replay", str(copied), "--verify")
-    assert done.returncode == 1
+    told = refused(copied, capfd)
     for index, what in enumerate(("pose", "tag", "slices")):
-        assert f"frame {index}: the record holds no hash of its {what}" in done.stderr
+        assert f"frame {index}: the record holds no hash of its {what}" in told
 
 
-def test_a_changed_slices_hash_is_found(copied: Path) -> None:
+def test_a_changed_slices_hash_is_found(copied: Path, capfd: pytest.CaptureFixture[str]) -> None:
     with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger, ledger:
         (record,) = ledger.execute("SELECT record FROM results WHERE idx = 0").fetchone()
         changed = {**json.loads(record), "slices_sha256": "0" * 64}
@@ -144,9 +147,7 @@ def test_a_changed_slices_hash_is_found(copied: Path) -> None:
             "UPDATE results SET slices_sha256 = ?, record = ? WHERE idx = 0", ["0" * 64, json.dumps(changed)]
         )
     ledger.close()
-    done = dappled("replay", str(copied), "--verify")
-    assert done.returncode == 1
-    assert "frame 0: the slices came out different" in done.stderr
+    assert "frame 0: the slices came out different" in refused(copied, capfd)
 
 
 def test_verify_needs_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -175,21 +176,25 @@ def test_a_new_recipe_writes_beside_the_old_results(copied: Path) -> None:
     assert "frame 1: the record holds no hash of its slices" in spoilt.stderr
 
 
-def test_flight_verbs_read_it(flown: Flown) -> None:
+def test_flight_verbs_read_it(flown: Flown, capsys: pytest.CaptureFixture[str]) -> None:
     for verb in ("show", "check", "report"):
-        done = dappled("flight", verb, str(flown.flight))
-        assert done.returncode == 0, done.stderr
-        as_json = dappled("flight", verb, str(flown.flight), "--json")
-        assert json.loads(as_json.stdout)
-    listed = dappled("flight", "list", str(flown.flight.parent))
-    assert flown.flight.name in listed.stdout
+        assert main(["flight", verb, str(flown.flight)]) == 0
+        capsys.readouterr()
+        assert main(["flight", verb, str(flown.flight), "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)
+    assert main(["flight", "list", str(flown.flight.parent)]) == 0
+    assert flown.flight.name in capsys.readouterr().out
 
 
-def test_flights_are_found_by_the_daemon_s_settings(flown: Flown, tmp_path: Path) -> None:
+def test_flights_are_found_by_the_daemon_s_settings(
+    flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = tmp_path / "dappled.toml"
     config.write_text(f'[record]\ndirectory = "{flown.flight.parent}"\n', encoding="utf-8")
-    assert flown.flight.name in dappled("flight", "list", "--config", str(config)).stdout
-    assert "the counts agree" in dappled("flight", "report", "--config", str(config)).stdout
+    assert main(["flight", "list", "--config", str(config)]) == 0
+    assert flown.flight.name in capsys.readouterr().out
+    assert main(["flight", "report", "--config", str(config)]) == 0
+    assert "the counts agree" in capsys.readouterr().out
 
 
 @pytest.mark.slow
