@@ -41,7 +41,7 @@ from dappled.products.maps.laboratory import Laboratory
 from dappled.products.mounting import Mounting
 from dappled.products.opened import OpenedFlight
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, request, tag
+from tests.flight.makers import deliver, request, tag, words_of
 
 SECRET = b"somebody else's file"
 
@@ -161,7 +161,7 @@ def test_geotag_writes_through_no_link(flight: Path, tmp_path: Path, folder: str
 def test_check_names_it_and_goes_on(flight: Path, table: str) -> None:
     edit(flight, "../victim.txt", table)
     durable.write_file(flight / "frames" / "000001.cr2", b"raw X")
-    problems = flight_check.check(flight).problems
+    problems = words_of(flight_check.check(flight).problems)
     assert any("names '../victim.txt', which does not stay inside" in text for text in problems)
     assert any("000001.cr2 was changed" in text for text in problems)
 
@@ -169,7 +169,7 @@ def test_check_names_it_and_goes_on(flight: Path, table: str) -> None:
 def test_check_confines_the_inputs_too(flight: Path) -> None:
     with Ledger(flight / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.set_fact("sha256:../victim.txt", [durable.hash_file(flight.parent / "victim.txt")])
-    assert any("names '../victim.txt'" in text for text in flight_check.check(flight).problems)
+    assert any("names '../victim.txt'" in text for text in words_of(flight_check.check(flight).problems))
 
 
 @pytest.mark.parametrize("part", ["flight.sqlite", "shots.jsonl", "telemetry.tlog", "frames", "flight.toml"])

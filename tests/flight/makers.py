@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.decode.geometry import Pose
+from dappled.findings import Finding, text
 from dappled.flight import Cause, Frame, Recording, Shot, Tag, TimeSource
 
 
@@ -101,3 +102,8 @@ def flip(path: Path, at: int) -> None:
     data = bytearray(path.read_bytes())
     data[at] ^= 0x01
     path.write_bytes(data)
+
+
+def words_of(found: Iterable[Finding]) -> tuple[str, ...]:
+    """What a check found, as a person reads it."""
+    return tuple(map(text, found))

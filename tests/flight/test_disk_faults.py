@@ -69,7 +69,7 @@ frames = sorted(os.listdir(flight.folder.frames))
 rows = {{row.shot.index: [row.state, row.reason] for row in flight.ledger.shots()}}
 flight.close()
 print(json.dumps({{"told": told, "safe": safe, "frames": frames, "rows": rows,
-                  "problems": check(flight.folder.path).problems}}))
+                  "problems": [str(one) for one in check(flight.folder.path).problems]}}))
 """
 FULL = """
 (disk / "ballast").write_bytes(bytes(2_000_000))

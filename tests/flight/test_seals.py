@@ -31,7 +31,7 @@ from dappled.flight import (
 from dappled.flight.checks.flight_check import check
 from tests.flight.checks.test_chain_check import attacked, fly
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import flip
+from tests.flight.makers import flip, words_of
 
 SEED = 20261122
 LATER = RecordedClock(START_UTC_NS + 10**12)
@@ -70,7 +70,7 @@ def files(folder: FlightFolder) -> list[Path]:
 def test_a_sealed_flight_is_consistent_and_not_signed(sealed: FlightFolder) -> None:
     bytes_before = {path: path.read_bytes() for path in files(sealed)}
     report = check(sealed.path)
-    assert (report.problems, report.notes) == ((), ())
+    assert (words_of(report.problems), words_of(report.notes)) == ((), ())
     assert report.vouched == "not signed"
     assert report.verdict.code is Code.SEAL_NOT_SIGNED
     assert {path: path.read_bytes() for path in files(sealed)} == bytes_before
@@ -98,14 +98,14 @@ def flips(folder: FlightFolder, count: int, seed: int) -> list[str]:
         path.write_bytes(before[:at] + bytes([before[at] ^ 1 << bit]) + before[at + 1 :])
         where = f"{path.name}: bit {bit} of byte {at}"
         try:
-            if not check(folder.path).problems:
+            if not words_of(check(folder.path).problems):
                 unnamed.append(where)
         except Exception as error:  # noqa: BLE001  any error but a finding is what is looked for
             unnamed.append(f"{where}: {error!r}")
         for leftover in folder.path.glob("flight.sqlite-*"):
             leftover.unlink()
         path.write_bytes(before)
-    assert check(folder.path).problems == ()
+    assert words_of(check(folder.path).problems) == ()
     return unnamed
 
 
@@ -119,7 +119,7 @@ def test_each_flipped_bit_of_the_ledger_is_named(sealed: FlightFolder) -> None:
     places = [*range(100), *(chosen.randrange(len(before)) for _ in range(60))]
     for at in places:
         sealed.ledger.write_bytes(before[:at] + bytes([before[at] ^ 1 << chosen.randrange(8)]) + before[at + 1 :])
-        unnamed += [] if check(sealed.path).problems else [at]
+        unnamed += [] if words_of(check(sealed.path).problems) else [at]
         for leftover in sealed.path.glob("flight.sqlite-*"):
             leftover.unlink()
     assert unnamed == []
@@ -193,7 +193,7 @@ STRANGERS = [
 @pytest.mark.parametrize("attack", [*ATTACKS, *STRANGERS], ids=lambda attack: attack.name)
 def test_an_attack_is_named(sealed: FlightFolder, attack: Attack) -> None:
     attack.do(sealed)
-    problems = check(sealed.path).problems
+    problems = words_of(check(sealed.path).problems)
     assert any(attack.words in problem for problem in problems), problems
 
 
@@ -214,8 +214,8 @@ def beside(folder: FlightFolder, suffix: str) -> Path:
 def test_what_harms_nothing_is_a_note(sealed: FlightFolder, do: Callable[[FlightFolder], object], words: str) -> None:
     do(sealed)
     report = check(sealed.path)
-    assert report.problems == ()
-    assert any(words in note for note in report.notes), report.notes
+    assert words_of(report.problems) == ()
+    assert any(words in note for note in words_of(report.notes)), words_of(report.notes)
 
 
 def test_the_name_of_another_flight_is_wrong_and_a_name_of_ones_own_a_note(sealed: FlightFolder) -> None:
@@ -223,8 +223,8 @@ def test_the_name_of_another_flight_is_wrong_and_a_name_of_ones_own_a_note(seale
     said = f"the flight was recorded as {sealed.name}"
     shutil.copytree(sealed.path, own)
     sealed.path.rename(other)
-    assert [said in text for text in check(other).problems] == [True]
-    assert (check(own).problems, [said in text for text in check(own).notes]) == ((), [True])
+    assert [said in text for text in words_of(check(other).problems)] == [True]
+    assert (words_of(check(own).problems), [said in text for text in words_of(check(own).notes)]) == ((), [True])
 
 
 def test_a_rollback_journal_changes_no_byte_of_the_ledger(sealed: FlightFolder) -> None:
@@ -238,8 +238,8 @@ def test_a_rollback_journal_changes_no_byte_of_the_ledger(sealed: FlightFolder) 
 def test_a_file_of_ones_own_is_named_and_no_fault(sealed: FlightFolder) -> None:
     (sealed.path / "notes.txt").write_bytes(b"windy")
     report = check(sealed.path)
-    assert report.problems == ()
-    assert report.notes == ("notes.txt was added since seal 2: no seal covers it",)
+    assert words_of(report.problems) == ()
+    assert words_of(report.notes) == ("notes.txt was added since seal 2: no seal covers it",)
 
 
 def test_work_that_was_killed_leaves_rows_that_the_chain_vouches_for(sealed: FlightFolder) -> None:
@@ -247,14 +247,14 @@ def test_work_that_was_killed_leaves_rows_that_the_chain_vouches_for(sealed: Fli
         writer.add_event("opened again", "late tags")
     (sealed.frames / "000001.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
     report = check(sealed.path)
-    assert report.problems == ()
-    assert any("opened again after seal 2 (geotag): 1 link of the chain" in note for note in report.notes)
+    assert words_of(report.problems) == ()
+    assert any("opened again after seal 2 (geotag): 1 link of the chain" in note for note in words_of(report.notes))
     with seals.reopened(sealed, LATER, "late tags"):
         pass
-    assert (check(sealed.path).problems, check(sealed.path).notes) == ((), ())
+    assert (words_of(check(sealed.path).problems), words_of(check(sealed.path).notes)) == ((), ())
     with attacked(sealed) as db:
         db.execute("UPDATE events SET text = 'else' WHERE number = 1")
-    assert "the row of events 1 was changed since dappled wrote it" in check(sealed.path).problems
+    assert "the row of events 1 was changed since dappled wrote it" in words_of(check(sealed.path).problems)
 
 
 def test_a_crash_between_announcement_and_seal_is_told_and_sealed_again(
@@ -267,11 +267,11 @@ def test_a_crash_between_announcement_and_seal_is_told_and_sealed_again(
         dying.setattr(durable, "write_file", crash)
         with pytest.raises(KeyboardInterrupt):
             seals.seal(sealed, LATER, "late tags")
-    assert any("seal 3 is missing" in problem for problem in check(sealed.path).problems)
+    assert any("seal 3 is missing" in problem for problem in words_of(check(sealed.path).problems))
     seals.seal(sealed, LATER, "late tags")
     report = check(sealed.path)
-    assert report.problems == ()
-    assert report.notes == ("seal 3 was never written: its work was interrupted",)
+    assert words_of(report.problems) == ()
+    assert words_of(report.notes) == ("seal 3 was never written: its work was interrupted",)
 
 
 def test_the_next_flight_seals_one_that_was_closed_and_not_sealed(
@@ -284,7 +284,7 @@ def test_the_next_flight_seals_one_that_was_closed_and_not_sealed(
     assert check(folder.path).vouched == "not sealed"
     recording.begin(folder.path.parent, LATER).close()
     report = check(folder.path)
-    assert (report.problems, report.vouched) == ((), "not signed")
+    assert (words_of(report.problems), report.vouched) == ((), "not signed")
     last = seals.read(folder).last
     assert last is not None
     assert last.why == "recovered"
@@ -303,13 +303,15 @@ def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: 
     folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
     genuine = folder.seals.read_bytes()
     report = check(folder.path, key)
-    assert (report.problems, report.vouched) == ((), "signed")
+    assert (words_of(report.problems), report.vouched) == ((), "signed")
     assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED, {"key": key.name})
     assert check(folder.path).vouched == check(folder.path, other).vouched == "not verified"
 
     reseal(folder, why="forged")  # its digests fit; its signature doesn't
-    assert check(folder.path).problems == ()
-    assert check(folder.path, key).problems == (f"the signature of seal 1 is wrong: key {key.name} did not make it",)
+    assert words_of(check(folder.path).problems) == ()
+    assert words_of(check(folder.path, key).problems) == (
+        f"the signature of seal 1 is wrong: key {key.name} did not make it",
+    )
     reseal(folder, key=None, mac=None)
     assert check(folder.path, key).vouched == "not signed"
 
@@ -317,7 +319,7 @@ def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: 
     with seals.reopened(folder, LATER, "geotag"):
         pass
     report = check(folder.path, key)
-    assert report.problems == ()
+    assert words_of(report.problems) == ()
     assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED_UNTIL, {"key": key.name, "seal": 1})
 
 
@@ -360,9 +362,9 @@ def test_a_flight_is_sealed_beside_a_reader_and_under_another_name(sealed: Fligh
         assert reader.shots()
         with seals.reopened(copy, LATER, "geotag"):
             pass
-        assert check(copy.path).problems == ()
+        assert words_of(check(copy.path).problems) == ()
     said = f"the folder is called renamed, and the flight was recorded as {sealed.name}"
-    assert (check(copy.path).problems, check(copy.path).notes) == ((), (said,))
+    assert (words_of(check(copy.path).problems), words_of(check(copy.path).notes)) == ((), (said,))
 
 
 def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -375,7 +377,7 @@ def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, mon
         with pytest.raises(FlightError, match="another program holds it"):
             seals.seal(sealed, LATER, "late tags")
     seals.seal(sealed, LATER, "late tags")
-    assert check(sealed.path).problems == ()
+    assert words_of(check(sealed.path).problems) == ()
 
 
 def test_a_record_that_was_rewritten_with_links_and_a_seal_of_its_own_is_named(flights: Path, tmp_path: Path) -> None:
@@ -392,7 +394,7 @@ def test_a_record_that_was_rewritten_with_links_and_a_seal_of_its_own_is_named(f
             )
             writer._written["frames", (1,)] = None
     seals.seal(folder, LATER, "late tags")
-    problems = check(folder.path, key).problems
+    problems = words_of(check(folder.path, key).problems)
     assert "the row of frames 1 was written again, which dappled never does" in problems
     for name in ("frames/000001.cr2", "telemetry.tlog"):
         assert f"seal 2 holds another digest of {name} than seal 1: it was changed in between" in problems
@@ -455,22 +457,22 @@ def test_what_was_changed_between_two_works_stays_known(
     with seals.reopened(sealed, LATER, "late tags"):
         pass
     report = check(sealed.path)
-    assert report.problems == ()
-    assert report.notes == (f"changed, added or removed by something else after seal 2: {names}",)
+    assert words_of(report.problems) == ()
+    assert words_of(report.notes) == (f"changed, added or removed by something else after seal 2: {names}",)
 
 
 @pytest.mark.parametrize("name", ["shots.jsonl", "seals.jsonl", "offloaded.jsonl", "telemetry.tlog"])
 def test_a_file_of_holes_is_judged_before_it_is_read(sealed: FlightFolder, name: str) -> None:
     with (sealed.path / name).open("ab") as file:
         file.truncate(1 << 40)
-    problems = check(sealed.path).problems
+    problems = words_of(check(sealed.path).problems)
     assert any("its content would take" in problem and name in problem for problem in problems), problems
 
 
 def test_a_value_that_no_ledger_holds_is_refused_before_it_is_read(sealed: FlightFolder) -> None:
     with attacked(sealed) as db:
         db.execute("UPDATE events SET text = hex(zeroblob(10000000)) WHERE number = 1")
-    assert any("a value in it takes more than 16 MB" in problem for problem in check(sealed.path).problems)
+    assert any("a value in it takes more than 16 MB" in problem for problem in words_of(check(sealed.path).problems))
 
 
 def test_the_start_of_a_daemon_does_not_sign_what_somebody_added(flights: Path, tmp_path: Path) -> None:
@@ -492,7 +494,7 @@ def test_a_pipe_in_place_of_a_file_is_not_waited_for(sealed: FlightFolder, name:
     (sealed.path / name).unlink()
     os.mkfifo(sealed.path / name)
     try:
-        problems = check(sealed.path).problems
+        problems = words_of(check(sealed.path).problems)
     except FlightError as error:
         problems = (str(error),)
     assert any(name in text for text in problems)

@@ -26,7 +26,7 @@ from dappled.flight import LedgerReader, Result, layout, offload, places, record
 from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting
-from tests.flight.makers import deliver, mavlink_2, request, shot, tag
+from tests.flight.makers import deliver, mavlink_2, request, shot, tag, words_of
 
 START_UTC_NS = 1_795_256_103_000_000_000
 FRAME_BYTES = 20_000
@@ -127,7 +127,7 @@ def _offload_settled(place: Path) -> list[str]:
 
 def _checked(place: Path) -> list[str]:
     every = [*flights(place), *(folder.path for folder in layout.flights(place / "disk"))]
-    wrong = [text for flight in every for text in check(flight).problems]
+    wrong = [text for flight in every for text in words_of(check(flight).problems)]
     return wrong + [f"{path} is left" for path in place.rglob("*.part")]
 
 

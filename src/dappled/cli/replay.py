@@ -29,7 +29,7 @@ from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, first_of_each, in_order
+from dappled.findings import Finding, first_of_each, in_order, text
 from dappled.flight import LIVE, TimeSource, layout
 from dappled.flight.checks import flight_check
 
@@ -133,7 +133,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
     def run(self, output: Output) -> Report:
         """Run a recorded flight."""
         settings = configuration.load(self.config)
-        problems = list(flight_check.check(self.flight).problems) if self.verify else []
+        problems = [text(one) for one in flight_check.check(self.flight).problems] if self.verify else []
         facts = layout.read_facts(layout.open_folder(self.flight)) if self._is_flight else {}
         recipe = self._recipe(facts, settings)
         recording = self._recording()
@@ -167,8 +167,8 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
                 output.row({"findings": codec.plain(in_order(told))})
             return Report(findings=told, failed=bool(progress.bad))
         problems += writer.verdict(decoded=recipe is not None)
-        for text in problems:
-            output.remark(f"different: {text}")
+        for said in problems:
+            output.remark(f"different: {said}")
         count = sum(one.frame is not None for one in recording.expected)
         undecoded = sum(one.frame is not None and one.left_undecoded for one in recording.expected)
         left = f" ({undecoded} left undecoded in flight)" if undecoded else ""

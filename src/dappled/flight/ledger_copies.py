@@ -14,6 +14,7 @@ from pathlib import Path
 from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored
+from dappled.findings import Finding, text
 from dappled.flight import seals
 from dappled.flight.chain import Column
 from dappled.flight.checks import chain_check
@@ -91,13 +92,14 @@ def _apart(source: Tree, there: Tree, name: str) -> FlightError:
     )
 
 
-def _refuse_edited(ledger: Path, problems: Sequence[str]) -> None:
+def _refuse_edited(ledger: Path, problems: Sequence[Finding]) -> None:
     """Raise FlightError for a ledger that something other than dappled wrote in: neither the only one of its kind nor
     one that may replace another."""
     if problems:
         raise FlightError(
-            f"{ledger} is not what its chain says ({problems[0]}): the copy's ledger was not replaced, and nothing was "
-            f"removed; run `dappled flight check {ledger.parent}`, and move the copy with the wrong one away"
+            f"{ledger} is not what its chain says ({text(problems[0])}): the copy's ledger was not replaced, and "
+            f"nothing was removed; run `dappled flight check {ledger.parent}`, and move the copy with the wrong one "
+            "away"
         )
 
 

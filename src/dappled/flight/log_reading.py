@@ -13,7 +13,6 @@ from pathlib import Path
 from dappled import codec, durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored, parse_json, read_log
-from dappled.errors import counted
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
@@ -26,10 +25,10 @@ _LATEST_US = 1 << 53  # stamps beyond (year 2255) are damage
 
 @dataclass(frozen=True, slots=True)
 class JournalContents:
-    """The shots of a journal in the order of its lines, and a sentence for each line that is not a shot."""
+    """The shots of a journal in the order of its lines, and the lines that are not shots."""
 
     shots: tuple[Shot, ...]
-    problems: tuple[str, ...]
+    problems: tuple[Finding, ...]
 
 
 def read_journal(path: Path) -> JournalContents:
@@ -47,7 +46,8 @@ def read_journal(path: Path) -> JournalContents:
         raise FlightError(f"the shot journal {path} can't be read: {error}") from error
     tail = data[data.rfind(b"\n") + 1 :]
     shots: dict[int, Shot] = {}
-    problems: list[str] = []
+    problems: list[Finding] = []
+    about = Subject("file", str(path))
     unlisted = 0
     for number, line in enumerate(io.BytesIO(data[: len(data) - len(tail)]), 1):
         shot = _parse(line.removesuffix(b"\n"))
@@ -56,13 +56,13 @@ def read_journal(path: Path) -> JournalContents:
         elif len(problems) >= _MOST_LISTED:
             unlisted += 1
         elif shot is None:
-            problems.append(f"line {number} of {path} is not a shot")
+            problems.append(finding(Code.JOURNAL_LINE_DAMAGED, about, path=str(path), line=number))
         else:
-            problems.append(f"line {number} of {path} notes shot {shot.index} again")
+            problems.append(finding(Code.JOURNAL_LINE_AGAIN, about, path=str(path), line=number, shot=shot.index))
     if unlisted:
-        problems.append(f"and {counted(unlisted, 'line')} more of {path}")
+        problems.append(finding(Code.JOURNAL_MORE_LINES, about, path=str(path), lines=unlisted))
     if tail:
-        problems.append(f"the last line of {path} is torn ({len(tail)} bytes)")
+        problems.append(finding(Code.JOURNAL_TORN, about, path=str(path), bytes=len(tail)))
     return JournalContents(tuple(shots.values()), tuple(problems))
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.findings import Code, Finding, Subject, finding, told
+from dappled.findings import Code, Finding, Subject, finding, text, told
 from dappled.flight import later_copy, layout, ledger_copies, places, pruning, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.errors import FlightError, disk_error
@@ -256,7 +256,7 @@ class _Copying:
         found = flight_check.check(self._there.path)
         if found.problems:
             raise FlightError(
-                f"the copy {self._there.path} is not intact ({found.problems[0]}): nothing was removed; "
+                f"the copy {self._there.path} is not intact ({text(found.problems[0])}): nothing was removed; "
                 f"run `dappled flight check {self._folder.path}`"
             )
 

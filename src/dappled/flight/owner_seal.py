@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dappled.clock import Clock
+from dappled.findings import text
 from dappled.flight import layout, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import CheckReport
@@ -33,12 +34,13 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
         found = flight_check.check(folder.path, key)
         if found.problems:
             raise FlightError(
-                f"{flight} is not intact ({found.problems[0]}) and was not signed: run `dappled flight check {flight}`"
+                f"{flight} is not intact ({text(found.problems[0])}) and was not signed: "
+                f"run `dappled flight check {flight}`"
             )
         if found.vouched == "signed":
             return found
         with seals.opened_again(folder, clock, seals.BY_OWNER, key), Ledger(folder.ledger, clock) as ledger:
             known = {event.text for event in ledger.events() if event.kind == seals.CHANGED}
-            if told := [note for note in found.notes if note not in known]:
+            if told := [said for one in found.notes if (said := text(one)) not in known]:
                 ledger.add_event(seals.CHANGED, f"noted before key {key.name} signed it: {'; '.join(told)}")
     return flight_check.check(folder.path, key)

@@ -14,7 +14,7 @@ from pathlib import Path
 from dappled import durable
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.findings import told
+from dappled.findings import text, told
 from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
@@ -123,7 +123,7 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
 
 def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
     journal = log_reading.read_journal(folder.journal)
-    report = [*journal.problems]
+    report = [text(one) for one in journal.problems]
     for shot in journal.shots:
         if ledger.shot(shot.index) is None:
             ledger.add_shot(shot)

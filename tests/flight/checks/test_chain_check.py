@@ -15,7 +15,7 @@ from dappled.flight import FlightFolder, Frame, Ledger, Recording, Result, Stray
 from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
 from dappled.flight.tables import KEYS
-from tests.flight.makers import deliver, held, mavlink_2, request, tag
+from tests.flight.makers import deliver, held, mavlink_2, request, tag, words_of
 
 SEED = 20261122
 EDITS = 50
@@ -94,7 +94,7 @@ def test_a_flight_with_rows_in_every_table_is_intact(recorded: FlightFolder) -> 
         for table in (*KEYS, "chain"):
             assert db.execute(f"SELECT count(*) FROM {table}").fetchone()[0] >= 2, table  # noqa: S608  names of the schema
     report = check(recorded.path)
-    assert report.problems == ()
+    assert words_of(report.problems) == ()
 
 
 @pytest.mark.parametrize("table", [*KEYS, "chain"])
@@ -105,7 +105,7 @@ def test_each_edit_of_a_row_is_named(recorded: FlightFolder, table: str) -> None
         recorded.ledger.write_bytes(before)
         with attacked(recorded) as db:
             done = edit(db, table, chosen)
-        problems = check(recorded.path).problems
+        problems = words_of(check(recorded.path).problems)
         if not any(words in text for text in problems for words in WORDS):
             unseen.append((done, problems))
     assert not unseen
@@ -140,7 +140,7 @@ def test_each_edit_of_a_row_is_named(recorded: FlightFolder, table: str) -> None
 def test_an_edit_is_named(recorded: FlightFolder, sql: str) -> None:
     with attacked(recorded) as db:
         db.executescript(sql)
-    assert check(recorded.path).problems
+    assert words_of(check(recorded.path).problems)
 
 
 def test_a_sentence_names_the_row(recorded: FlightFolder) -> None:
@@ -148,7 +148,7 @@ def test_a_sentence_names_the_row(recorded: FlightFolder) -> None:
         db.execute("UPDATE shots SET wished_utc_ns = 7 WHERE idx = 2")
         db.execute("DELETE FROM results WHERE idx = 1")
         db.execute("INSERT INTO events VALUES (77, 1, 'camera', NULL, 'it never was')")
-    problems = check(recorded.path).problems
+    problems = words_of(check(recorded.path).problems)
     assert "the row of shots 2 was changed since dappled wrote it" in problems
     assert 'the row of results 1,"live" was removed since dappled wrote it' in problems
     assert "the row of events 77 was added by something other than dappled" in problems
@@ -157,7 +157,7 @@ def test_a_sentence_names_the_row(recorded: FlightFolder) -> None:
 def test_a_link_that_does_not_follow_is_named_once(recorded: FlightFolder) -> None:
     with attacked(recorded) as db:
         db.execute("UPDATE chain SET sha256 = ? WHERE number = 25", ("0" * 64,))
-    broken = [text for text in check(recorded.path).problems if text.startswith("link ")]
+    broken = [text for text in words_of(check(recorded.path).problems) if text.startswith("link ")]
     assert len(broken) == 1
     assert "link 25" in broken[0]
 
@@ -179,6 +179,6 @@ def test_a_flight_that_lost_its_chain_is_found_out_and_gets_no_new_one(recorded:
     with attacked(recorded) as db:
         db.execute("DROP TABLE chain")
         db.execute("DELETE FROM facts WHERE key = 'chain'")
-    assert "the chain was removed from the ledger" in check(recorded.path).problems
+    assert "the chain was removed from the ledger" in words_of(check(recorded.path).problems)
     with pytest.raises(FlightError, match="the chain was removed from the ledger"):
         Ledger(recorded.ledger, RecordedClock(78))

@@ -14,7 +14,7 @@ from dappled.findings import Code, Subject, finding
 from dappled.flight import FlightError, FlightFolder, Ledger, LedgerReader, Recording, Result, flight_report
 from dappled.flight.checks.flight_check import check
 from dappled.flight.records import LOST
-from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag
+from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag, words_of
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ FAULTS = [
 def test_a_flight_as_it_was_recorded_is_intact(recorded: FlightFolder) -> None:
     report = check(recorded.path)
     assert report.intact
-    assert (report.files, report.size, report.telemetry_packets, report.notes) == (2, 2000, 20, ())
+    assert (report.files, report.size, report.telemetry_packets, words_of(report.notes)) == (2, 2000, 20, ())
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
@@ -109,14 +109,14 @@ def test_one_fault_is_found(recorded: FlightFolder, fault: Fault) -> None:
     fault.do(recorded)
     report = check(recorded.path)
     assert not report.intact
-    assert any(fault.words in problem for problem in report.problems), report.problems
+    assert any(fault.words in problem for problem in words_of(report.problems)), words_of(report.problems)
 
 
 def test_a_flight_that_is_being_recorded_is_no_fault(flight: Recording) -> None:
     request(flight, 0)
     report = check(flight.folder.path)
     assert report.intact
-    assert "still being recorded" in report.notes[0]
+    assert "still being recorded" in words_of(report.notes)[0]
 
 
 def test_a_crash_while_flight_toml_is_written_anew_is_no_fault(
@@ -133,7 +133,7 @@ def test_a_crash_while_flight_toml_is_written_anew_is_no_fault(
             dying.setattr(durable, "write_file", crash)
             with pytest.raises(KeyboardInterrupt):
                 flight.add_facts({"camera": {"written": written}})
-        assert check(flight.folder.path).problems == ()
+        assert words_of(check(flight.folder.path).problems) == ()
     flight.add_facts({"identity": {"model": "450D"}})
     with LedgerReader.open(flight.folder.ledger) as ledger:
         assert len(ledger.facts()["sha256:flight.toml"]) == 1

@@ -68,8 +68,8 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
 
 def of_check(found: CheckReport) -> Iterator[str]:
     """The problems, the notes, and the verdict."""
-    yield from (f"wrong: {text}" for text in found.problems)
-    yield from (f"note:  {text}" for text in found.notes)
+    yield from (f"wrong: {findings.text(one)}" for one in found.problems)
+    yield from (f"note:  {findings.text(one)}" for one in found.notes)
     word, rest = "NOT INTACT", ""
     if found.intact:
         words, signed = findings.told(found.verdict, found.verdict.subject), found.vouched == "signed"

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled import durable
 from dappled.errors import counted
+from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import layout
 from dappled.flight.layout import FlightFolder
 
@@ -25,10 +26,10 @@ class PlaceFindings:
     """What stands in a flight folder apart from ordinary files, as it was before the ledger was opened: (name relative
     to the flight, sentence). `rollback` says why the ledger can't be opened without being changed."""
 
-    unknown: tuple[tuple[str, str], ...]
-    half_written: tuple[tuple[str, str], ...]
-    empty: tuple[tuple[str, str], ...]
-    left_by_readers: tuple[str, ...]
+    unknown: tuple[Finding, ...]
+    half_written: tuple[Finding, ...]
+    empty: tuple[Finding, ...]
+    left_by_readers: tuple[Finding, ...]
     rollback: str | None
 
 
@@ -37,16 +38,16 @@ def look(folder: FlightFolder) -> PlaceFindings:
     unknown, half_written, empty = [], [], []
     for entry, name in _entries(folder.path):
         if entry.is_symlink():
-            unknown.append((name, f"{name} is a link, which dappled never makes; it was not followed"))
+            unknown.append(_found(Code.FILE_LINKED, name))
         elif name == layout.UNFINISHED:
-            unknown.append((name, "an offload to this folder was cut short: run it again"))
+            unknown.append(_found(Code.FLIGHT_COPY_UNFINISHED, name))
         elif durable.is_temporary(entry.name) and Path(name).parent.as_posix() != folder.frames.name:
-            half_written.append((name, f"{name} is a half-written file"))
+            half_written.append(_found(Code.FILE_HALF_WRITTEN, name))
         elif entry.is_dir():
             if name != folder.frames.name and not os.listdir(entry):
-                empty.append((name, f"{name} is an empty folder, which no seal covers"))
+                empty.append(_found(Code.FLIGHT_EMPTY_FOLDER, name))
         elif not entry.is_file():
-            unknown.append((name, f"{name} is no file (a pipe, a socket or a device), which dappled never makes"))
+            unknown.append(_found(Code.FILE_SPECIAL, name))
     beside = {suffix: folder.ledger.with_name(folder.ledger.name + suffix) for suffix in (*_OF_READERS, _ROLLBACK)}
     rollback = None
     if beside[_ROLLBACK].is_file() and (size := beside[_ROLLBACK].stat().st_size):
@@ -55,7 +56,7 @@ def look(folder: FlightFolder) -> PlaceFindings:
             "SQLite would change the ledger by it, so the ledger was not opened; move it away, and check again"
         )
     left = tuple(
-        f"{path.name} stands beside the ledger: another program has it open, or was killed; it holds no row"
+        _found(Code.FLIGHT_LEFT_OPEN, path.name)
         for suffix, path in beside.items()
         if path.is_file() and (suffix == "-shm" or path.stat().st_size == 0)
     )
@@ -64,24 +65,28 @@ def look(folder: FlightFolder) -> PlaceFindings:
 
 def compare(
     found: PlaceFindings, folder: FlightFolder, recorded_as: str, *, closed: bool, at_work: bool
-) -> tuple[list[str], list[str]]:
-    """(problems, notes). `recorded_as` is the name that the flight was recorded under, "" where that isn't known.
+) -> list[Finding]:
+    """What is wrong, and notes. `recorded_as` is the name that it was recorded under, "" where that isn't known.
 
     While a flight is recorded, files are half-written and the ledger is open; `at_work` after it was opened again and
     not sealed since.
     """
-    problems = [text for _, text in found.unknown]
-    notes: list[str] = []
+    whole = [*found.unknown]
     if recorded_as not in ("", folder.name):
-        text = f"the folder is called {folder.name}, and the flight was recorded as {recorded_as}"
-        (problems if layout.is_flight_name(folder.name) else notes).append(text)
+        level = Level.STOP if layout.is_flight_name(folder.name) else Level.NOTE
+        names = {"folder": folder.name, "recorded": recorded_as}
+        whole.append(Finding(Code.FLIGHT_RENAMED, Subject("flight"), names, level))
     if closed:
-        notes += [text for _, text in found.empty]
-        for name, text in found.half_written:
-            recorded = name.split("/")[0] in _RECORDED or durable.is_temporary(name)
-            (problems if recorded and not at_work else notes).append(text)
-        notes += found.left_by_readers
-    return problems, notes
+        for one in found.half_written:
+            name = str(one.subject.which)
+            recorded = name.split("/", maxsplit=1)[0] in _RECORDED or durable.is_temporary(name)
+            whole.append(one if recorded and not at_work else replace(one, level=Level.NOTE))
+        whole += [*found.empty, *found.left_by_readers]
+    return whole
+
+
+def _found(code: Code, name: str) -> Finding:
+    return finding(code, Subject("file", name), name=name)
 
 
 def _entries(top: Path) -> Iterator[tuple[os.DirEntry[str], str]]:

@@ -10,16 +10,18 @@ from pathlib import Path
 from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.chain import ChainLink
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.tables import TELEMETRY
 
 
-def compare(path: Path, links: Mapping[int, ChainLink]) -> Iterator[str]:
-    """A sentence for each block of the log that differs from its link. Raises FlightError when it can't be read."""
+def compare(path: Path, links: Mapping[int, ChainLink]) -> Iterator[Finding]:
+    """The blocks of the log that differ from their links. Raises FlightError when it can't be read."""
     blocks = [link for link in links.values() if link.subject == TELEMETRY]
     if not blocks:
         return
+    about = Subject("file", path.name)
     try:
         with open(path, "rb", opener=durable.plain_file) as file:
             size = check_stored(file.fileno())
@@ -27,9 +29,9 @@ def compare(path: Path, links: Mapping[int, ChainLink]) -> Iterator[str]:
                 start, end = _range(link.key)
                 file.seek(min(start, size))
                 if hashlib.sha256(file.read(min(end, size) - min(start, size))).hexdigest() != link.sha256:
-                    yield f"{path.name} was changed between bytes {start} and {end}: its SHA-256 is not the chain's"
+                    yield finding(Code.TELEMETRY_BLOCK_CHANGED, about, name=path.name, start=start, end=end)
     except FileNotFoundError:
-        yield f"{path.name} is missing, and the chain covers {len(blocks)} blocks of it"
+        yield finding(Code.TELEMETRY_BLOCKS_MISSING, about, name=path.name, blocks=len(blocks))
     except OSError as error:
         raise disk_error("read the telemetry", path, error) from error
     except ClaimError as error:

@@ -22,6 +22,7 @@ import tomli_w
 from dappled.config import settings as configuration
 from dappled.daemon.camera_protocol.ground_client import GroundClient
 from dappled.drivers.mavlink import mavlink
+from dappled.findings import text
 from dappled.flight import flight_report
 from dappled.flight.checks import flight_check
 from dappled.mocks.simulation import Simulation, World, free_port
@@ -131,7 +132,7 @@ def _settle(
     safe = failed = flights = 0
     for listed in flight_report.list_flights(root):
         flights += 1
-        problems += [f"{listed.name}: {text}" for text in flight_check.check(listed.path).problems]
+        problems += [f"{listed.name}: {text(one)}" for one in flight_check.check(listed.path).problems]
         if listed.balance is None:
             problems.append(f"{listed.name}: {listed.problem}")
             continue
