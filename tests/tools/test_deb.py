@@ -106,7 +106,8 @@ def test_a_package_installs_in_a_bare_root_and_runs_in_a_hostile_folder_there(tm
     verbs = [*VERBS, "open nothing.h5", "doctor --json"]
     tried = [
         f"cd {hostile.path}; export PYTHONPATH=: HOME={hostile.path}; exec </dev/null; set -x",
-        "dappled --version; timeout 120 dappled run --simulate --frames 2",
+        f'test "$(dappled --version)" = "dappled {dappled.__version__}" || exit 8',
+        "dappled run --simulate --frames 2 2>&1 | grep '2 frames safe, 2 decoded, 0 with a problem' || exit 7",
         *(f"timeout 6 dappled {verb} >out 2>&1; case $? in 0|1|2|124) ;; *) cat out; exit 9; esac" for verb in verbs),
         "test ! -e ran",
     ]
@@ -117,9 +118,7 @@ def test_a_package_installs_in_a_bare_root_and_runs_in_a_hostile_folder_there(tm
         'chroot "$1" dpkg -i /tmp/dappled.deb',
         f'chroot "$1" sh {hostile.path}/try.sh',
     ]
-    said = ask(
+    ask(
         "mmdebstrap", "--variant=minbase", "--include=python3,systemd-standalone-sysusers",
         *(f"--customize-hook={hook}" for hook in hooks), "--format=null", suite, "/dev/null",
     )  # fmt: skip
-    assert f"dappled {dappled.__version__}\n" in said
-    assert "2 shots: 2 frames safe, 2 decoded, 0 with a problem" in said
