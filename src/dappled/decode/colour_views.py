@@ -24,6 +24,8 @@ from dappled.decode.depth.evidence import of_views
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
+# Chosen by hand where no figure stands beside a number; benchmarks/colour_views.py measures what they make together.
+
 _AROUND = 11  # samples of a view on each side: what is the same around
 _SMOOTH, _NEARER, _SOFT = 5, 3, 0.6  # samples: the windows of a median, and of the nearest; the last one's blur
 _SLOPE = np.array([1, -8, 0, 8, -1]) / 12  # of a line of samples, exact for polynomials of fourth order

@@ -19,6 +19,8 @@ from dappled.decode.spectrum.slices import extract
 from dappled.decode.spectrum.transform import transform
 from dappled.findings import Code, Finding, Level, Subject
 
+# Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
+
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _CLEAR = 6.5  # times the level around: noise moves a carrier so strong by less than a tenth of a bin
 _ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one

@@ -19,6 +19,8 @@ from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
 from dappled.findings import Code, Finding, Subject, finding
 
+# Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
+
 CALIBRATION = Subject("calibration")
 EXPLAINED_BINS = 2.0  # rms: the residual that a law may leave (the thesis' own readings scatter by 0 to 2)
 PLAUSIBLE = 0.35  # relative: a mask distance further from the stated one is not believed

@@ -26,6 +26,8 @@ from dappled.decode.spectrum.mask_lattice import (
 from dappled.decode.spectrum.peaks import ALONE_NATS, measure, residual_bins
 from dappled.findings import FRAME, Code, Finding, finding
 
+# Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
+
 _ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _SCALE_OFF = {"geometric": 0.06, "fd": 0.35}  # relative: no print, and no distance, is farther off than that
 _STANDS_NATS = 3.5  # above what is around: a peak that is more than noise

@@ -20,6 +20,8 @@ from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.decode.optics import MaskedOptics, Order, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
 
+# Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
+
 _SEARCHED = 1.8  # times or a fraction of the stated distance
 _STEPS = 241  # of the search: 0.5 % of the distance each
 _AMPLITUDE = 1.5e-3  # of the mean: what a wall's own structure and the noise add to a carrier

@@ -25,6 +25,8 @@ from dappled.decode.depth.photo_consistency import WINDOW, Lines
 from dappled.decode.depth.scatter import undecided
 from dappled.decode.lightfield import ViewStack
 
+# Chosen by hand where no figure stands beside a number; benchmarks/depth.py measures what all of them together make.
+
 _CLEAN, _NOISY = 2.0, 200.0  # contrast's share beside photo-consistency, by noise over texture and its square
 _NEGLIGIBLE = 0.3  # with a smaller share contrast only enlarges what is near
 _SMALL, _LARGE = 4.0, 30.0  # P1 and P2, in units of the log-likelihood

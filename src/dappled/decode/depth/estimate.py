@@ -21,6 +21,8 @@ from dappled.decode.depth.photo_consistency import Lines, differences
 from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield import ViewStack
 
+# Chosen by hand where no figure stands beside a number; benchmarks/depth.py measures what all of them together make.
+
 METHODS: Mapping[str, Callable[[Evidence, Search], DepthMap]] = {
     "combined": combined.depth,
     "contrast": contrast.depth,

@@ -23,6 +23,8 @@ from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.lightfield.light_field import Image, needs_parallax
 from dappled.decode.lightfield.views import finest_detail
 
+# Chosen by hand where no figure stands beside a number; benchmarks/depth.py measures what all of them together make.
+
 _LEAST_NOISE = 1e-9  # variance: float32
 _NOISE_FREE = 5e-3  # of the variance of a view's fine detail
 _UNMEASURED = 1e-6  # of the weight of what was measured best

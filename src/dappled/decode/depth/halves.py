@@ -25,6 +25,8 @@ from dappled.decode.depth.evidence import CELLS, Evidence
 from dappled.decode.lightfield.light_field import centred
 from dappled.workers import each, spans
 
+# Chosen by hand where no figure stands beside a number; benchmarks/depth.py measures what all of them together make.
+
 _WINDOW = 3  # px
 _MOST_VOTE, _VOTES = 0.5, 100.0  # measured on the masked frames of benchmarks/depth.py, seeds 1 and 2
 _PAD = 12  # px

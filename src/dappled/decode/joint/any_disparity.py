@@ -20,6 +20,8 @@ from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patch_model import LEAST_NOISE, SIDE, WITHIN, DisparityRange, FrameModel, whitener_of
 
 Doubles = NDArray[np.complex128]
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 # Of a patch's texture, times the mean power of patches like it: chosen by hand, two decades down and one up; measured
 # by benchmarks/views.py.
 STRENGTHS = np.array([0.01, 0.1, 0.3, 1.0, 3.0, 10.0], dtype=np.float32)

@@ -14,6 +14,8 @@ from dappled.decode.joint.patch_model import SIDE
 from dappled.decode.joint.patches import Patches
 from dappled.decode.lightfield import LightField
 
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _NEAR = 0.75  # of the mask's period: 1 σ of the window in which light is taken as even
 _LEAST_KNOWN = 1e-3  # of the window
 _ROWS = 64  # at a time: complex waves take twice the plane's memory

@@ -20,6 +20,8 @@ from dappled.decode.optics import Carrier, Order
 from dappled.findings import FRAME, Code, Finding, finding
 
 ViewsModel = Literal["joint", "independent"]
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _REACH = 1.0  # samples of a slice from view to view: a carrier's order further, and parallax can't be told apart
 _LEAST_TRANSFER = 1e-3  # of the whole light: a carrier that the mask doesn't make tells nothing
 _MOST_BEYOND = 0.1  # of a frame may be beyond the widest range

@@ -46,6 +46,8 @@ from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each
 
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _TEXTURES = 3  # groups of patches of similar texture, each with its own spectrum
 _FEWEST_VIEWS = 3  # along an axis: depth compares them with the middle one
 _FEWEST = 12  # patches in a group

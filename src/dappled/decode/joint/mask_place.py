@@ -33,6 +33,8 @@ from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.optics import Lattice, Order, Sensor
 from dappled.workers import each, spans
 
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _MOST_PATCHES = 400  # those with the most texture
 _FEWEST = 12  # patches, for an answer at all
 _AT_A_TIME = 50  # patches

@@ -17,6 +17,8 @@ from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import Fold, SliceModel, folded
 from dappled.workers import each
 
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 SIDE = 24  # samples: a patch is wide against parallax, and small against things at one disparity
 STEP = SIDE // 2  # from one patch to the next
 FARTHEST = 2.0  # times the reach: nothing that moves farther is told from other things

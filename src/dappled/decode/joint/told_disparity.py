@@ -22,6 +22,8 @@ from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackgrou
 from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, nats_of
 from dappled.decode.joint.patches import Patches
 
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _SMOOTH_PX = 5  # the window of a median: folded detail scatters the depth of single samples
 _LEAST_SHARE = 0.02  # of a patch: less is left out
 _MOST = 8  # disparities in a patch

@@ -12,6 +12,8 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.decode.joint.patch_model import KINDS, USUAL_KINDS
 from dappled.decode.joint.patches import Patches
 
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 # Where things shine through each other a sample has two disparities, and a depth map one. All patches around are then
 # less probable as told than with all disparities at once, there by 3600 nats in the mean; at edges of opaque things
 # single ones are, there by up to 3400, and by 1500 in the mean. Two textures over each other have 34.9 dB as told, and

@@ -32,6 +32,8 @@ from dappled.decode.optics import Lattice, Order
 from dappled.findings import FRAME, Code, Finding, finding
 
 Shape = Literal["beams", "filled", "round"]
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _PARTS = 15  # of a cell's side, where a circle cuts through cells
 SEARCHED = 1.7  # times or a fraction of the nominal κ: an f-number told a third wrong, and a distance of a tenth
 _STEP = 5e-4  # relative: of the search

@@ -23,6 +23,8 @@ from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, tr
 from dappled.decode.optics import Carrier, Order
 
 Views = NDArray[np.float32]
+# Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
+
 _SHARED = 1e3  # variance of what all views share, over that of what one view has alone
 _MODEL_ERROR = 0.45  # over the root of a slice's shorter side: the frame's end rings in a share of each slice
 _COLOURED = 0.3  # of a band's finest detail is counted as chroma; all of it would count parallax as chroma, too

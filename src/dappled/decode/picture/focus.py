@@ -20,6 +20,8 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.decode.picture.blocks import PatternPlace, block_sums, wave_sums
 from dappled.decode.picture.shadow import Shadow, period_of
 
+# Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
+
 _BLOCK_PX, _BLOCK_PERIODS = 64, 8  # a block's side is at least both
 _EDGE = (0.45, 0.55)  # of the carriers' distance: where the band ends
 _SEEN, _SURE = 3.0, 8.0  # ghost and detail over detail: from where on it counts, and counts in full

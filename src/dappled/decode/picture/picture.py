@@ -13,6 +13,8 @@ from dappled.decode.picture.blocks import EMPTY, MosaicPlane, local_mean
 from dappled.decode.picture.focus import Sharp, mixed
 from dappled.decode.picture.shadow import Shadow, ShadowFrom
 
+# Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
+
 DARK = 0.2  # of the mean: behind less of the mask the picture has five times the noise
 _NOISE_PX = 16  # samples on a side of the parts that the noise is measured in
 _NOISE_LEVELS = 6  # of brightness

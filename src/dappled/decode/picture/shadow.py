@@ -24,6 +24,8 @@ from dappled.decode.optics import Lattice, Order
 from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, local_mean, wave_sums
 
 Coefficients = NDArray[np.complex128]
+# Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
+
 _BLOCK_PX, _BLOCK_PERIODS = 64, 4  # a block's side is at least both
 _RIDGE = 1e-6  # of the mean of the diagonal: orders that fall together on a coarse pattern share what they explain
 _DEGREES = (0, 2)  # of the polynomials that are tried

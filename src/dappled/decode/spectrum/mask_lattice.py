@@ -24,6 +24,8 @@ from dappled.decode.spectrum.lattice import Candidate, candidates
 from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, fit, is_suspect, lattice_from, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum, hann
 
+# Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
+
 SCALES = 0.35  # relative: a print's scale and the mask's distance, together
 TURN_RAD = math.radians(8)  # of a mask: what is farther turned is not looked for
 SURE_NATS = 8.0  # log odds against chance, 1 : 3000

@@ -13,6 +13,8 @@ from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum.transform import Complex, Spectrum, hann
 from dappled.findings import FRAME, Code, Finding, finding
 
+# Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
+
 PROMINENCE_NATS = 2.5  # of log magnitude above the median around; the highest of 400 bins of noise reaches 1.1
 ALONE_NATS = 1.6  # for a peak that is expected within a bin: the highest of 10 bins of noise reaches 0.6
 _FEWEST_WITHOUT_OUTLIERS = 6  # peaks that a fit needs once outliers are left out
