@@ -25,7 +25,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import tomli_w
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the tags are the tests' own
+
 from limits import show
+from tests.flight.makers import hot_shoe_tag
 
 from dappled.config import profiles
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
@@ -34,7 +38,7 @@ from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import Frame, Tag, TimeSource
+from dappled.flight import Frame
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products.batch import batch, workers
@@ -80,20 +84,7 @@ def flight(folder: Path, count: int, scale: float) -> list[Job]:
             "interpolated", round(true.t_s * 1e9), None, _radians(true.latitude_deg), _radians(true.longitude_deg),
             true.altitude_msl_m, -true.position_ned_m[2], None, true.attitude, 0.02, 0.001, 1.0, 1,
         )  # fmt: skip
-        tag = Tag(
-            index,
-            pose.utc_ns,
-            1000,
-            TimeSource.HOT_SHOE,
-            50.0,
-            F_NUMBER,
-            0.001,
-            100.0,
-            CAMERA,
-            MASK,
-            frame.sha256,
-            pose,
-        )
+        tag = hot_shoe_tag(frame, pose)
         station = photographs.station(frame, tag, Mounting())
         options = Options(crs="EPSG:32615")
         jobs.append(

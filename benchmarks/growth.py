@@ -19,16 +19,19 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # the tags are the tests' own
+
 from limits import show
+from tests.flight.makers import hot_shoe_tag
 
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Blob
-from dappled.flight import Cause, Shot, Tag, TimeSource, recording
+from dappled.flight import Cause, Shot, recording
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.masked_camera import reference_camera
 
-CAMERA, MASK, F_NUMBER, FOCAL_MM = "reference-36mm", "reference-5x5", 14.8, 50.0
+CAMERA, MASK, F_NUMBER = "reference-36mm", "reference-5x5", 14.8
 LINE, STEP_M, APART_M = 25, 4.0, 6.0
 """Frames of a line, metres between frames, metres between lines."""
 VERBS = ("show", "report", "check", "coverage", "geotag")
@@ -70,22 +73,7 @@ def fly(folder: Path, count: int, file: bytes | None = None) -> Path:
             age_ms=1.0,
             telemetry_packets=1,
         )
-        begun.ledger.add_tag(
-            Tag(
-                index,
-                utc_ns,
-                10_000,
-                TimeSource.HOT_SHOE,
-                FOCAL_MM,
-                F_NUMBER,
-                0.001,
-                100,
-                CAMERA,
-                MASK,
-                frame.sha256,
-                pose,
-            )
-        )
+        begun.ledger.add_tag(hot_shoe_tag(frame, pose, F_NUMBER))
     begun.close()
     return begun.folder.path
 

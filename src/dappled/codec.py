@@ -84,11 +84,6 @@ def read_json(kind: type[Record], text: str | bytes) -> Record:
     return read(kind, value)
 
 
-def words(kind: Any) -> str:
-    """What a field of this type takes: "a whole number"."""
-    return _reader(kind).words
-
-
 def hint(key: str, known: Iterable[str]) -> str:
     """The known key that is next to an unknown one, or all of them."""
     names = list(known)

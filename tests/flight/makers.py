@@ -83,6 +83,12 @@ def tag(frame: Frame) -> Tag:
     )
 
 
+def hot_shoe_tag(frame: Frame, at: Pose, f_number: float = 14.8) -> Tag:
+    """Of a frame of the simulated reference camera, timed by its hot shoe."""
+    lens, body = (50.0, f_number, 0.001, 100.0), ("reference-36mm", "reference-5x5")
+    return Tag(frame.index, at.utc_ns, 10_000, TimeSource.HOT_SHOE, *lens, *body, frame.sha256, at)
+
+
 def mavlink_1(payload: bytes, sequence: int = 0) -> bytes:
     """A MAVLink 1 packet by its framing (the checksum is not looked at)."""
     return bytes((0xFE, len(payload), sequence, 1, 1, 30)) + payload + b"\x12\x34"

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose, Quaternion, camera_pose, metres_per_radian
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.flight import Recording, Tag, TimeSource, recording
+from dappled.flight import Recording, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene import landscape
@@ -24,7 +24,7 @@ from dappled.mocks.scene.flyover import TerrainScene
 from dappled.mocks.scene.landscape import DETAIL_TEXEL_M, EXTENT_M, TEXEL_M
 from dappled.mocks.scene.masked_camera import MaskedCamera, Truth, reference_camera
 from dappled.mocks.simulation import CAMERA, MASK
-from tests.flight.makers import deliver, request
+from tests.flight.makers import deliver, hot_shoe_tag, request
 
 START_NS = 1_795_256_103_000_000_000
 F_NUMBER = 14.8
@@ -95,22 +95,7 @@ def record(begun: Recording, index: int, data: bytes, f_number: float, pose: Pos
     """A frame of a shot, with its tag by the hot shoe."""
     request(begun, index)
     frame = deliver(begun, index, data, f"IMG_{index:04d}.DNG")
-    begun.ledger.add_tag(
-        Tag(
-            index,
-            pose.utc_ns,
-            10_000,
-            TimeSource.HOT_SHOE,
-            50.0,
-            f_number,
-            0.001,
-            100,
-            CAMERA,
-            MASK,
-            frame.sha256,
-            pose,
-        )
-    )
+    begun.ledger.add_tag(hot_shoe_tag(frame, pose, f_number))
 
 
 def as_recorded(true: TruePose) -> Pose:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -11,6 +10,7 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
+from dappled import codec
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_toml, read_bytes
 from dappled.errors import DappledError
@@ -137,9 +137,8 @@ def examine(
     findings = []
     for key in table:
         if key not in fields:
-            near = difflib.get_close_matches(key, fields, 1, 0.4)
-            hint = f"did you mean {near[0]!r}?" if near else f"known: {', '.join(fields)}"
-            findings.append(BadSetting(name, key, f"{source.where(name, key)} is not a known key; {hint}"))
+            text = f"{source.where(name, key)} is not a known key; {codec.hint(key, fields)}"
+            findings.append(BadSetting(name, key, text))
     values = {}
     for key, field in fields.items():
         if key not in table:
@@ -164,13 +163,13 @@ def _convert(value: Any, wanted: Any, rule: Rule, where: str) -> Any:
     if wanted is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
     if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        raise ConfigError(f"{where} = {_shown(value)} must be {_kind(wanted)}")
+        raise ConfigError(f"{where} = {codec.shown(value)} must be {_kind(wanted)}")
     if isinstance(value, int | float) and not isinstance(value, bool):
         unit = f" {rule.unit}" if rule.unit else ""
         if not math.isfinite(value) or not rule.low <= value <= rule.high:
             raise ConfigError(f"{where} = {value} must lie between {rule.low:g} and {rule.high:g}{unit}")
     if rule.choices and value not in rule.choices:
-        raise ConfigError(f"{where} = {_shown(value)} must be one of {', '.join(rule.choices)}")
+        raise ConfigError(f"{where} = {codec.shown(value)} must be one of {', '.join(rule.choices)}")
     return value
 
 
@@ -179,14 +178,8 @@ def _convert_tuple(value: Any, arguments: tuple[Any, ...], rule: Rule, where: st
     if arguments[-1] is Ellipsis:
         return tuple(_convert(v, arguments[0], rule, where) for v in values)
     if len(values) != len(arguments):
-        raise ConfigError(f"{where} = {_shown(value)} must be a list of {len(arguments)} values")
+        raise ConfigError(f"{where} = {codec.shown(value)} must be a list of {len(arguments)} values")
     return tuple(_convert(v, a, rule, where) for v, a in zip(values, arguments, strict=True))
-
-
-def _shown(value: Any) -> str:
-    """A value as a sentence shows it: a long one is cut."""
-    shown = repr(value)
-    return shown if len(shown) <= 80 else f"{shown[:79]}…"
 
 
 def _kind(wanted: type) -> str:
