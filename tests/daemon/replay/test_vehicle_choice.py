@@ -79,6 +79,23 @@ def test_evidence_says_which_vehicle_counts(
     assert [(one["code"], one["facts"]["by"]) for one in found["findings"]] == [("log.vehicle", by)]
 
 
+@pytest.mark.parametrize("camera", [True, False])
+def test_of_three_vehicles_the_one_that_reports_a_camera_counts(
+    frames: Path, capsys: pytest.CaptureFixture[str], camera: bool
+) -> None:
+    def third(step: int) -> list[tuple[int, int, MavlinkMessage]]:
+        there = mavlink.MAVLink_global_position_int_message(9000 + step * 100, 3 * 10**8, 0, 10**5, 10**4, 0, 0, 0, 0)
+        return [(3, 1, there), *(camera_of_2(step) if camera else [])]
+
+    log = logged(frames.parent, extra=third)
+    assert main(["replay", str(frames), "--telemetry", str(log), "--json"]) == (0 if camera else 1)
+    shown = capsys.readouterr()
+    assert ("vehicle 2 counts, by its camera" if camera else "vehicles 1, 2 and 3") in shown.err
+    for vehicle in (1, 2, 3):
+        assert main(["replay", str(frames), "--telemetry", str(log), "--vehicle", str(vehicle), "--json"]) == 0
+        assert north_deg(capsys) == vehicle * 10.0
+
+
 def test_a_vehicle_can_t_be_chosen_without_telemetry(frames: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["replay", str(frames), "--vehicle", "2"]) == 2
     assert "there is no telemetry; leave it out" in capsys.readouterr().err

@@ -136,6 +136,12 @@ class Flight:
         """Exposures that have not arrived."""
         return set(self.made) - {int(found) for _, data in self.events for found in re.findall(rb"shot (\d+)", data)}
 
+    def fired_s(self, shot: int | None) -> float:
+        """When a shot was fired; or had failed, where the link broke in the trigger call."""
+        of_shot = [one for one, _ in self.events if isinstance(one, Fired | ShotFailed) and one.shot == shot]
+        first = of_shot[0]
+        return (first.called_monotonic_ns if isinstance(first, Fired) else first.monotonic_ns) / 1e9
+
     def problems(self) -> list[str]:
         """Stop the camera, and say what went wrong."""
         if self._open and self.shots:
@@ -160,8 +166,7 @@ class Flight:
             made = self.made[number]
             if event.shot in (None, made.shot) or "doubt" in event.facts or event.shot in doubted:
                 continue
-            fired = (one for one, _ in self.events if isinstance(one, Fired) and one.shot == event.shot)
-            if abs(made.at_s - next(fired).called_monotonic_ns / 1e9) > _ALIKE_S:
+            if abs(made.at_s - self.fired_s(event.shot)) > _ALIKE_S:
                 found.append(f"the frame of shot {event.shot} is exposure {number}, of shot {made.shot}")
         if any(one.code is Code.CARD_NOT_LISTED for one in noticed):  # said of all that may be on it
             return found
