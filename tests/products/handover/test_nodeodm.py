@@ -6,6 +6,7 @@ import email.parser
 import email.policy
 import io
 import json
+import shutil
 import threading
 import urllib.parse
 import zipfile
@@ -252,6 +253,16 @@ def test_a_task_that_fails_or_a_transfer_that_breaks_off_leaves_no_file(
     node.states, node.cut = [40], 1
     with pytest.raises(NodeOdmError, match=r"(broke off|ended) the transfer .*; the task goes on there"):
         run(*words[1:])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["jpeg"]
+
+
+def test_results_without_an_end_fill_no_disk(
+    node: FakeNodeOdm, photos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=10**8))
+    with pytest.raises(NodeOdmError, match="has less than 1 GB free left"):
+        run("odm", node.url, str(photos), "-o", str(tmp_path / "model.zip"))
     assert sorted(path.name for path in tmp_path.iterdir()) == ["jpeg"]
 
 

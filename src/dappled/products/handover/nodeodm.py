@@ -11,6 +11,7 @@ import json
 import os
 import re
 import secrets
+import shutil
 import time
 import urllib.error
 import urllib.parse
@@ -37,6 +38,7 @@ _PAUSES_S = (2.0, 4.0, 8.0, 16.0)  # before a picture is sent again
 _ANSWER_BYTES = 1 << 22
 _SAID = 300  # letters of what a server says
 _PIECE_BYTES = 1 << 20
+_LEFT_BYTES = 10**9
 _FIELDS = "application/x-www-form-urlencoded"  # the only kind of form that a task is removed by
 _FAILED, _COMPLETED, _CANCELLED = 30, 40, 50
 _WORDS = {10: "waits for its turn", 20: "is being processed", 30: "has failed", 40: "is done", 50: "was cancelled"}
@@ -211,6 +213,8 @@ class NodeOdm:
                 wanted = answer.headers.get("content-length")
                 with part.open("wb") as file:
                     while piece := self._piece(answer):
+                        if shutil.disk_usage(part.parent).free < _LEFT_BYTES:  # results may have no end
+                            raise NodeOdmError(f"{part.parent} has less than 1 GB free left: free some space")
                         file.write(piece)
                     file.flush()
                     os.fsync(file.fileno())
