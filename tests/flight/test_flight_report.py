@@ -65,9 +65,9 @@ def test_the_report_names_frames_in_doubt_and_what_the_card_holds(
     flight.ledger.add_event("doubt", doubt, 0)
     flight.close()
     assert main(["flight", "report", str(flight.folder.path)]) == 1
-    said = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert f"card: {findings.told(card)}" in said
-    assert "in doubt: frame 0: it may be of shot 1 as well: compare the picture with its neighbours" in said
+    said = capsys.readouterr()
+    assert f"card: {findings.told(card)}" in [line.strip() for line in said.out.splitlines()]
+    assert said.err == "in doubt: frame 0: it may be of shot 1 as well: compare the picture with its neighbours\n"
 
 
 def test_the_report_says_what_stood_and_when(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:

@@ -106,14 +106,14 @@ class ReportFlight(FlightArgument, Verb):
         found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
         sources = codec.plain(by_source)
         values = {**codec.plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
-        agree = found.balanced and found.wishes > 0 and not found.doubts
+        agree = found.balanced and found.wishes > 0
         said = [*flight_lines.of_report(found, by_source)]
         if self.log:
             from dappled.cli.flight import books  # noqa: PLC0415  # the logs' readers take a second to load
 
             third = books.compared(flight, self.log)
             values["log"], said, agree = third.values, [*said, *third.lines], agree and third.balanced
-        return Report(values, said, failed=not agree)
+        return Report(values, said, findings=found.doubts, failed=not agree)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -104,7 +104,6 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:
         yield f"  {counted(found.strays, 'file', 6)} without a shot"
-    yield from (f"  {'in doubt':>13}: {findings.told(one)}" for one in found.doubts)
     yield from (f"  {'card':>13}: {findings.told(one)}" for one in found.card[:_SHOWN])
     if len(found.card) > _SHOWN:
         yield f"  {'':13}  and {len(found.card) - _SHOWN} more (--json names all)"
