@@ -1,0 +1,112 @@
+"""Masked frames in focus by wave optics: what diffraction at the film does, which no rays show. Nothing of `dappled` is
+used here, nor of the rays.
+
+The wave that a lens with a square stop focuses on the sensor point x₀ passes the film at d. The film's amplitude
+Σ t_k e^{2πi k·f x} makes of it Σ t_k e^{2πi k·f x₀} A(x − x₀ − λ d f k) on the sensor, A the stop's own diffraction
+(Fresnel, exact for a wave that converges). Points of the scene don't interfere; a frame is the mean of three colours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+Grid = NDArray[np.float64]
+PITCH_UM, DISTANCE_UM, PER_UM = 10.0, 480.0, 15.5e-3
+COLOURS_UM = (0.45, 0.55, 0.65)
+FINER, ORDERS = 4, 6  # samples a pixel; the film's amplitude has more orders than its transmittance
+
+
+@dataclass(frozen=True)
+class WaveShot:
+    """One exposure of a scene of amplitude f^-exponent up to the sensor's limit."""
+
+    f_number: float
+    exponent: float = 1.1
+    snr: float = 100.0
+    shape: tuple[int, int] = (192, 192)
+    contrast: float = 0.12
+    masked: bool = True
+
+    def scene(self) -> Grid:
+        """On the fine grid, without detail that pixels can't sample."""
+        fy, fx = fft.fftfreq(self.shape[0])[:, None], fft.fftfreq(self.shape[1])[None, :]
+        f = np.hypot(fy, fx)
+        f[0, 0] = 1
+        waves = fft.fft2(np.random.default_rng(5).normal(size=self.shape)) * f**-self.exponent
+        waves[0, 0] = 0
+        waves[self.shape[0] // 2] = waves[:, self.shape[1] // 2] = 0
+        wide = np.zeros([FINER * side for side in self.shape], dtype=complex)
+        down, across = (np.round(fft.fftfreq(side, 1 / side)).astype(int) for side in self.shape)
+        wide[np.ix_(down, across)] = waves
+        made = fft.ifft2(wide).real
+        return np.asarray(np.clip(0.4 + self.contrast * made / made.std(), 0.05, 0.75))
+
+    def light(self) -> Grid:
+        """The frame, free of noise, of mean transmittance 1."""
+        scene, total = self.scene(), np.zeros(self.shape)
+        amplitudes = film_amplitudes() if self.masked else np.pad([[1.0]], ORDERS)
+        y, x = ((np.arange(side) / FINER - (side / FINER - 1) / 2) * PITCH_UM for side in scene.shape)
+        fy, fx = (fft.fftfreq(side, PITCH_UM / FINER) for side in scene.shape)
+        pixel = np.outer(*(np.sinc(f * PITCH_UM) for f in (fy, fx)))
+        reach = 4  # orders of the transmittance that are worth a wave
+        for colour in COLOURS_UM:
+            seen = np.zeros(scene.shape, dtype=complex)
+            for m in np.ndindex(2 * reach + 1, 2 * reach + 1):
+                my, mx = (one - reach for one in m)
+                pairs = amplitudes * shifted(amplitudes, my, mx).conj()
+                if np.abs(pairs).max() < 1e-4:
+                    continue
+                kernel = kernels(fy, my, colour, self.f_number).T @ pairs @ kernels(fx, mx, colour, self.f_number)
+                turn = np.outer(*(np.exp(2j * np.pi * PER_UM * k * at) for k, at in ((my, y), (mx, x))))
+                seen += fft.fft2(scene * turn) * kernel
+            total += fft.ifft2(seen * pixel).real[::FINER, ::FINER]
+        return total / len(COLOURS_UM)
+
+    def noise(self) -> Grid:
+        return np.random.default_rng(77).normal(size=self.shape) * 0.4 / self.snr
+
+
+def film_amplitudes() -> NDArray[np.complex128]:
+    """t_k for −ORDERS … ORDERS on both axes: the film's phase is flat, its transmittance of mean 1."""
+    n = 64
+    turns = 2 * np.pi * np.arange(n) / n
+    line = 1 + np.cos(turns) + np.cos(2 * turns)
+    found = fft.fft2(np.sqrt((np.outer(line, line) + 0.375) / 1.375)) / n**2
+    orders = np.arange(-ORDERS, ORDERS + 1)
+    return np.asarray(found[np.ix_(orders, orders)])
+
+
+def shifted(amplitudes: NDArray[np.complex128], my: int, mx: int) -> NDArray[np.complex128]:
+    """t_{k − m} at k; 0 beyond the last order."""
+    made = np.zeros_like(amplitudes)
+    size = len(amplitudes)
+    to = [slice(max(0, m), size + min(0, m)) for m in (my, mx)]
+    of = [slice(max(0, -m), size + min(0, -m)) for m in (my, mx)]
+    made[to[0], to[1]] = amplitudes[of[0], of[1]]
+    return made
+
+
+def kernels(frequencies: Grid, m: int, colour_um: float, f_number: float) -> NDArray[np.complex128]:
+    """(orders k, frequencies): the transform of A(x − s k) A*(x − s (k − m)) along one axis, s = λ d f; 1 at 0 for
+    m = 0."""
+    edge = 1 / (2 * colour_um * f_number)
+    step = colour_um * DISTANCE_UM * PER_UM
+    low, high = np.maximum(-edge, frequencies - edge), np.minimum(edge, frequencies + edge)
+    width, middle = np.maximum(high - low, 0), (high + low) / 2
+    both = width * np.sinc(step * m * width) * np.exp(-2j * np.pi * step * m * middle) / (2 * edge)
+    k = np.arange(-ORDERS, ORDERS + 1)[:, None]
+    return np.asarray(both * np.exp(-2j * np.pi * step * (k - m) * frequencies))
+
+
+def contrast_left(found: NDArray[np.floating], truth: Grid, band: tuple[float, float], border: int = 16) -> float:
+    """The share of the truth's detail in a band (cycles/px) that a picture holds, by their common waves."""
+    cut = (slice(border, -border),) * 2
+    window = np.outer(*(np.hanning(side - 2 * border) for side in truth.shape))
+    one, other = (fft.fft2((np.asarray(a, np.float64)[cut] - a[cut].mean()) * window) for a in (found, truth))
+    f = np.hypot(fft.fftfreq(one.shape[0])[:, None], fft.fftfreq(one.shape[1])[None, :])
+    inside = (f >= band[0]) & (f < band[1])
+    return float((one * other.conj()).real[inside].sum() / (np.abs(other) ** 2)[inside].sum())
