@@ -100,8 +100,8 @@ MUTATIONS = (
     Mutation(
         "a doubt is dropped on its way to the exit code",
         "cli/decode.py",
-        "return bool(made.doubts)",
-        "return False",
+        "return made.doubts",
+        "return ()",
         ("cli/test_wrong_input.py",),
     ),
     Mutation(
