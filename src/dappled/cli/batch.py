@@ -38,9 +38,10 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
     flights: tuple[Path, ...] = argument("FLIGHT", "flight folders, or a folder of flights", there=True)
     output: Path = option("-o --output", "folder for the results", metavar="DIR")
     kinds: tuple[str, ...] = option(
-        "--as", "per frame: a light field (npz, zarr, h5), a map (cog, kmz), or pictures with position (photos: "
-        "16-bit TIFF and JPEG, and geo.txt for OpenDroneMap); per flight: a rig of the views' cameras (colmap, "
-        "nerfstudio), a catalogue of maps (stac), or a recording for Foxglove and ROS 2 (mcap)", ("npz",),
+        "--as", "per frame: a light field (npz, zarr, h5), a map (cog, kmz), or pictures with position and every "
+        "pixel of the sensor (photos: 16-bit TIFF and JPEG, and geo.txt for OpenDroneMap); per flight: these pictures' "
+        "cameras, with --view ground a rig of the views' (colmap, nerfstudio), a catalogue of maps "
+        "(stac), or a recording for Foxglove and ROS 2 (mcap)", ("npz",),
         choices=tuple(KINDS),
     )  # fmt: skip
     workers: int = option("--workers", "number of processes", os.cpu_count() or 1, low=1, otherwise="one per core")

@@ -103,7 +103,8 @@ class Placing(Mounted):
     )  # fmt: skip
     f_number: float | None = option("--f-number", "f-number, if the frames don't say", None, above=0.0, group="camera")
     view: str = option(
-        "--view", "mean, ground (all views, refocused on it), or the row,column of one view", "mean", metavar="VIEW",
+        "--view", "mean (the picture with every pixel of the sensor), ground (all views, refocused on it), or the "
+        "row,column of one view", "mean", metavar="VIEW",
         group="camera",
     )  # fmt: skip
     grey: bool = flag("--grey", "make grey maps (default: in colour if the frames have colour)", group="camera")
