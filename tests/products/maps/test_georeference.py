@@ -16,13 +16,14 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
-from dappled import codec, findings
+from dappled import findings
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
 from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import Tag, TimeSource, recording
@@ -52,26 +53,22 @@ def words(flight: Flown, output: Path, *more: str) -> list[str]:
 
 
 @pytest.mark.slow
-def test_maps_of_light_fields_in_doubt_say_so(
+def test_maps_of_pictures_in_doubt_say_so(
     short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each kind of doubt once, with the first frame: in the report of a map, and where a flight is refocused."""
-    decode = Darkroom.decode
+    picture = PictureMaker.picture
 
-    def doubted(*given: Any, **named: Any) -> DecodeResult:
-        made = decode(*given, **named)
-        attributes = {
-            **made.light_field.attributes,
-            "doubts": [codec.plain(finding(Code.FRAME_CLIPPED, FRAME, share=0.03))],
-        }
-        return replace(made, light_field=replace(made.light_field, attributes=attributes))
+    def doubted(*given: Any, **named: Any) -> MadePicture:
+        made = picture(*given, **named)
+        return replace(made, findings=(finding(Code.PICTURE_CLIPPED, FRAME, share=0.03),))
 
-    monkeypatch.setattr(Darkroom, "decode", doubted)
-    told = f"in doubt: {findings.told(finding(Code.FRAME_CLIPPED, Subject('frame', '000000'), share=0.03))}"
+    monkeypatch.setattr(PictureMaker, "picture", doubted)
+    told = f"in doubt: {findings.told(finding(Code.PICTURE_CLIPPED, Subject('frame', '000000'), share=0.03))}"
     assert main(words(short_flight, tmp_path / "maps", "--as", "cog")) == 1
     assert capsys.readouterr().err.splitlines().count(told) == 1
     report = json.loads((tmp_path / "maps" / "report.json").read_text())
-    assert [(one["code"], one["subject"]["which"]) for one in report["doubts"]] == [("frame.clipped", "000000")]
+    assert [(one["code"], one["subject"]["which"]) for one in report["doubts"]] == [("picture.clipped", "000000")]
     recipe = ["--camera", short_flight.recipe.camera, "--mask", short_flight.recipe.mask]
     flight = ["--flight", str(short_flight.folder), "--calibration", short_flight.recipe.calibration, *recipe]
     assert main(["refocus", *flight, "--height", "0", "-o", str(tmp_path / "a.tif")]) == 1
