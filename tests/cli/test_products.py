@@ -71,7 +71,7 @@ def test_what_is_made_of_a_light_field_in_doubt_is_in_doubt(
     said = capsys.readouterr()
     assert json.loads(said.out)["doubts"] == codec.plain(doubts)
     lines = "".join(f"in doubt: light field {words[1]}: {told(doubt, FRAME)}\n" for doubt in reversed(doubts))
-    assert said.err == f"{lines}dappled {verb}: written, but in doubt: see above; --anyway accepts that\n"
+    assert said.err == f"{lines}dappled {verb}: done, but in doubt: see above; --anyway accepts that\n"
     (tmp_path / name).unlink()
     assert main([*words, "--anyway"]) == 0
     assert capsys.readouterr().err == lines

@@ -84,7 +84,7 @@ def _refused(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str])
     ):
         assert main([verb, *words, *more]) == 1, verb
         sentence, *more_said = capsys.readouterr().err.strip().splitlines()
-        assert more_said in ([], [f"dappled {verb}: written, but in doubt: see above; --anyway accepts that"])
+        assert more_said in ([], [f"dappled {verb}: done, but in doubt: see above; --anyway accepts that"])
         told.append(sentence)
     assert not (folder / "f.npz").exists()
     assert not (folder / "c.toml").exists()
@@ -147,7 +147,7 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     assert main(["decode", *words, "-o", str(tmp_path / "f.npz")]) == 1
     first, *_, last = capsys.readouterr().err.splitlines()
     assert first.startswith("in doubt: ")
-    assert last == "dappled decode: written, but in doubt: see above; --anyway accepts that"
+    assert last == "dappled decode: done, but in doubt: see above; --anyway accepts that"
     assert code in {one.code for one in light_files.load(tmp_path / "f.npz").doubts}
     assert main(["decode", *words, "--anyway", "-o", str(tmp_path / "g.npz")]) == 0
     said = capsys.readouterr().err
@@ -155,7 +155,7 @@ def test_what_is_not_linear_is_no_calibration_and_a_doubt_of_the_light_field(
     assert "--anyway" not in said
     good = str(dng_of(tmp_path / "good.dng", SHOT, masked))
     assert main(["decode", good, *words, "-o", str(tmp_path / "both")]) == 1
-    assert "written, but in doubt, 1 of 2 frames: see above" in capsys.readouterr().err
+    assert "done, but in doubt, 1 of 2 frames: see above" in capsys.readouterr().err
 
 
 def test_the_same_frame_as_it_is_passes_without_a_doubt(masked: NDArray[np.float32], tmp_path: Path) -> None:

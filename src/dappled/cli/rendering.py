@@ -110,7 +110,7 @@ def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
     if findings.worst(report.findings) > Level.NOTE and not getattr(verb, "anyway", False):
         if isinstance(verb, Doubtable):
             extent = f", {report.extent}" if report.extent else ""
-            output.warn(f"written, but in doubt{extent}: see above; --anyway accepts that")
+            output.warn(f"done, but in doubt{extent}: see above; --anyway accepts that")
         return FAILED
     return FAILED if report.failed else DONE
 

@@ -235,7 +235,7 @@ def test_what_one_form_refuses_the_others_keep(
         f"dappled batch: {full}",
         f"in doubt: frame second/000000: {told(CLIPPED, FRAME)}",
         f"in doubt: frame first/000000: {told(CLIPPED, FRAME)}",
-        "dappled batch: written, but in doubt: see above; --anyway accepts that",
+        "dappled batch: done, but in doubt: see above; --anyway accepts that",
     ]
     rows = [json.loads(line) for line in said.out.splitlines()]
     assert [sorted(row["refused"]) for row in rows] == [["stac"], [], ["stac"], []]
