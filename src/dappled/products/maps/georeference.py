@@ -91,7 +91,8 @@ class Survey:
         finest = min(one.eye.gsd_m(_below(one, self.ground)) for one in self.photographs)
         chosen = self.gsd_m / finest
         largest = max(math.prod(one.eye.shape) for one in self.photographs)
-        step = int(chosen) if chosen > _CHOSEN else round(math.sqrt(largest / _SWEPT_PX))
+        step = round(math.sqrt(largest / _SWEPT_PX))
+        step = min(step, int(chosen)) if chosen > _CHOSEN else step
         if step < 2:
             return self
         gsd_m = self.gsd_m if chosen > _CHOSEN else _two_digits(step * self.gsd_m)
