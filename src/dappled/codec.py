@@ -79,7 +79,7 @@ def read_json(kind: type[Record], text: str | bytes) -> Record:
     """The record in a JSON text. Raises CodecError."""
     try:
         value = json.loads(text)
-    except (ValueError, RecursionError) as error:
+    except (ValueError, TypeError, RecursionError) as error:  # a ledger's column may hold what is no text
         raise CodecError(f"it is not JSON: {error}") from None
     return read(kind, value)
 

@@ -186,6 +186,16 @@ def test_a_record_that_is_no_record_is_told(tmp_path: Path) -> None:
                 ledger.tags()
 
 
+def test_a_record_that_is_no_text_is_told(tmp_path: Path) -> None:
+    with ledger_at(tmp_path / "flight.sqlite") as ledger:
+        for table, read in (("tags", ledger.tags), ("facts", ledger.facts)):
+            ledger._rows(f"DROP TABLE {table}")
+            ledger._rows(f"CREATE TABLE {table} (idx, key, record, value)")
+            ledger._rows(f"INSERT INTO {table} VALUES (1, 'x', NULL, NULL)")  # noqa: S608  a constant
+            with pytest.raises(FlightError, match="can't be read"):
+                read()
+
+
 def test_a_full_disk_is_told(tmp_path: Path) -> None:
     with ledger_at(tmp_path / "flight.sqlite") as ledger:
         ledger._rows("PRAGMA max_page_count = 1")

@@ -95,3 +95,11 @@ def test_a_name_that_is_none(flight: Recording, recipe: Recipe, name: str) -> No
 def test_a_flight_that_is_still_recorded_gets_no_run(flight: Recording, recipe: Recipe) -> None:
     with pytest.raises(DappledError, match="still being recorded"):
         RunWriter(flight.folder.path, Run("second", recipe, NAMES), RecordedClock(5))
+
+
+@pytest.mark.parametrize("fact", [5, {"names": {}}, {"recipe": 1, "names": 1}, {"recipe": {"camera": 5}, "names": {}}])
+def test_a_run_that_can_not_be_read_is_told(flight: Recording, fact: object) -> None:
+    flight.ledger.set_fact("run:second", fact)
+    flight.close()
+    with pytest.raises(DappledError, match=r"the run 'second' of .* can't be read"):
+        runs.of_flight(flight.folder.path, "second")

@@ -88,8 +88,13 @@ def of_flight(flight: Path, name: str) -> Run:
     if fact is None:
         runs = sorted(key.removeprefix("run:") for key in facts if key.startswith("run:"))
         raise DappledError(f"{flight} has no run {name!r}; it has {', '.join(runs) or 'only the flight itself'}")
-    recipe = codec.read(Recipe, {**fact["recipe"], **_absolute(fact["recipe"], flight)})
-    return Run(name, recipe, codec.read(Names, fact["names"]))
+    try:
+        recipe = codec.read(Recipe, {**fact["recipe"], **_absolute(fact["recipe"], flight)})
+        return Run(name, recipe, codec.read(Names, fact["names"]))
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DappledError(
+            f"the run {name!r} of {flight} can't be read: {error}; run it anew under another name"
+        ) from None
 
 
 def _fact(name: str) -> str:
