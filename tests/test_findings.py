@@ -50,6 +50,10 @@ def test_words_take_the_facts() -> None:
     assert findings.told(one) == f"frame 4: {findings.text(one)}: compare the picture with its neighbours"
 
 
+def test_a_small_share_of_a_picture_is_not_told_as_none() -> None:
+    assert findings.text(finding(Code.PICTURE_SOFT, Subject("picture"), share=0.0017)).startswith("0.17% of it")
+
+
 def test_facts_from_a_damaged_file_are_shown_as_they_are() -> None:
     one = Finding(Code.CAMERA_ABSENT, Subject("camera"), {"reason": ""})
     assert findings.text(one) == "the camera is absent"
