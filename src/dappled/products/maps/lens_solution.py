@@ -128,7 +128,8 @@ def solve(
         if settled:
             break
     best = replace(given, seen=replace(seen, sigma_px=sigma_px), used=inliers)
-    covariance = np.linalg.inv(_normal(best, state, prior, free).reduced(0.0)[0])[:_LENS, :_LENS]
+    variances = _variances(_normal(best, state, prior, free).reduced(0.0)[0])[:_LENS]
+    variances = np.where(variances > 0, variances, prior.lens**2)  # where rounding leaves nothing, nothing is learnt
     v, x, y, k1, k2, p1, p2 = state.lens
     solved = Lens(
         lens.focal_length_mm,
@@ -137,8 +138,13 @@ def solve(
         (float(k1), float(k2), float(p1), float(p2), lens.distortion[4]),
     )
     moved = tuple(_eye(eye, state.lens, solved, state.turns[n], state.centres[n]) for n, eye in enumerate(eyes))
-    own = np.sqrt(np.diag(covariance)) * units
-    return LensSolution(solved, own, moved, state.places, inliers, sigma_px, before_px)
+    return LensSolution(solved, np.sqrt(variances) * units, moved, state.places, inliers, sigma_px, before_px)
+
+
+def _variances(weights: Floats) -> Floats:
+    """(q,) diagonal of the inverse of a symmetric (q, q) matrix."""
+    units = 1 / np.sqrt(np.diag(weights))  # metres, radians and shares differ by many powers of ten
+    return np.asarray(np.diag(np.linalg.inv(weights * np.outer(units, units))) * units**2)
 
 
 def _eye(eye: Eye, lens: Floats, solved: Lens, rotation: Floats, centre: Floats) -> Eye:
