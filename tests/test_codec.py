@@ -255,7 +255,7 @@ def test_toml_leaves_out_what_is_unknown() -> None:
 
 def test_an_unknown_number_is_never_written_as_one() -> None:
     with pytest.raises(ValueError, match="JSON compliant"):
-        codec.canonical(finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=float("nan")))
+        codec.canonical(Finding(Code.FRAME_CLIPPED, Subject("frame", 1), {"share": float("nan")}))
 
 
 def test_a_number_stays_of_its_kind() -> None:

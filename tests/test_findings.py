@@ -67,6 +67,13 @@ def test_a_number_that_no_format_takes_is_shown() -> None:
     assert findings.text(finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=10**400))
 
 
+def test_a_number_that_is_not_finite_is_unknown_and_the_finding_survives_the_ledger() -> None:
+    one = finding(Code.FRAME_CLOCK_DISAGREES, Subject("frame", 4), off_s=float("nan")).with_facts(far_s=float("inf"))
+    back = findings.of_json_text(findings.json_text(one))
+    assert back is not None
+    assert back.facts == {"off_s": None, "far_s": None}
+
+
 def test_a_subject_that_is_no_name_is_refused() -> None:
     row = codec.plain(finding(Code.FRAME_CLIPPED, Subject("frame", 1), share=0.1))
     assert findings.of_json_text(json.dumps(row)) is not None

@@ -7,6 +7,7 @@ sentences; no code reads a sentence back.
 from __future__ import annotations
 
 import json
+import math
 import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
@@ -388,7 +389,7 @@ class Finding:
 
     def with_facts(self, **more: Value) -> Self:
         """It with more facts, or others."""
-        return replace(self, facts={**self.facts, **more})
+        return replace(self, facts={**self.facts, **_known(more)})
 
     def number(self, name: str) -> int:
         """A whole number of its facts; 0 where there is none of this name."""
@@ -415,8 +416,13 @@ def of_json_text(words: str) -> Finding | None:
 
 
 def finding(code: Code, subject: Subject, level: Level | None = None, **facts: Value) -> Finding:
-    """A finding with its code's own level, unless another is given."""
-    return Finding(code, subject, facts, WORDS[code].level if level is None else level)
+    """A finding with its code's own level, unless another is given. A number that isn't finite is unknown: None."""
+    return Finding(code, subject, _known(facts), WORDS[code].level if level is None else level)
+
+
+def _known(facts: Mapping[str, Value]) -> dict[str, Value]:
+    """Facts as JSON has them, and the codec reads them back."""
+    return {name: None if isinstance(one, float) and not math.isfinite(one) else one for name, one in facts.items()}
 
 
 def worst(found: Iterable[Finding]) -> Level:
