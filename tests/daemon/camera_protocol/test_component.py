@@ -205,6 +205,26 @@ def test_one_request_one_shot_acknowledged_at_once() -> None:
     assert rig.fired == [5]
 
 
+@pytest.mark.parametrize("target", [(0, 0), (1, 0), (1, 100)])
+@pytest.mark.parametrize(
+    ("command", "parameters"), [(203, (0.0, 0, 0, 0, 1)), (2000, (0.0, 0, 1, 0)), (2000, (0.0, 2.0, 3))]
+)
+def test_a_request_that_says_that_it_repeats_is_no_second_shot(
+    command: int, parameters: tuple[float, ...], target: tuple[int, int]
+) -> None:
+    """A broadcast 203, which nobody acknowledges and which has no number, repeated with confirmation 1."""
+    rig = Rig()
+    rig.tick(4)
+    for confirmation in (0, 1, 2):
+        result = rig.command(command, *parameters, target=target, confirmation=confirmation)
+        assert result == mavlink.MAV_RESULT_ACCEPTED
+        rig.clock.advance(0.7)
+    assert rig.fired == [5]
+    rig.clock.advance(11)
+    rig.command(command, *parameters, target=target)
+    assert rig.fired == [5, 6]
+
+
 def test_px4s_triple_is_one_shot() -> None:
     rig = Rig()
     rig.tick(4)

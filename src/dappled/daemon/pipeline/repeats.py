@@ -4,8 +4,8 @@
    within 2.5 s over another link, is one packet (`PacketDedup`).
 2. Retry. A capture request of the same source, kind and sequence within 1.2 s of the last such message, and within
    2.4 s of the first, is a retry of it. With `confirmation` above 0 (the sender itself says that it repeats) 10 s
-   instead of both. Holds for messages that are acknowledged (their sender repeats when it misses the answer) or that
-   carry a sequence (`RecentRequests`).
+   instead of both. Holds for messages that are acknowledged (their sender repeats when it misses the answer), that
+   carry a sequence, or whose `confirmation` is above 0 (`RecentRequests`).
 3. One trigger, several messages. PX4 sends CAMERA_TRIGGER, IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for one trigger,
    and a vehicle on two links sends each of them twice. Within 0.3 s of a shot's first message, a message of the same
    source belongs to that shot if the shot has none of this kind from this link yet, and none of this kind with another
@@ -138,7 +138,7 @@ class RecentRequests:
                 del self._instants[next(iter(self._instants))]
 
     def _retry(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
-        if not request.acknowledged and request.sequence is None:
+        if not request.acknowledged and request.sequence is None and request.confirmation == 0:
             return None
         for known in reversed(self._requests):
             if known.key() != _request_key(request):
