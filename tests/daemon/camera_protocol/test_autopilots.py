@@ -493,6 +493,41 @@ def px4_rig(**options: object) -> Rig:
     return rig
 
 
+def numbered(number: int, at_s: int) -> MavlinkMessage:
+    """PX4's trigger, by the time since its boot."""
+    return mavlink.MAVLink_camera_trigger_message(BOOT_US + at_s * 10**6, number)
+
+
+def test_triggers_that_are_lost_after_px4s_counter_was_set_back_are_named() -> None:
+    """MAV_CMD_DO_TRIGGER_CONTROL with parameter 2 = 1, which is not forwarded to the camera: its numbers start again
+    below the highest one, and nothing was missed until they reached it."""
+    rig = px4_rig()
+    heard = [*range(7), 9, 0, 1, 2, 5, 6, 0, 1, 4]  # 7, 8; then 3, 4; then 2, 3 are lost
+    for at_s, number in enumerate(heard):
+        rig.tick(1.0)
+        hear(rig, [numbered(number, at_s)])
+    rig.tick(5)
+    assert named(rig) == [(7, 8), (3, 4), (2, 3)]
+    assert len(rig.fired) == len(heard)
+
+
+def test_late_numbers_of_a_slow_second_link_set_no_counter_back() -> None:
+    rig = px4_rig()
+    for at_s, number in enumerate(range(1, 8)):
+        rig.tick(0.3)
+        hear(rig, [numbered(number, at_s)] if number not in (3, 4) else [])
+    for late in (4, 3):
+        rig.tick(0.3)
+        hear(rig, [numbered(late, late - 1)])
+    rig.tick(5)
+    assert (named(rig), len(rig.fired)) == ([], 7)
+    for number, at_s in ((1, 10), (7, 6), (2, 11)):  # set back; a copy from before; the next one
+        rig.tick(1.0)
+        hear(rig, [numbered(number, at_s)])
+    rig.tick(5)
+    assert (named(rig), len(rig.fired)) == ([], 9)
+
+
 @pytest.mark.parametrize(("sender", "after_s"), [(AUTOPILOT, 600.0), ((9, 1), 1.0)])
 def test_old_shots_without_a_number_and_those_of_others_cover_no_loss(sender: tuple[int, int], after_s: float) -> None:
     """Items of a mission, or another vehicle's, became shots; then triggers were lost, and the books balanced."""

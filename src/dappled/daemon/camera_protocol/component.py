@@ -17,6 +17,7 @@ from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import CameraModel, CameraStatus, Captured, image_captured
 from dappled.daemon.camera_protocol.commands import (
     ACCEPTED,
+    AUTOPILOT,
     UNSUPPORTED,
     CameraCommands,
     Command,
@@ -319,6 +320,9 @@ class Component:
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
         sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
+        sent_us = int(message.time_usec) if name == "CAMERA_TRIGGER" else 0  # a contact repeats ArduPilot's number
+        if message.get_srcComponent() != AUTOPILOT or self._autopilot.is_stale(sent_us):
+            sent_us = 0
         numbers, now_ns = self._autopilot.numbers[name], self._clock.monotonic_ns()
         if name == "CAMERA_FEEDBACK":
             ours = self._feedback.is_trigger(message, self._here)
@@ -327,7 +331,7 @@ class Component:
             if not ours or self._shutter.fires:
                 return  # the hot shoe's time of a known shot: telemetry uses it
         if self._autopilot.is_echo(packet, name):
-            numbers.heard(sequence, now_ns, self._here)
+            numbers.heard(sequence, now_ns, self._here, time_us=sent_us)
             return
         request = CaptureRequest(
             f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}",
@@ -345,7 +349,7 @@ class Component:
             decision = self._shutter.request(request)
             known = decision.outcome == "duplicate"
         finally:  # a shot that could not be fired is in the books as failed, and not lost
-            numbers.heard(sequence, now_ns, self._here, known=known)
+            numbers.heard(sequence, now_ns, self._here, known=known, time_us=sent_us)
         if not decision.accepted:
             self.say(decision.words)
             self.state_changed()

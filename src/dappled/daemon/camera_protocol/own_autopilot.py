@@ -275,13 +275,16 @@ class TriggerNumbers:
     A number that is passed over is waited for `LATE_NS`: a second link may bring it, or a message without a number may
     have become its shot. Times are monotonic. A jump of more than `MOST_LOST` numbers is told as one: nobody can say
     whether they were lost or the counter was set. If the numbers go back into the jump, a wrong number was heard, and
-    nothing is told. All methods may be called from any thread.
+    nothing is told. A number that is not above the highest one, at a later time of the autopilot's own, shows that its
+    counter was set back (PX4: MAV_CMD_DO_TRIGGER_CONTROL with parameter 2 = 1). All methods may be called from any
+    thread.
     """
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._heard: deque[int] = deque(maxlen=MOST_LOST)
         self._heard_ns = 0
+        self._latest_us = self._set_back_us = 0  # by the autopilot's clock; 0: none since its start
         self._top: int | None = None
         self._missing: dict[int, tuple[int, str]] = {}  # when it counts as lost, and where that was noticed
         self._jumps: list[_Jump] = []
@@ -289,9 +292,19 @@ class TriggerNumbers:
         # when messages without a number became shots whose number is not known
         self._unnumbered: deque[int] = deque(maxlen=MOST_LOST)
 
-    def heard(self, number: int, now_ns: int, where: Callable[[], str], *, known: bool = False) -> None:
-        """A request, or a shot's own message, with this number has come. `known`: another message made its shot."""
+    def heard(
+        self, number: int, now_ns: int, where: Callable[[], str], *, known: bool = False, time_us: int = 0
+    ) -> None:
+        """A request, or a shot's own message, with this number has come. `known`: another message made its shot.
+        `time_us`: when, by the autopilot's clock; 0: the kind has none."""
         with self._lock:
+            if 0 < time_us < self._set_back_us <= time_us + STALE_US:
+                return  # late, with a number of before the counter was set back
+            if 0 < self._latest_us < time_us and self._goes_back(number):
+                self._over += self._take(now_ns, at_once=True)
+                self._heard.clear()
+                self._top, self._set_back_us = 0, time_us
+            self._latest_us = max(self._latest_us, time_us)
             if number not in self._heard:
                 self._reach(number, now_ns, where)
                 if not known and not self._missing:
@@ -333,6 +346,7 @@ class TriggerNumbers:
             last = self._heard[-1] if self._heard and self._heard_ns > since_ns else None
             self._heard.clear()
             self._unnumbered.clear()
+            self._latest_us = self._set_back_us = 0
             self._top = 0 if last is None else last
             if last is not None:
                 self._heard.append(last)
@@ -360,6 +374,11 @@ class TriggerNumbers:
             *(_lost(Code.TRIGGER_LOST, *run) for run in runs),
             *(_lost(Code.TRIGGER_JUMP, jump.first, jump.last, jump.where) for jump in jumps),
         ]
+
+    def _goes_back(self, number: int) -> bool:
+        """Whether it is not above the highest number, and none of a jump, whose end was a wrong number then."""
+        jumped = any(jump.first <= number <= jump.last for jump in self._jumps)
+        return self._top is not None and number <= self._top and not jumped
 
     def _miss(self, number: int, now_ns: int, where: Callable[[], str]) -> None:
         if number not in self._heard:
