@@ -287,6 +287,17 @@ def test_what_is_asked_for_follows_its_acknowledgement(command: int, parameters:
     assert [m.get_type() for m in rig.sent] == ["COMMAND_ACK", then]
 
 
+@pytest.mark.parametrize(("command", "before"), [(mavlink.MAV_CMD_REQUEST_MESSAGE, (261.0,)), (525, ())])
+@pytest.mark.parametrize(("storage", "known"), [(0, True), (NAN, True), (1, True), (2, False), (255, False)])
+def test_the_disk_is_storage_1_and_there_is_no_other(
+    command: int, before: tuple[float, ...], storage: float, *, known: bool
+) -> None:
+    rig = Rig()
+    result = rig.command(command, *before, storage, 1)
+    assert result == (mavlink.MAV_RESULT_ACCEPTED if known else mavlink.MAV_RESULT_DENIED)
+    assert [m.storage_id for m in rig.of("STORAGE_INFORMATION")] == [1] * known
+
+
 def test_past_images_are_answered_failures_too_and_without_an_index_one_after_the_other() -> None:
     rig = Rig()
     rig.tick(4)

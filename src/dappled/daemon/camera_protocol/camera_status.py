@@ -25,6 +25,7 @@ from dappled.flight.layout import DiskSpace
 
 log = logging.getLogger(__name__)
 ZOOM = "CAM_FOCALLEN"
+STORAGE_ID = 1  # of the disk, the only one
 UNKNOWN_INT32 = 2**31 - 1
 _NAN = math.nan
 _NEAREST_M, _FARTHEST_M = 0.3, 655.0  # what DISTANCE_SENSOR's centimetres can say
@@ -368,12 +369,12 @@ def _storage(disk: DiskSpace | None, boot_ms: int) -> MavlinkMessage:
     """STORAGE_INFORMATION (261) in MiB. READY, else ground stations disable the shutter; NOT_SUPPORTED: unknown."""
     if disk is None:
         return mavlink.MAVLink_storage_information_message(
-            boot_ms, 1, 1, mavlink.STORAGE_STATUS_NOT_SUPPORTED, _NAN, _NAN, _NAN, _NAN, _NAN
+            boot_ms, STORAGE_ID, 1, mavlink.STORAGE_STATUS_NOT_SUPPORTED, _NAN, _NAN, _NAN, _NAN, _NAN
         )
     total, used, available = (part / 2**20 for part in (disk.total, disk.used, disk.available))
     return mavlink.MAVLink_storage_information_message(
         boot_ms,
-        1,
+        STORAGE_ID,
         1,
         mavlink.STORAGE_STATUS_READY,
         total,

@@ -11,7 +11,7 @@ from typing import Protocol
 
 from dappled import findings
 from dappled.clock import Clock
-from dappled.daemon.camera_protocol.camera_status import ZOOM, CameraStatus
+from dappled.daemon.camera_protocol.camera_status import STORAGE_ID, ZOOM, CameraStatus
 from dappled.daemon.camera_protocol.parameters import Parameters, unsigned_refusal
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.daemon.pipeline.shutter import CANNOT_FIRE, ShotDecision, Shutter
@@ -305,11 +305,19 @@ class CameraCommands:
             return self._old_image(command, 2)
         if number == mavlink.MAVLINK_MSG_ID_MESSAGE_INTERVAL:
             return self._get_interval(command, 2)
+        if number == mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION:
+            return self._storage(command, 2)
         return self._send_status(number)
 
     def _send_status(self, number: int) -> CommandAnswer:
         message = self._status.about(number)
         return CommandAnswer(UNSUPPORTED) if message is None else CommandAnswer(ACCEPTED, (message,))
+
+    def _storage(self, command: Command, place: int = 1) -> CommandAnswer:
+        """261: the disk, storage 1, is the only one; 0 (and NaN) are all."""
+        if command.integer(place) not in (0, STORAGE_ID):
+            return CommandAnswer(DENIED)
+        return self._send_status(mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION)
 
     def _request_image(self, command: Command) -> CommandAnswer:
         return self._old_image(command, 1)
@@ -425,7 +433,7 @@ class CameraCommands:
 
 
 def _requests(number: int) -> Callable[[CameraCommands, Command], CommandAnswer]:
-    """The old 52x commands: one message each, whatever parameter 1 says (Mission Planner sends 0)."""
+    """The old 52x commands without a storage: one message each, whatever parameter 1 says (Mission Planner sends 0)."""
     return lambda commands, command: commands._send_status(number)
 
 
@@ -440,7 +448,7 @@ _COMMANDS: dict[int, Callable[[CameraCommands, Command], CommandAnswer]] = {
     mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: CameraCommands._set_interval,
     mavlink.MAV_CMD_REQUEST_CAMERA_INFORMATION: _requests(mavlink.MAVLINK_MSG_ID_CAMERA_INFORMATION),
     mavlink.MAV_CMD_REQUEST_CAMERA_SETTINGS: _requests(mavlink.MAVLINK_MSG_ID_CAMERA_SETTINGS),
-    mavlink.MAV_CMD_REQUEST_STORAGE_INFORMATION: _requests(mavlink.MAVLINK_MSG_ID_STORAGE_INFORMATION),
+    mavlink.MAV_CMD_REQUEST_STORAGE_INFORMATION: CameraCommands._storage,
     mavlink.MAV_CMD_REQUEST_CAMERA_CAPTURE_STATUS: _requests(mavlink.MAVLINK_MSG_ID_CAMERA_CAPTURE_STATUS),
     mavlink.MAV_CMD_REQUEST_CAMERA_IMAGE_CAPTURE: CameraCommands._request_image,
     mavlink.MAV_CMD_SET_CAMERA_MODE: CameraCommands._set_mode,
