@@ -653,6 +653,23 @@ def test_a_stranger_cannot_zoom_which_changes_how_frames_are_decoded() -> None:
     assert rig.of("STATUSTEXT")[0].text.startswith("no zoom: CAM_FOCALLEN can't be set")
 
 
+def test_an_accepted_zoom_is_answered_with_the_settings_and_again_when_the_body_has_it() -> None:
+    """Peers wait for CAMERA_SETTINGS, also where the lens is there already or the command is a retry."""
+    rig = Rig()
+    rig.tick(4)
+    rig.body.now["focal_length"] = Setting("focal_length", "18", ("18", "24", "35", "55"))
+    for kind, value in ((0, 1.0), (0, 1.0), (2, 0.0), (3, 55.0)):
+        assert rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, kind, value) == mavlink.MAV_RESULT_ACCEPTED
+        assert [m.get_type() for m in rig.sent] == ["COMMAND_ACK", "CAMERA_SETTINGS"]
+        assert rig.sent[1].zoomLevel == 0.0
+    rig.body.take("focal_length", "55")
+    rig.sent.clear()
+    rig.component.settings_changed()
+    assert rig.of("CAMERA_SETTINGS")[0].zoomLevel == 100.0
+    rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 2, 101.0)
+    assert rig.of("CAMERA_SETTINGS") == []
+
+
 def test_a_repeated_zoom_step_is_one_step_and_another_step_is_another() -> None:
     rig = Rig()
     rig.tick(4)

@@ -392,7 +392,7 @@ class CameraCommands:
         )
         now_ns = self._clock.monotonic_ns()
         if kind == _ZOOM_STEP and self._steps.same(step, now_ns) is not None:
-            return CommandAnswer(ACCEPTED)  # a retry: its sender missed the answer
+            return CommandAnswer(ACCEPTED, (self._status.settings(),))  # a retry: its sender missed the answer
         at = self._zoom_target(kind, value, [mm for mm, _ in lengths])
         if at is None:
             return CommandAnswer(DENIED, words="zoom goes by step, range, focal length or field of view")
@@ -403,7 +403,7 @@ class CameraCommands:
         self._steps.forget(replace(step, series=(kind, -value)))  # forth, back and forth again is three steps
         if kind == _ZOOM_STEP:
             self._steps.add(step, now_ns, at)
-        return CommandAnswer(ACCEPTED)
+        return CommandAnswer(ACCEPTED, (self._status.settings(),))  # again when the body has reported it
 
     def _zoom_target(self, kind: int, value: float, lengths_mm: list[float]) -> int | None:
         last = len(lengths_mm) - 1
