@@ -628,7 +628,7 @@ def test_zoom_and_focus_by_hand_are_refused_in_words() -> None:
 @pytest.mark.parametrize(
     ("kind", "value", "wanted"),
     [(3, 33.0, "35"), (3, 1e9, "55"), (2, 0.0, "18"), (2, 100.0, "55"), (0, 1.0, "35"), (0, -1.0, "18"),
-     (4, 63.0, "18"), (1, 1.0, None), (2, 101.0, None), (3, NAN, None), (4, 200.0, None)],
+     (4, 63.0, "18"), (1, 0.5, "35"), (1, NAN, None), (2, 101.0, None), (3, NAN, None), (4, 200.0, None)],
 )  # fmt: skip
 def test_a_lens_that_can_be_set_zooms_to_the_nearest_focal_length(kind: int, value: float, wanted: str | None) -> None:
     rig = Rig()
@@ -653,12 +653,41 @@ def test_a_stranger_cannot_zoom_which_changes_how_frames_are_decoded() -> None:
     assert rig.of("STATUSTEXT")[0].text.startswith("no zoom: CAM_FOCALLEN can't be set")
 
 
+def test_a_continuous_zoom_goes_on_until_it_is_stopped_or_at_the_end() -> None:
+    """HAS_BASIC_ZOOM is declared, and ZOOM_TYPE_CONTINUOUS was denied."""
+    rig = Rig()
+    rig.tick(4)
+    rig.body.now["focal_length"] = Setting("focal_length", "18", ("18", "24", "35", "55", "70"))
+
+    def asked(direction: float | None, seconds: float = 0.0) -> list[str]:
+        """What the body was asked for since."""
+        rig.body.asked.clear()
+        if direction is not None:
+            assert rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 1, direction) == mavlink.MAV_RESULT_ACCEPTED
+            assert len(rig.of("CAMERA_SETTINGS")) == 1
+        for _ in range(round(10 * seconds)):
+            if rig.body.asked:
+                rig.body.take("focal_length", rig.body.asked[-1][1])
+            rig.tick(0.1)
+        return [value for _, value in rig.body.asked]
+
+    assert asked(1.0, 1.5) == ["24", "35"]
+    assert asked(1.0) == []  # a retry
+    assert asked(0.0, 3.0) == []
+    assert asked(1.0, 5.0) == ["55", "70"]
+    assert asked(-1.0, 1.5) == ["55", "35"]
+    assert asked(0.3, 0.5) == ["55"]
+    rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, 2, 0.0)  # another zoom ends it
+    assert asked(None, 3.0) == []
+
+
 def test_an_accepted_zoom_is_answered_with_the_settings_and_again_when_the_body_has_it() -> None:
     """Peers wait for CAMERA_SETTINGS, also where the lens is there already or the command is a retry."""
     rig = Rig()
     rig.tick(4)
     rig.body.now["focal_length"] = Setting("focal_length", "18", ("18", "24", "35", "55"))
     for kind, value in ((0, 1.0), (0, 1.0), (2, 0.0), (3, 55.0)):
+        rig.clock.advance(0.6)
         assert rig.command(mavlink.MAV_CMD_SET_CAMERA_ZOOM, kind, value) == mavlink.MAV_RESULT_ACCEPTED
         assert [m.get_type() for m in rig.sent] == ["COMMAND_ACK", "CAMERA_SETTINGS"]
         assert rig.sent[1].zoomLevel == 0.0

@@ -51,7 +51,8 @@ _NAMES_CAMERA = {  # which parameter is the "target camera ID" (MAV_CMD)
 }
 # Their texts want a broadcast that names a camera denied. The others may be the autopilot's own.
 _DENIED_TO_ALL = (mavlink.MAV_CMD_IMAGE_START_CAPTURE, mavlink.MAV_CMD_IMAGE_STOP_CAPTURE)
-_ZOOM_STEP, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = 0, 2, 3, 4
+_ZOOM_STEP, _ZOOM_CONTINUOUS, _ZOOM_RANGE, _ZOOM_FOCAL_LENGTH, _ZOOM_WIDTH = range(5)
+ZOOM_NS = 10**9  # a body's lens moves from one focal length to the next in less
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +182,15 @@ class MessageIntervals:
         return due
 
 
+@dataclass(slots=True)
+class _Zooming:
+    """A zoom in one direction until it is stopped, or at the end: at most `left` more steps, the next at `due_ns`."""
+
+    direction: float
+    left: int
+    due_ns: int
+
+
 class CameraCommands:
     """Answers commands from memory. `wanted_images` are the past images asked for, (index, link)."""
 
@@ -199,6 +209,8 @@ class CameraCommands:
         self._shutter, self._clock, self._status, self._parameters = shutter, clock, status, parameters
         self._intervals = intervals
         self._steps = RecentRequests()
+        self._zoom_lock = threading.Lock()
+        self._zooming: _Zooming | None = None
         self._next_images: dict[
             tuple[str, bool], tuple[int, int]
         ] = {}  # (source, as image 0): the next one, when asked
@@ -387,6 +399,10 @@ class CameraCommands:
         if command.exposed and self._parameters.closed_to_strangers(ZOOM):
             return CommandAnswer(DENIED, words=f"no zoom: {unsigned_refusal(ZOOM)}")
         kind, value = command.integer(1, -1), command.number(2, math.nan)
+        if kind == _ZOOM_CONTINUOUS and math.isfinite(value):
+            return self._zoom_on(value)
+        with self._zoom_lock:
+            self._zooming = None
         step = CaptureRequest(
             command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value)
         )
@@ -404,6 +420,42 @@ class CameraCommands:
         if kind == _ZOOM_STEP:
             self._steps.add(step, now_ns, at)
         return CommandAnswer(ACCEPTED, (self._status.settings(),))  # again when the body has reported it
+
+    def _zoom_on(self, direction: float) -> CommandAnswer:
+        """One focal length now, and one each second until 0 comes or the end is reached. The same again is a retry."""
+        words = None
+        with self._zoom_lock:
+            zooming = self._zooming
+            if zooming is None or zooming.direction * direction <= 0:
+                steps = len(self._status.focal_lengths()) - 1
+                self._zooming = _Zooming(direction, steps, self._clock.monotonic_ns()) if direction else None
+                words = self._zoom_further()
+        if words is not None:
+            return CommandAnswer(DENIED, words=words)
+        return CommandAnswer(ACCEPTED, (self._status.settings(),))
+
+    def zoom_further(self) -> str | None:
+        """Take the next step of a zoom that goes on, where it is due; a sentence where the body refuses it."""
+        with self._zoom_lock:
+            return self._zoom_further()
+
+    def _zoom_further(self) -> str | None:
+        zooming, now_ns = self._zooming, self._clock.monotonic_ns()
+        if zooming is None or now_ns < zooming.due_ns:
+            return None
+        lengths = self._status.focal_lengths()
+        at = self._zoom_target(_ZOOM_STEP, math.copysign(1, zooming.direction), [mm for mm, _ in lengths])
+        zooming.left, zooming.due_ns = zooming.left - 1, now_ns + ZOOM_NS
+        if zooming.left <= 0 or at in (0, len(lengths) - 1):
+            self._zooming = None
+        if at is None or not lengths:
+            return None
+        try:
+            self._parameters.change(ZOOM, lengths[at][1])
+        except CameraError as error:
+            self._zooming = None
+            return str(error)
+        return None
 
     def _zoom_target(self, kind: int, value: float, lengths_mm: list[float]) -> int | None:
         last = len(lengths_mm) - 1

@@ -463,6 +463,8 @@ class Component:
         self._send_unproven_reports(now_ns)
         for number in self._intervals.due(now_ns):
             self._links.send(self._status.about(number))
+        if (refused := self._commands.zoom_further()) is not None:
+            self.say(refused)
         for link, reply in self._parameters.settled(now_ns):
             self._send_reply(reply, link)
         self._send_old_images()
