@@ -93,6 +93,11 @@ class FlightControl:
         """The rotation from camera to body axes, row by row, as it may be changed in flight."""
         return self._settings.now.pose.mount
 
+    @property
+    def on_gimbal(self) -> bool:
+        """Whether the camera hangs on the gimbal, to whose head the mount leads then."""
+        return self._settings.now.pose.on_gimbal
+
     def facts(self) -> CameraFacts:
         """Make, model, lens and sensor, as far as they are known."""
         return self._camera.facts()

@@ -139,6 +139,7 @@ class Camera:
         """Told to the sender alone."""
 
     mount = PoseSettings().mount
+    on_gimbal = False
 
     def facts(self) -> CameraFacts:
         return CameraFacts("dappled", "test", (0, 1, 0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import struct
+from dataclasses import replace
 from itertools import pairwise
 
 import pytest
@@ -20,12 +21,13 @@ from dappled.daemon.camera_protocol.parameters import Parameter, Parameters, cod
 from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger, Spacing
+from dappled.decode.geometry import GroundHeight, Quaternion
 from dappled.drivers.camera import Setting, SettingName, check_change
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
 from dappled.findings import Code, Finding, Level
 from dappled.flight.layout import DiskSpace
 from tests.daemon.camera_protocol.rig import NothingEarlier
-from tests.daemon.fakes import NO_CAMERA, FakeSink, Nowhere
+from tests.daemon.fakes import NO_CAMERA, FakeSink, Nowhere, no_pose
 
 NAN = math.nan
 GCS = (255, 190)
@@ -64,6 +66,7 @@ class Rig:
         configured: Spacing | None = None,
     ) -> None:
         self.body = Body()
+        self.on_gimbal = on_gimbal
         self.decode = "on"
         self.system_id, self.component_id = 1, 100
         self.packer = mavlink.MAVLink(None)
@@ -723,6 +726,26 @@ def test_field_of_view_from_lens_and_sensor() -> None:
     assert view.hfov == pytest.approx(math.degrees(2 * math.atan(22.2 / 100)), abs=1e-3)
     assert view.lat_camera == view.lat_image == 2**31 - 1
     assert math.isnan(view.q[0])
+
+
+@pytest.mark.parametrize(
+    ("on_gimbal", "gimbal", "q"),
+    [
+        (False, None, (math.sqrt(0.5), 0, -math.sqrt(0.5), 0)),  # the camera looks down, and the vehicle ahead
+        (True, (math.sqrt(0.5), 0, math.sqrt(0.5), 0), (1, 0, 0, 0)),  # its head is turned up by 90°
+        (True, None, (NAN,) * 4),
+    ],
+)
+def test_a_photograph_is_told_with_the_cameras_orientation_and_its_height_above_the_ground(
+    on_gimbal: bool, gimbal: Quaternion | None, q: Quaternion
+) -> None:
+    rig = Rig(on_gimbal=on_gimbal)
+    pose = replace(no_pose(), attitude=(1.0, 0.0, 0.0, 0.0), gimbal_attitude=gimbal, height_above_home_m=60.0)
+    for ground, above_m in ((None, 60_000), (GroundHeight(42.5, None, "rangefinder", 3.0), 42_500)):
+        rig.component.announce(Captured(5, ok=True, pose=replace(pose, ground=ground)))
+        image = rig.of("CAMERA_IMAGE_CAPTURED")[-1]
+        assert tuple(image.q) == pytest.approx(q, nan_ok=True)
+        assert image.relative_alt == above_m
 
 
 def test_the_same_line_is_said_once_in_ten_seconds_and_a_long_one_in_pieces() -> None:

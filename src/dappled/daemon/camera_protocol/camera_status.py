@@ -101,11 +101,14 @@ class ReportedCamera:
 class CameraModel(Protocol):
     """What the component reports about the camera. Every method but `lookup` answers from memory.
 
-    `mount` turns camera axes to body axes (nine numbers, row by row).
+    `mount` turns camera axes to body axes (nine numbers, row by row); to those of the gimbal's head with `on_gimbal`.
     """
 
     @property
     def mount(self) -> tuple[float, ...]: ...
+
+    @property
+    def on_gimbal(self) -> bool: ...
 
     def facts(self) -> CameraFacts:
         """Make, model, lens and sensor, as far as they are known."""
@@ -127,7 +130,7 @@ class CameraModel(Protocol):
 
 
 class CameraStatus:
-    """Messages 259 to 262 and 271, and the camera definition file."""
+    """Messages 259 to 263 and 271, and the camera definition file."""
 
     def __init__(
         self, model: CameraModel, shutter: Shutter, parameters: Parameters, clock: Clock, *, component_id: int
@@ -198,7 +201,7 @@ class CameraStatus:
     def view(self) -> MavlinkMessage:
         """CAMERA_FOV_STATUS. Unknown: position INT32_MAX, angles and `q` NaN."""
         facts, pose = self._model.facts(), self._model.pose()
-        attitude, ground = field_of_view.look(pose, self._model.mount)
+        attitude, ground = field_of_view.look(pose, self._model.mount, on_gimbal=self._model.on_gimbal)
         camera = image = (UNKNOWN_INT32,) * 3
         if pose is not None:
             camera = _place(pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m)
@@ -211,6 +214,30 @@ class CameraStatus:
             attitude or (_NAN,) * 4,
             _degrees_or_nan(field_of_view.angle_rad(facts.sensor_width_mm, facts.focal_length_mm)),
             _degrees_or_nan(field_of_view.angle_rad(facts.sensor_height_mm, facts.focal_length_mm)),
+        )
+
+    def image(self, captured: Captured) -> MavlinkMessage:
+        """CAMERA_IMAGE_CAPTURED (263). `q` as CAMERA_FOV_STATUS has it, at mid-exposure, by the mount of now;
+        `relative_alt` is above the ground below or, where nothing measures that, above the take-off place.
+
+        Unknown: time 0, position INT32_MAX (no place on Earth), `q` NaN.
+        """
+        pose = captured.pose
+        attitude, _ = field_of_view.look(pose, self._model.mount, on_gimbal=self._model.on_gimbal)
+        place, height = (UNKNOWN_INT32,) * 3, UNKNOWN_INT32
+        if pose is not None:
+            place = _place(pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m)
+            height = _millimetres(pose.ground.metres if pose.ground else pose.height_above_home_m)
+        return mavlink.MAVLink_camera_image_captured_message(
+            self.boot_ms(),
+            0 if captured.utc_ns is None else max(0, captured.utc_ns // 1000),
+            0,
+            *place,
+            height,
+            attitude or (_NAN,) * 4,
+            captured.index,
+            int(captured.ok),
+            captured.url.encode()[:205],
         )
 
     def focal_lengths(self) -> list[tuple[float, str]]:
@@ -230,29 +257,6 @@ class CameraStatus:
         if zoom is None or zoom.value not in steps or len(steps) < 2:
             return math.nan
         return 100.0 * steps.index(zoom.value) / (len(steps) - 1)
-
-
-def image_captured(captured: Captured, boot_ms: int) -> MavlinkMessage:
-    """CAMERA_IMAGE_CAPTURED (263). `q` is (w, x, y, z), vehicle body to north-east-down at mid-exposure.
-
-    Unknown: time 0, position INT32_MAX (no place on Earth), `q` NaN.
-    """
-    pose = captured.pose
-    place, height, q = (UNKNOWN_INT32,) * 3, UNKNOWN_INT32, (_NAN,) * 4
-    if pose is not None:
-        place = _place(pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m)
-        height, q = _millimetres(pose.height_above_home_m), pose.attitude or q
-    return mavlink.MAVLink_camera_image_captured_message(
-        boot_ms,
-        0 if captured.utc_ns is None else max(0, captured.utc_ns // 1000),
-        0,
-        *place,
-        height,
-        q,
-        captured.index,
-        int(captured.ok),
-        captured.url.encode()[:205],
-    )
 
 
 def sensor_orientation(mount: Sequence[float]) -> int | None:

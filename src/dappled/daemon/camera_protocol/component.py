@@ -14,7 +14,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 
 from dappled.clock import Clock
-from dappled.daemon.camera_protocol.camera_status import CameraModel, CameraStatus, Captured, image_captured
+from dappled.daemon.camera_protocol.camera_status import CameraModel, CameraStatus, Captured
 from dappled.daemon.camera_protocol.commands import (
     ACCEPTED,
     AUTOPILOT,
@@ -402,7 +402,7 @@ class Component:
     def announce(self, captured: Captured) -> bool:
         """Report a shot that ended, its frame safe or lost, once to each receiver (see `ReportRoutes`). False where no
         link took it."""
-        report = image_captured(captured, self._status.boot_ms())
+        report = self._status.image(captured)
         without = self._routes.without(report, self._clock.monotonic_ns())
         taken = self._links.send(report, without=without)
         if not taken and without is not None:
@@ -504,7 +504,7 @@ class Component:
             if captured is None:
                 self.say(f"image {index} is in none of the flights here, or has not ended yet")
             else:
-                self._links.send(image_captured(captured, self._status.boot_ms()), link)
+                self._links.send(self._status.image(captured), link)
 
     def _send_earlier_outcomes(self, now_ns: int) -> None:
         if lost := self._earlier.summary():

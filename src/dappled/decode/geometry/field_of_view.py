@@ -18,17 +18,21 @@ def angle_rad(size_mm: float | None, focal_length_mm: float | None) -> float | N
     return 2 * math.atan(size_mm / (2 * focal_length_mm))
 
 
-def look(pose: Pose | None, mount: Sequence[float]) -> tuple[Quaternion | None, tuple[float, float, float] | None]:
+def look(
+    pose: Pose | None, mount: Sequence[float], *, on_gimbal: bool = False
+) -> tuple[Quaternion | None, tuple[float, float, float] | None]:
     """Attitude of the camera and its ground point, from the vehicle's pose; None where unknown.
 
-    `mount`: camera axes (right, down, forward) to body axes (forward, right, down), nine numbers row by row. The
+    `mount`: camera axes (right, down, forward) to body axes (forward, right, down), nine numbers row by row; with
+    `on_gimbal` to those of the gimbal's head, whose attitude counts. The
     attitude (w, x, y, z) turns a frame that looks along x, with y to the image's right, to north-east-down. The ground
     point is (latitude, longitude, altitude above sea level in metres) of the image's centre on the plane of the
     take-off place.
     """
-    if pose is None or pose.attitude is None:
+    head = None if pose is None else pose.gimbal_attitude if on_gimbal else pose.attitude
+    if pose is None or head is None:
         return None, None
-    right, down, forward = (turned(pose.attitude, (mount[at], mount[3 + at], mount[6 + at])) for at in range(3))
+    right, down, forward = (turned(head, (mount[at], mount[3 + at], mount[6 + at])) for at in range(3))
     attitude = _quaternion((forward, right, down))
     known = (pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m, pose.height_above_home_m)
     latitude, longitude, altitude, height = known
