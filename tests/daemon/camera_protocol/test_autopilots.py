@@ -548,6 +548,23 @@ def test_old_shots_without_a_number_and_those_of_others_cover_no_loss(sender: tu
     assert sum(one.number("triggers") for one in rig.lost_triggers) == 3
 
 
+@pytest.mark.parametrize("test_shot", [True, False])
+def test_a_test_shot_is_a_photograph_that_covers_no_lost_trigger(test_shot: bool) -> None:
+    """Parameter 7 = 1: PX4 doesn't count it. Any other shot without a number may be the one whose number is missing."""
+    rig, px4 = px4_rig(), CameraTriggers("px4")
+    hear(rig, px4.trigger(BOOT_US))
+    rig.tick(3.0)
+    seven = (0, 0, 0, 0, 1, 0, int(test_shot))
+    hear(rig, [mavlink.MAVLink_command_long_message(0, 0, mavlink.MAV_CMD_DO_DIGICAM_CONTROL, 0, *seven)])
+    assert len(rig.fired) == 2
+    for number in (1, 2):
+        rig.tick(1.0)
+        messages = px4.trigger(BOOT_US + number * 10**6)
+        hear(rig, messages if number == 2 else [])
+    rig.tick(5)
+    assert named(rig) == [(2, 2)] * test_shot
+
+
 def test_a_shot_that_could_not_be_fired_is_not_told_as_a_lost_trigger(monkeypatch: pytest.MonkeyPatch) -> None:
     rig, px4 = px4_rig(fires=False), CameraTriggers("px4", (CameraPort("wire"),))
 

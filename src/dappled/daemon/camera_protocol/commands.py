@@ -111,6 +111,11 @@ class Command:
         return 1 if count == 0 and self.number(2) == 0 else count
 
     @property
+    def test_shot(self) -> bool:
+        """Whether its photograph is a test shot, which an autopilot doesn't count (MAV_CMD_DO_DIGICAM_CONTROL)."""
+        return self.name == mavlink.MAV_CMD_DO_DIGICAM_CONTROL and self.integer(7) == 1
+
+    @property
     def of_autopilot(self) -> bool:
         """Whether an autopilot sent it."""
         return self.component == AUTOPILOT

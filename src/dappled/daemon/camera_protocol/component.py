@@ -283,7 +283,7 @@ class Component:
         if not self._commands.concerns(command):
             return  # the numbers of another camera
         if not self._identity.is_ardupilot():
-            if new:
+            if new and not command.test_shot:
                 self._autopilot.numbers["CAMERA_TRIGGER"].unnumbered(self._clock.monotonic_ns())
         elif command.name != mavlink.MAV_CMD_IMAGE_START_CAPTURE:
             return
