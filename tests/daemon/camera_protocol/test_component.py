@@ -335,7 +335,7 @@ def test_a_past_image_whose_flight_was_moved_away_is_missed_in_words() -> None:
 
 def test_refused_by_name_and_silent_on_broadcasts() -> None:
     rig = Rig()
-    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 214, 2505):
+    for command in (mavlink.MAV_CMD_VIDEO_START_CAPTURE, 214, 534, 2504, 2505):
         assert rig.command(command, NAN) == mavlink.MAV_RESULT_UNSUPPORTED
         assert rig.command(command, NAN, target=(0, 0)) is None
     assert rig.command(mavlink.MAV_CMD_SET_CAMERA_MODE, 0, 1) == mavlink.MAV_RESULT_DENIED
@@ -644,6 +644,33 @@ def test_a_lens_that_can_be_set_zooms_to_the_nearest_focal_length(kind: int, val
     assert rig.of("CAMERA_SETTINGS")[0].zoomLevel == pytest.approx(100 / 3, abs=0.01)
     rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
     assert rig.of("CAMERA_INFORMATION")[0].flags & mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM
+
+
+@pytest.mark.parametrize("by_hand", [True, False])
+@pytest.mark.parametrize(
+    ("flag", "commands"),
+    [
+        ("CAPTURE_IMAGE", [(2000, 0.0, 0, 1)]),
+        ("HAS_IMAGE_SURVEY_MODE", [(530, 0.0, 2)]),
+        ("HAS_BASIC_ZOOM", [(531, 0, 1.0), (531, 1, 1.0), (531, 2, 50.0), (531, 3, 35.0)]),
+        ("HAS_BASIC_FOCUS", [(532, 0.0, 1)]),
+        ("CAPTURE_VIDEO", [(2500, 0.0, 1), (530, 0.0, 1)]),
+        ("HAS_VIDEO_STREAM", [(512, 269.0, 1), (512, 270.0, 1), (534, 0.0, 1), (2502, 1.0), (2504, 1.0), (2505, 1.0)]),
+    ],
+)
+def test_what_is_declared_is_obeyed_and_what_is_not_is_refused(
+    flag: str, commands: list[tuple[float, ...]], *, by_hand: bool
+) -> None:
+    rig = Rig()
+    if not by_hand:
+        rig.body.now["focal_length"] = Setting("focal_length", "24", ("18", "24", "35", "55"))
+    rig.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 259)
+    (information,) = rig.of("CAMERA_INFORMATION")
+    declared = bool(information.flags & getattr(mavlink, f"CAMERA_CAP_FLAGS_{flag}"))
+    for command, *parameters in commands:
+        rig.clock.advance(2)
+        obeyed = rig.command(round(command), *parameters) == mavlink.MAV_RESULT_ACCEPTED
+        assert obeyed == declared
 
 
 def test_a_stranger_cannot_zoom_which_changes_how_frames_are_decoded() -> None:

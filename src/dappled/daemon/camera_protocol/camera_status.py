@@ -340,7 +340,7 @@ def _sensor_facts(settings: Settings, model: str) -> dict[str, Any]:
 def _information(
     facts: CameraFacts, boot_ms: int, *, zooms: bool = False, definition: tuple[int, str] | None = None
 ) -> MavlinkMessage:
-    """CAMERA_INFORMATION (259): takes photographs, has modes (photo, survey), and zooms where the lens can be set.
+    """CAMERA_INFORMATION (259): photographs, modes (photo, survey) and zoom where the lens can be set; no video.
 
     `definition`: version and address of the camera definition file."""
     major, minor, patch = (min(255, max(0, part)) for part in facts.firmware)
@@ -358,6 +358,7 @@ def _information(
         0,
         mavlink.CAMERA_CAP_FLAGS_CAPTURE_IMAGE
         | mavlink.CAMERA_CAP_FLAGS_HAS_MODES
+        | mavlink.CAMERA_CAP_FLAGS_HAS_IMAGE_SURVEY_MODE
         | (mavlink.CAMERA_CAP_FLAGS_HAS_BASIC_ZOOM if zooms else 0),
         version,
         uri.encode(),
