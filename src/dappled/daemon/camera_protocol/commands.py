@@ -403,11 +403,14 @@ class CameraCommands:
             return CommandAnswer(DENIED, words="no zoom: this lens is zoomed by hand")
         if command.exposed and self._parameters.closed_to_strangers(ZOOM):
             return CommandAnswer(DENIED, words=f"no zoom: {unsigned_refusal(ZOOM)}")
-        kind, value = command.integer(1, -1), command.number(2, math.nan)
-        if kind == _ZOOM_CONTINUOUS and math.isfinite(value):
-            return self._zoom_on(value)
+        if command.integer(1, -1) == _ZOOM_CONTINUOUS and math.isfinite(command.parameters[1]):
+            return self._zoom_on(command.parameters[1])
         with self._zoom_lock:
             self._zooming = None
+        return self._zoom_to(command, lengths)
+
+    def _zoom_to(self, command: Command, lengths: list[tuple[float, str]]) -> CommandAnswer:
+        kind, value = command.integer(1, -1), command.number(2, math.nan)
         step = CaptureRequest(
             command.source, "SET_CAMERA_ZOOM", None, command.confirmation, command.link, series=(kind, value)
         )
