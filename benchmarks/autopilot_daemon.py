@@ -64,6 +64,7 @@ class Daemon:
 
     system_id, component_id = US
     mount = PoseSettings().mount
+    on_gimbal = False
 
     def __init__(
         self, *, outside: bool, camera: int, send: Callable[[MavlinkMessage], None], fired: Callable[[Shot], None]
