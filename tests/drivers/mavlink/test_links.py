@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import pty
 import socket
@@ -257,6 +258,35 @@ def test_a_serial_device_that_comes_late_is_opened(tmp_path: Path) -> None:
         with Side(f"{device},57600") as side:
             assert side.links.statistics()[0].error is not None
             device.symlink_to(os.ttyname(near))
+            until = time.monotonic() + 60
+            while side.links.statistics()[0].error is not None:
+                assert time.monotonic() < until
+                time.sleep(0.02)
+    finally:
+        os.close(near)
+        os.close(far)
+
+
+@pytest.mark.parametrize(
+    ("number", "words"), [(errno.EACCES, "add the user to the group"), (errno.EPERM, "restart the service")]
+)
+def test_a_serial_device_that_may_not_be_opened_yet_is_waited_for(
+    number: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """udev gives a device to its group after it has appeared; systemd keeps from a service what came after it."""
+    far, near = terminals()
+    device, real, shut = os.ttyname(near), os.open, [True]
+
+    def opened(path: str, *how: int, **more: int) -> int:
+        if path == device and shut:
+            raise PermissionError(number, os.strerror(number), path)
+        return real(path, *how, **more)
+
+    monkeypatch.setattr(os, "open", opened)
+    try:
+        with Side(device) as side:
+            assert words in (side.links.statistics()[0].error or "")
+            shut.clear()
             until = time.monotonic() + 60
             while side.links.statistics()[0].error is not None:
                 assert time.monotonic() < until

@@ -13,7 +13,7 @@ from dappled.config.settings import GnssSettings
 from dappled.drivers.gnss import recorded
 from dappled.drivers.gnss.ubx import Edge, TimeMark, UbxMessage, UbxStream, time_mark
 from dappled.drivers.mavlink import LinkError, MavlinkMessage
-from dappled.drivers.mavlink.channels import Address, ByteChannel, over_serial, serial_address
+from dappled.drivers.mavlink.channels import FORBIDDEN, Address, ByteChannel, over_serial, serial_address
 from dappled.drivers.utc_choice import RELEASED_NS, Date, UtcBounds, rolled_over, rollovers
 from dappled.errors import DappledError, report
 from dappled.findings import Code, Finding, Level, Subject, finding, told
@@ -172,6 +172,6 @@ class GnssPort:
 def _sentence(error: OSError) -> str:
     if error.errno == errno.ENOENT:
         return f"there is no such device; plug it in or correct {SETTING}"
-    if error.errno == errno.EACCES:
-        return "no permission to open it; add the user to the group of the device"
+    if error.errno in FORBIDDEN:
+        return f"no permission to open it; {FORBIDDEN[error.errno]}"
     return f"{error.strerror or error}; plug it in again"

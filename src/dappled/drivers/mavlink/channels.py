@@ -21,6 +21,7 @@ from dappled.drivers.mavlink.streams import ByteStream, TcpServer, over_tcp
 from dappled.errors import DappledError
 
 __all__ = [
+    "FORBIDDEN",
     "Address",
     "ByteChannel",
     "ByteStream",
@@ -54,7 +55,14 @@ _KERNEL_BYTES = 4 << 20
 _SO_RCVBUFFORCE = 33  # socket(7)
 _NO_DATAGRAM = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNREFUSED)  # the last: no program listens there yet
 _FINAL = (errno.EADDRINUSE, errno.EACCES, errno.EPERM)
-"""What waiting does not mend: another program has the port, or this user may not open the device."""
+"""What waiting does not mend: another program has the port, or this user may not listen on it. A device is another
+matter: it may be there before udev has given it to its group."""
+
+FORBIDDEN = {
+    errno.EACCES: "add the user to the group of the device",
+    errno.EPERM: "restart the service: devices of this kind came after it had started, and systemd keeps it from them",
+}
+"""What to do where this process may not open a serial device."""
 
 
 class LinkError(DappledError):
@@ -208,7 +216,8 @@ def open_channel(address: Address, clock: Clock) -> ByteChannel:
             return UdpIn(_bound(address, socket.SOCK_DGRAM), clock)
         return UdpOut(address)
     except OSError as error:
-        raise LinkError(_sentence(address, error), may_come=error.errno not in _FINAL) from error
+        may_come = address.kind == "serial" or error.errno not in _FINAL
+        raise LinkError(_sentence(address, error), may_come=may_come) from error
 
 
 def _sentence(address: Address, error: OSError) -> str:
@@ -223,8 +232,9 @@ def _sentence(address: Address, error: OSError) -> str:
         return f"MAVLink link {url}: {address.host} is not an address of this machine; 0.0.0.0 listens on all of them"
     if error.errno == errno.ENOENT:
         return f"MAVLink link {url}: there is no device {address.host}; plug it in or correct mavlink.url"
-    if error.errno == errno.EACCES:
-        return f"MAVLink link {url}: no permission to open {address.host}; add the user to the group of the device"
+    if error.errno in FORBIDDEN:
+        todo = FORBIDDEN[error.errno] if address.kind == "serial" else "choose a port above 1023"
+        return f"MAVLink link {url}: no permission to open {address.host}; {todo}"
     return f"MAVLink link {url}: {error.strerror or error}; correct mavlink.url or repair the connection"
 
 
