@@ -127,6 +127,7 @@ class Code(StrEnum):
     FILE_UNLISTED = "file.unlisted"
     FILE_UNREADABLE = "file.unreadable"
     FLIGHT_COPY_UNFINISHED = "flight.copy_unfinished"
+    FLIGHT_CUT_SHORT = "flight.cut_short"
     FLIGHT_EMPTY_FOLDER = "flight.empty_folder"
     FLIGHT_FILES_REMOVED = "flight.files_removed"
     FLIGHT_LEFT_OPEN = "flight.left_open"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sqlite3
 import subprocess
@@ -12,7 +13,9 @@ from types import ModuleType
 
 import pytest
 
+from dappled.cli import main
 from dappled.clock import RecordedClock
+from dappled.findings import Code, Subject, finding
 from dappled.flight import (
     FlightError,
     ImageIndex,
@@ -136,6 +139,26 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
     third = begin_later(flights)
     assert third.recovered == ()
     third.close()
+
+
+def test_the_report_of_a_flight_that_was_cut_short_says_what_it_can_not_know(
+    flights: Path, flight: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The journal's last lines and counted refusals go with the power; it said that the counts agree."""
+    request(flight, 0)
+    deliver(flight, 0, b"raw")
+    crash(flight)
+    begin_later(flights).close()
+    path = str(flight.folder.path)
+    balance = flight_report.balance(flight.folder.path)
+    assert balance.balanced
+    assert balance.cut_short == finding(Code.FLIGHT_CUT_SHORT, Subject("flight"), shots_s=1.0, refusals_s=60.0)
+    assert main(["flight", "report", path]) == 1
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1] == "what is recorded adds up; what came last is not known"
+    assert "shots accepted in its last 1 s, and requests refused in its last 60 s, may be missing" in said.err
+    assert main(["flight", "report", path, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["balanced"] is None
 
 
 def test_a_shot_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: Recording) -> None:

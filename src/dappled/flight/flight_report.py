@@ -14,6 +14,7 @@ from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import (
     BEGAN,
+    CUT_SHORT,
     DOUBT,
     ENDED,
     LATER_DOUBT,
@@ -49,7 +50,8 @@ class Balance:
     frames. `began_utc_ns` is None where UTC was never known. `judged` counts frames by their verdict in flight (a frame
     without one is unknown; empty where none was judged), `bad` says of each bad one why, `unknown` of each unknown one.
     `doubts` says of each frame that may be another shot's why, `card` what happened to the camera's card, and what
-    stays on it. `stood` is what the service found, above notes, in the order of its beginning.
+    stays on it. `stood` is what the service found, above notes, in the order of its beginning. `cut_short` says what
+    the numbers may lack, where the recording was not ended in order.
     """
 
     flight: str
@@ -76,6 +78,7 @@ class Balance:
     doubts: tuple[Finding, ...] = ()
     card: tuple[Finding, ...] = ()
     stood: tuple[StoodFinding, ...] = ()
+    cut_short: Finding | None = None
 
     @property
     def balanced(self) -> bool:
@@ -158,6 +161,9 @@ def balance(path: Path) -> Balance:
             doubts=_found(events, DOUBT, LATER_DOUBT),
             card=_found(events, NOTICED),
             stood=_stood(events, correction_ns),
+            cut_short=None
+            if CUT_SHORT not in facts
+            else finding(Code.FLIGHT_CUT_SHORT, Subject("flight"), **facts[CUT_SHORT]),
         )
 
 

@@ -1,7 +1,8 @@
 """Write the two files of a flight that are only appended to: shots.jsonl and telemetry.tlog.
 
-Each entry is one write(2), which survives the death of the process at once. A thread brings it to the disk within a
-second; after that it survives a power cut. Neither firing nor receiving waits for a frame's fsync or for a database.
+Each entry is one write(2), which survives the death of the process at once. A thread brings it to the disk within
+`DURABLE_S`; after that it survives a power cut. Neither firing nor receiving waits for a frame's fsync or for a
+database.
 
 shots.jsonl, the shot journal, has one JSON line for each shot, written before the camera is touched. telemetry.tlog has
 every MAVLink packet received and sent, in the ground stations' common format: an 8-byte big-endian count of
@@ -23,6 +24,8 @@ from dappled.codec import canonical
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.records import Shot
 from dappled.workers import Loop
+
+DURABLE_S = 1.0
 
 
 class AppendedFile:

@@ -27,6 +27,9 @@ BEGAN, ENDED = "began", "ended"
 REFUSED, LOST = "refused", "lost trigger"
 """Kinds of events that hold a finding: requests that became no shot, with their number `times` and their source as
 subject; triggers of the autopilot that became no request."""
+CUT_SHORT = "cut_short"
+"""A fact of a flight that was not ended in order: within how many seconds of its end accepted shots (`shots_s`) and
+refused requests (`refusals_s`) may have been lost."""
 
 
 class TimeSource(StrEnum):

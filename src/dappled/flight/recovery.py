@@ -11,7 +11,7 @@ import os
 import shutil
 from pathlib import Path
 
-from dappled import durable
+from dappled import durable, refusals
 from dappled.clock import Clock
 from dappled.errors import DappledError
 from dappled.findings import text, told
@@ -21,7 +21,7 @@ from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.logs import ShotJournal
-from dappled.flight.records import Frame, Stray
+from dappled.flight.records import CUT_SHORT, Frame, Stray
 from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import ledger_damage
 
@@ -81,6 +81,7 @@ def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:
                 ledger.failed(row.shot.index, f"shot {row.shot.index} is lost: {LOST}")
                 report.append(f"shot {row.shot.index} was {row.state}, and is lost: {LOST}")
         if "closed_utc_ns" not in ledger.facts():
+            ledger.set_fact(CUT_SHORT, {"shots_s": logs.DURABLE_S, "refusals_s": refusals.INTERVAL_S})
             close_ledger(folder, ledger, clock.utc_ns(), None, report)
             report.append("it was not closed; it is now")
         for text in report:

@@ -105,7 +105,8 @@ class ReportFlight(FlightArgument, Verb):
         flight = self.chosen(output)
         found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
         sources = codec.plain(by_source)
-        values = {**codec.plain(found), "sources": sources, "balanced": found.balanced if found.wishes else None}
+        known = found.wishes and not (found.balanced and found.cut_short)
+        values = {**codec.plain(found), "sources": sources, "balanced": found.balanced if known else None}
         agree = found.balanced and found.wishes > 0
         said = [*flight_lines.of_report(found, by_source)]
         if self.log:
@@ -113,7 +114,8 @@ class ReportFlight(FlightArgument, Verb):
 
             third = books.compared(flight, self.log)
             values["log"], said, agree = third.values, [*said, *third.lines], agree and third.balanced
-        return Report(values, said, findings=found.doubts, failed=not agree)
+        doubts = [*found.doubts, *filter(None, [found.cut_short])]
+        return Report(values, said, findings=doubts, failed=not agree)
 
 
 @dataclass(frozen=True, kw_only=True)

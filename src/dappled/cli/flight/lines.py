@@ -117,6 +117,9 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     if found.lost:
         yield f"THE COUNTS DO NOT AGREE: {counted(found.lost, 'trigger')} of the autopilot became no shot"
         return
+    if found.balanced and found.cut_short:
+        yield "what is recorded adds up; what came last is not known"
+        return
     yield "the counts agree" if found.balanced else "THE COUNTS DO NOT AGREE: run `dappled flight check`"
 
 
