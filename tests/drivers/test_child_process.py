@@ -24,6 +24,7 @@ from dappled.drivers.child_process import (
     ProcessChannel,
     RestartBudget,
     end_child,
+    how_ended,
     start_child,
 )
 from dappled.drivers.wired.ptp_source import PtpSource
@@ -122,17 +123,40 @@ def test_the_restart_budget_allows_its_limit_in_any_window() -> None:
 
 
 def test_looking_goes_before_decoding_and_decoding_before_the_rest() -> None:
-    program = (
-        "from dappled.drivers.child_process import *; goes_first({}); print(open('/proc/self/oom_score_adj').read())"
-    )
+    """From the child's first moment: what it imports alone can be too much."""
     own = int(Path("/proc/self/oom_score_adj").read_text(encoding="ascii"))
     scores = [own]
     for score in (DECODER_GOES, CONSOLE_GOES):
-        done = subprocess.run(
-            [sys.executable, "-c", program.format(score)], capture_output=True, text=True, check=True, timeout=60
-        )
-        scores.append(int(done.stdout))
+        process, channel = start_child("dappled.drivers.wired.ptp_source", "usb:", goes_first=score)
+        scores.append(int(Path(f"/proc/{process.pid}/oom_score_adj").read_text(encoding="ascii")))
+        end_child(process, 0.0)
+        channel.close()
     assert scores == [own, 500, 800]
+
+
+def test_a_real_time_process_that_never_sleeps_is_ended_by_a_signal_that_tells_why() -> None:
+    """At the hard limit the kernel sends SIGKILL, as for want of memory."""
+    program = (
+        "import resource; from dappled.drivers.child_process import raise_priority; raise_priority();"
+        "print(*resource.getrlimit(resource.RLIMIT_RTTIME))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60)
+    soft, hard = map(int, done.stdout.split())
+    assert soft == 1_000_000 < hard
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (-signal.SIGXCPU, "it used real-time CPU for 1 s without a pause"),
+        (-signal.SIGSEGV, "killed: Segmentation fault"),
+        (-signal.SIGRTMIN - 1, "killed: "),
+        (3, "exit status 3"),
+        (None, "the kernel holds it"),
+    ],
+)
+def test_the_end_of_a_process_is_told_in_words(code: int | None, words: str) -> None:
+    assert words in how_ended(code)
 
 
 # --- messages

@@ -334,7 +334,7 @@ def test_a_decoder_that_is_killed_loses_one_decode_at_most(frame: Path, here: Pa
         for process in stopped:
             os.kill(process, signal.SIGKILL)
         eventually(lambda: len(daemon.shots) == 3, "the end of the third shot")
-        assert "the decoder died (signal 9)" in daemon.shots[2].problem
+        assert "the decoder died (killed: Killed)" in daemon.shots[2].problem
         assert daemon.shots[2].frame is not None
         assert daemon.shoot().decoded is not None
 

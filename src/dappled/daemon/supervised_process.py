@@ -10,6 +10,7 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.drivers.child_process import (
+    CONSOLE_GOES,
     ChannelError,
     ChannelMessage,
     ProcessChannel,
@@ -94,7 +95,11 @@ class SupervisedProcess:
         """Start the process and serve it until it ends or must. Raises ChannelError, and what the peer raises."""
         one = self._program
         self._process, channel = start_child(
-            one.module, *one.arguments, descriptors=one.descriptors, environment=one.environment
+            one.module,
+            *one.arguments,
+            descriptors=one.descriptors,
+            environment=one.environment,
+            goes_first=CONSOLE_GOES,
         )
         try:
             self._peer.begun(channel)

@@ -219,12 +219,14 @@ def start_child(
     descriptors: Sequence[int] = (),
     environment: Mapping[str, str] | None = None,
     quiet: bool = False,
+    goes_first: int | None = None,
 ) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
     """Start `python -m module` with a channel to it.
 
     The child's arguments are the channel's descriptor, this process' id, and `arguments`. It inherits `descriptors`,
-    and `environment` in addition to this process' own. `quiet` discards what it writes to standard error. Raises
-    OSError.
+    and `environment` in addition to this process' own. `quiet` discards what it writes to standard error.
+    With `goes_first` the kernel, when it is short of memory, ends it before those with a lower score (proc(5),
+    oom_score_adj), from its first import on; where the system allows it. Raises OSError.
     """
     channel, other = ProcessChannel.pair()
     with other:
@@ -240,6 +242,9 @@ def start_child(
         except OSError:
             channel.close()
             raise
+    if goes_first is not None:
+        with contextlib.suppress(OSError):
+            Path(f"/proc/{process.pid}/oom_score_adj").write_text(str(goes_first), encoding="ascii")
     return process, channel
 
 
@@ -254,6 +259,17 @@ def end_child(process: subprocess.Popen[bytes], patience_s: float = 0.2) -> None
     process.kill()
     with contextlib.suppress(subprocess.TimeoutExpired):  # as above
         process.wait(_DEAD_S)
+
+
+def how_ended(code: int | None) -> str:
+    """How a process ended, by its `returncode`, in words."""
+    if code is None:
+        return "the kernel holds it"
+    if code >= 0:
+        return f"exit status {code}"
+    if code == -signal.SIGXCPU:
+        return f"killed: it used real-time CPU for {_REAL_TIME_US / 1e6:g} s without a pause"
+    return f"killed: {signal.strsignal(-code) or f'signal {-code}'}"
 
 
 class RestartBudget:
@@ -314,18 +330,12 @@ def raise_priority() -> None:
     CAP_SYS_NICE), else with a lower niceness (LimitNICE), else unchanged.
 
     On two busy cores a niceness of -10 still waits 10 to 50 ms now and then, real time less than 1 ms. The kernel stops
-    a real-time process that runs for a second without sleeping (RLIMIT_RTTIME), so it can't hold a core.
+    a real-time process that runs for a second without sleeping (RLIMIT_RTTIME), so it can't hold a core: with SIGXCPU,
+    which tells why (`how_ended`); the hard limit's SIGKILL would not.
     """
     try:
-        resource.setrlimit(resource.RLIMIT_RTTIME, (_REAL_TIME_US, _REAL_TIME_US))
+        resource.setrlimit(resource.RLIMIT_RTTIME, (_REAL_TIME_US, 2 * _REAL_TIME_US))
         os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(_RR_PRIORITY))
     except (PermissionError, ValueError):
         with contextlib.suppress(PermissionError):
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
-
-
-def goes_first(score: int) -> None:
-    """Let the kernel, when it is short of memory, end this process before those with a lower score (proc(5),
-    oom_score_adj); children inherit it. What the system does not allow stays as it is."""
-    with contextlib.suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text(str(score), encoding="ascii")

@@ -28,7 +28,7 @@ from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import systemd
 from dappled.daemon.stream.subscriber import reuse_large_blocks
 from dappled.decode.geometry import area
-from dappled.drivers.child_process import CONSOLE_GOES, ProcessChannel, goes_first
+from dappled.drivers.child_process import ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 from dappled.shown import guard_output
@@ -43,7 +43,6 @@ def main() -> int:
     guard_output()
     logging.basicConfig(level=logging.WARNING, handlers=[systemd.handler()])
     os.nice(NICENESS)
-    goes_first(CONSOLE_GOES)
     reuse_large_blocks()
     channel = ProcessChannel(socket.socket(fileno=int(sys.argv[1])))
     listener = socket.socket(fileno=int(sys.argv[3]))

@@ -20,12 +20,14 @@ from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.drivers.child_process import (
+    DECODER_GOES,
     ChannelError,
     ChannelMessage,
     MessageSizeError,
     ProcessChannel,
     RestartBudget,
     end_child,
+    how_ended,
     start_child,
 )
 from dappled.drivers.raw.recipe import LawDecision, Recipe
@@ -227,7 +229,8 @@ class DecodeProcess:
             code = self._end()
             if self._closed:  # `close` has killed it
                 raise DecodeProcessError(stopped) from None
-            raise DecodeProcessError(f"the decoder died ({_manner(code)}) on {question.get('path', 'start')}") from None
+            on = question.get("path", "start")
+            raise DecodeProcessError(f"the decoder died ({how_ended(code)}) on {on}") from None
         except OSError as error:
             self._end()
             raise DecodeProcessError(f"the decoder's process can't be started: {error.strerror}") from None
@@ -248,7 +251,7 @@ class DecodeProcess:
                 f"the decoder keeps crashing: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock.monotonic_ns())
-        self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker")
+        self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker", goes_first=DECODER_GOES)
         self._channel.send({"do": "set up", "recipe": codec.plain(self._recipe), "preview_px": self._preview_px})
         return self._channel
 
@@ -260,10 +263,6 @@ class DecodeProcess:
             return None
         end_child(process, 0.5)
         return process.returncode
-
-
-def _manner(code: int | None) -> str:
-    return f"signal {-code}" if code is not None and code < 0 else f"exit code {code}"
 
 
 def _mapped(fd: int) -> mmap.mmap:

@@ -28,7 +28,7 @@ from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.light_field import fingerprint, slice_mosaic
 from dappled.drivers.camera import Blob
-from dappled.drivers.child_process import DECODER_GOES, ChannelMessage, end_with_parent, goes_first
+from dappled.drivers.child_process import ChannelMessage, end_with_parent
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError, sentence
@@ -318,7 +318,6 @@ def main() -> None:
     guard_output()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
     os.nice(NICENESS)
-    goes_first(DECODER_GOES)
     serve(socket.socket(fileno=fd), DecodeWorker())
 
 

@@ -21,7 +21,7 @@ from typing import Any
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.stream import admission
 from dappled.daemon.stream.admission import ConnectionLimits, Handshake, OpeningConnection
-from dappled.drivers.child_process import CONSOLE_GOES, ChannelError, ProcessChannel, goes_first
+from dappled.drivers.child_process import ChannelError, ProcessChannel
 from dappled.findings import Code
 from dappled.shown import guard_output
 
@@ -296,7 +296,6 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
     guard_output()
     os.nice(NICENESS)
-    goes_first(CONSOLE_GOES)
     near = socket.socket(fileno=int(sys.argv[1]))
     given = iter(sys.argv[3:])  # after the parent's process id
     relay = Relay({socket.socket(fileno=int(fd)): path for fd, path in zip(given, given, strict=True)})

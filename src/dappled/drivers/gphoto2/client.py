@@ -42,6 +42,7 @@ from dappled.drivers.child_process import (
     ProcessChannel,
     RestartBudget,
     end_child,
+    how_ended,
     start_child,
 )
 from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, lost_file, message_event
@@ -222,6 +223,9 @@ class GPhoto2Camera(QueuedCamera):
             self._carryover = self._carryover.died(fired)
             channel.close()
             end_child(process)
+            reason = (
+                reason or f"the camera's process ended unexpectedly ({how_ended(process.returncode)}); it starts again"
+            )
             stopped = self._loop.stopping.is_set()
             self._looked_last = stopped and process.returncode == 0
             for shot in pending:
@@ -234,7 +238,8 @@ class GPhoto2Camera(QueuedCamera):
         self.report(StateChanged("absent", "the camera was stopped", self._clock.monotonic_ns()))
 
     def _serve(self, process: subprocess.Popen[bytes], channel: ProcessChannel) -> str:
-        """Pass events on until the process ends; return why, as a sentence."""
+        """Pass events on until the process ends; return why it was ended, as a sentence; "" where it ended by
+        itself."""
         heard_ns = asked_ns = self._clock.monotonic_ns()
         answer_s = self._settings.timeouts.answer_s
         try:
@@ -264,8 +269,8 @@ class GPhoto2Camera(QueuedCamera):
                 if now_ns - asked_ns > _PING_S * 1e9:
                     asked_ns = now_ns
                     _tell(channel, "ping")
-        except ChannelError as error:
-            return f"the camera's process ended unexpectedly ({error}); it starts again"
+        except ChannelError:
+            return ""
 
     def _reset_port(self) -> str:
         """Reset a silent body on USB, as if its cable had been pulled; return words on the result."""
