@@ -87,3 +87,11 @@ def test_who_holds_a_device_file_is_named(tmp_path: Path) -> None:
     (tmp_path / "proc" / "1").mkdir()  # another user's: no fd folder to be seen
     assert holders(node, tmp_path / "proc") == ["gvfsd-gphoto2 (process 4711)"]
     assert holders(tmp_path / "other", tmp_path / "proc") == []
+    ours = tmp_path / "proc" / "4712"
+    (ours / "fd").mkdir(parents=True)
+    (ours / "fd" / "3").symlink_to(node)
+    (ours / "comm").write_text("python3\n")
+    (ours / "cmdline").write_bytes(b"python3\0-P\0-m\0dappled.drivers.gphoto2.process\0" + b"7\0")
+    (process / "cmdline").write_bytes(b"/usr/libexec/gvfsd-gphoto2\0")
+    assert len(holders(node, tmp_path / "proc")) == 2
+    assert holders(node, tmp_path / "proc", ours=False) == ["gvfsd-gphoto2 (process 4711)"]

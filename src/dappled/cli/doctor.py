@@ -101,7 +101,7 @@ def _beside(endpoint: str, settings: Settings, arguments: ExamineMachine) -> Rep
         looked = [
             one
             for check in (host_checks.bodies, host_checks.grabbers)
-            for one in check(settings, host_checks.Machine())
+            for one in check(settings, host_checks.Machine(served=True))
         ]
     verdict = go_no_go.state(checks)
     if arguments.config is not None:

@@ -22,6 +22,7 @@ UsbMode = Literal["PTP", "mass storage", "other"]
 CANON, FUJIFILM = 0x04A9, 0x04CB
 MAKERS = {CANON: "Canon", FUJIFILM: "Fujifilm", 0x04B0: "Nikon", 0x054C: "Sony", 0x07B4: "Olympus", 0x04DA: "Panasonic"}
 _STILL_IMAGE, _MASS_STORAGE = 0x06, 0x08  # USB class codes; a still image device speaks PTP
+_OURS = b"dappled.drivers."  # in the command line of a process that holds a camera for us
 _NO_LIBUSB = "no libusb works on this machine: install libusb-1.0-0 (Debian, Ubuntu) or libusb1 (Fedora)"
 
 
@@ -89,14 +90,15 @@ def reset(port: str, backend: Any = None) -> None:
     raise CameraError(f"there is no device at {port} any more")
 
 
-def holders(node: Path, proc: Path = Path("/proc")) -> list[str]:
-    """List the programs that have a device file open, as "name (process 123)", as far as this user may see them."""
+def holders(node: Path, proc: Path = Path("/proc"), *, ours: bool = True) -> list[str]:
+    """List the programs that have a device file open, as "name (process 123)", as far as this user may see them; with
+    or without `ours`, the camera processes of dappled."""
     found = []
     for process in proc.iterdir():
         if process.name.isdigit() and process.name != str(os.getpid()):
             try:
                 open_files = {os.readlink(link) for link in (process / "fd").iterdir()}
-                if str(node) in open_files:
+                if str(node) in open_files and (ours or _OURS not in (process / "cmdline").read_bytes()):
                     found.append(f"{(process / 'comm').read_text().strip()} (process {process.name})")
             except OSError:
                 continue  # another user's, or it has ended

@@ -86,6 +86,24 @@ def test_a_body_that_another_program_holds(machine: Machine) -> None:
     assert "gvfs-gphoto2-volume-monitor" in remedy(found)
 
 
+def test_beside_a_daemon_its_own_camera_process_and_this_user_s_rights_are_no_finding(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It named the service's own process as the one to end, and told a user to join the group of the service."""
+    node = EOS.node(machine.dev / "bus" / "usb")
+    node.parent.mkdir(parents=True)
+    node.write_bytes(b"")
+    process = machine.proc / "4711"
+    (process / "fd").mkdir(parents=True)
+    (process / "fd" / "3").symlink_to(node)
+    (process / "comm").write_text("python3\n")
+    (process / "cmdline").write_bytes(b"python3\0-P\0-m\0dappled.drivers.gphoto2.process\0" + b"7\0")
+    assert the_one(host_checks.bodies(Settings(), having(machine, EOS))).code is Code.USB_HELD
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != node)  # root may do everything
+    found = the_one(host_checks.bodies(Settings(), having(replace(machine, served=True), EOS)))
+    assert found.code is Code.USB_READY
+
+
 def test_gvfs_is_named_as_the_culprit(machine: Machine) -> None:
     assert host_checks.grabbers(Settings(), machine) == []
     (machine.proc / "17").mkdir()

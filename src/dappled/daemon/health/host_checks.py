@@ -31,13 +31,14 @@ USB, CAMERA, DISK = Subject("USB"), Subject("camera"), Subject("disk")
 
 @dataclass(frozen=True, slots=True)
 class Machine:
-    """Where the checks look; tests pass their own."""
+    """Where the checks look; tests pass their own. `served`: a daemon runs here, and opens the camera."""
 
     bodies: Callable[[], list[UsbBody]] = usb_bus.bodies
     proc: Path = Path("/proc")
     dev: Path = Path("/dev")
     open_s: float = OPEN_S
     unsynchronised: Callable[[], bool] = field(default=lambda: not kernel_synchronised())
+    served: bool = False
 
 
 def next_step(found: Iterable[Finding]) -> str:
@@ -83,14 +84,14 @@ def bodies(settings: Settings, machine: Machine) -> list[Finding]:
 def _body(settings: Settings, machine: Machine, body: UsbBody) -> Finding:
     name = f"{body.maker} {body.name}".strip() + f" at {body.port} ({body.mode})"
     node = body.node(machine.dev / "bus" / "usb")
-    if node.exists() and not os.access(node, os.R_OK | os.W_OK):
+    if not machine.served and node.exists() and not os.access(node, os.R_OK | os.W_OK):
         return finding(Code.USB_FORBIDDEN, USB, body=name, node=str(node))
     if body.vendor == usb_bus.FUJIFILM:
         level = Level.NOTE if settings.camera.driver == "fujifilm" else Level.CAUTION
         return finding(Code.USB_FILES_ONLY, USB, level, body=name)
     if body.mode != "PTP":
         return finding(Code.USB_WRONG_MODE, USB, body=name)
-    holders = ", ".join(usb_bus.holders(node, machine.proc))
+    holders = ", ".join(usb_bus.holders(node, machine.proc, ours=not machine.served))
     if not holders:
         return finding(Code.USB_READY, USB, body=name)
     return finding(Code.USB_HELD_BY_DESKTOP if "gvfs" in holders else Code.USB_HELD, USB, body=name, holders=holders)
