@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 
 import pytest
@@ -70,6 +70,7 @@ class FakeCamera:
     opened: int = 0
     closed: int = 0
     looking: bool = False
+    pieces: int = 0
 
     def open(self, _settings: GPhoto2Settings, _before: str | None) -> FakeCamera:
         self._stumble("open")
@@ -86,8 +87,10 @@ class FakeCamera:
         news, self.coming = self.coming, []
         return news
 
-    def fetch(self, file: CameraFile) -> Fetched:
+    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
         self._stumble("fetch")
+        for _ in range(self.pieces):
+            alive()
         return Fetched(Blob.of(self.card[file]), self.taken.get(file))
 
     def delete(self, file: CameraFile) -> None:
@@ -280,6 +283,20 @@ def test_a_file_without_a_shot_has_none(ready: Harness) -> None:
     (arrival,) = arrivals(ready.turn())
     assert arrival.shot is None
     arrival.blob.close()
+
+
+def test_each_piece_of_a_file_is_a_sign_of_life_before_the_file_is_there(ready: Harness) -> None:
+    """A cable of 0.9 MB/s took longer than the process may be silent: it was killed in every shot."""
+    ready.camera.pieces = 3
+    ready.camera.adds(CameraFile("/store", "IMG_0001.CR2"))
+    assert ready.loop.step()
+    said = []
+    while (message := ready.channel.receive(0.0)) is not None:
+        said.append("pong" if message.body["is"] == "pong" else type(message_event(message)).__name__)
+        for fd in message.fds:
+            os.close(fd)
+    assert said.count("pong") == 3
+    assert said.index("Arrival") > 2
 
 
 def test_a_file_announced_twice_comes_once(ready: Harness) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import random
 from collections import Counter, deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -187,7 +187,7 @@ class Body:
                 self._cache.setdefault(news.file, (picture.card, (len(data), taken_s)))
         return [news for _, news, _ in due]
 
-    def fetch(self, file: CameraFile) -> Fetched:
+    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
         self._check()
         if self.cuts_transfer:
             self.cuts_transfer = False

@@ -86,7 +86,7 @@ def session(library: FakeLibrary) -> GPhoto2Session:
 def test_a_file_without_bytes_is_refused_in_a_sentence(library: FakeLibrary, session: GPhoto2Session) -> None:
     library.card["IMG_0001.CR2"] = b""
     with pytest.raises(RefusedError, match=r"announced 0 bytes of IMG_0001\.CR2"):
-        session.fetch(CameraFile(FOLDER, "IMG_0001.CR2"))
+        session.fetch(CameraFile(FOLDER, "IMG_0001.CR2"), lambda: None)
 
 
 @pytest.mark.parametrize("name", ["IMG_0001.CR2", "Ä" * 200 + ".CR2"])
@@ -94,7 +94,9 @@ def test_a_file_is_read_in_pieces_whatever_it_is_called(
     library: FakeLibrary, session: GPhoto2Session, name: str
 ) -> None:
     library.card[name] = bytes(range(256)) * 5000  # more than a piece
-    fetched = session.fetch(CameraFile(FOLDER, name))
+    told: list[int] = []
+    fetched = session.fetch(CameraFile(FOLDER, name), lambda: told.append(1))
+    assert len(told) == 2  # each piece, so that a slow cable is not taken for a dead body
     assert os.pread(fetched.blob.fd, fetched.blob.size + 1, 0) == library.card[name]
     assert fetched.taken_s == 1_700_000_000
     fetched.blob.close()

@@ -110,7 +110,7 @@ class EventSender:
         self._channel.send({"is": CUT_OFF, "files": [(file.folder, file.name) for file in files]}, timeout_s=_SEND_S)
 
     def pong(self) -> None:
-        """Answer a ping."""
+        """Say that this process lives: the answer to a ping, and whenever bytes of a file have come."""
         self._channel.send({"is": "pong"}, timeout_s=_SEND_S)
 
 

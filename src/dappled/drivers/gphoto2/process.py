@@ -296,7 +296,7 @@ class CameraLoop:
         while (file := self._state.next_file()) is not None:
             began_ns = self._now_ns()
             try:
-                fetched = session.fetch(file)
+                fetched = session.fetch(file, self._sender.pong)
             except (BusyError, RefusedError) as error:
                 self._sender.send(*self._state.not_fetched(file, str(error), self._now_ns()))
                 break

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, TypeAlias
 
@@ -107,8 +107,9 @@ class Session(Protocol):
     def news(self) -> list[CameraNews]:
         """Return what happened since the last call. Raises LostError."""
 
-    def fetch(self, file: CameraFile) -> Fetched:
-        """Fetch a file's bytes. Raises BusyError, RefusedError, LostError."""
+    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
+        """Fetch a file's bytes; `alive` is called whenever some have come. Raises BusyError, RefusedError, LostError,
+        and what `alive` raises."""
 
     def about(self, file: CameraFile) -> FileFacts:
         """Return size and time of a file on the card. Raises SessionError."""

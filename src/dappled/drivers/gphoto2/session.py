@@ -9,7 +9,7 @@ import contextlib
 import mmap
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import gphoto2 as gp
@@ -206,11 +206,11 @@ class GPhoto2Session:
                 raise LostError(_sentence(error, "report what happens")) from error
         return news
 
-    def fetch(self, file: CameraFile) -> Fetched:
-        """Fetch a file's bytes; from the card in pieces of 1 MiB straight into a memory file."""
+    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
+        """Fetch a file's bytes; from the card in pieces of 1 MiB straight into a memory file, each of which is told."""
         fd = os.memfd_create("camera file", os.MFD_CLOEXEC)  # the camera's own name may be too long for one
         try:
-            size, taken_s = self._fill(fd, file)
+            size, taken_s = self._fill(fd, file, alive)
         except gp.GPhoto2Error as error:
             os.close(fd)
             raise _translated(error, f"send {file.name}") from error
@@ -219,7 +219,7 @@ class GPhoto2Session:
             raise
         return Fetched(Blob(fd, size), taken_s)
 
-    def _fill(self, fd: int, file: CameraFile) -> tuple[int, int | None]:
+    def _fill(self, fd: int, file: CameraFile, alive: Callable[[], None]) -> tuple[int, int | None]:
         if file.in_memory:
             # libgphoto2 fetched it whole with the event, and keeps it until it is deleted.
             size = self._whole(fd, file)
@@ -230,7 +230,7 @@ class GPhoto2Session:
         taken_s = _time(info)
         if not announced:
             raise RefusedError(f"the camera announced 0 bytes of {file.name}")
-        got = self._pieces(fd, file, announced) if self._in_pieces else None
+        got = self._pieces(fd, file, announced, alive) if self._in_pieces else None
         if got is None:
             self._in_pieces = False
             got = self._whole(fd, file)
@@ -238,7 +238,7 @@ class GPhoto2Session:
             raise RefusedError(f"the camera announced {announced} bytes of {file.name} and sent {got}")
         return got, taken_s
 
-    def _pieces(self, fd: int, file: CameraFile, size: int) -> int | None:
+    def _pieces(self, fd: int, file: CameraFile, size: int, alive: Callable[[], None]) -> int | None:
         """Read piece by piece; None where the body doesn't support that."""
         os.ftruncate(fd, size)
         offset = 0
@@ -253,6 +253,7 @@ class GPhoto2Session:
                             return None
                         raise
                 offset += got
+                alive()
                 if got != wanted:
                     break
         return offset

@@ -11,7 +11,7 @@ import os
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dappled import picture_order
@@ -84,6 +84,8 @@ class PtpSource:
         try:
             channel.send(question, timeout_s=_SEND_S)
             answer = channel.receive(_ANSWER_S)
+            while answer is not None and "coming" in answer.body:
+                answer = channel.receive(_ANSWER_S)
         except ChannelError as error:
             self.close()
             raise CameraError(f"the camera at {self._port} was lost ({error}): connect it again") from None
@@ -110,10 +112,10 @@ class _Files:
         self._settings = GPhoto2Settings(port=None if port == "usb:" else port)
         self._session: Session | None = None
 
-    def answer(self, question: Mapping[str, Any]) -> Blob | str:
-        """Return what was requested, or a sentence why it is not available."""
+    def answer(self, question: Mapping[str, Any], alive: Callable[[], None]) -> Blob | str:
+        """Return what was requested, or a sentence why it is not available. `alive` is called as bytes come."""
         try:
-            return self._list() if question["do"] == "list" else self._fetch(question["name"])
+            return self._list() if question["do"] == "list" else self._fetch(question["name"], alive)
         except SessionError as error:
             self.rest()  # the next question opens it again
             return str(error)
@@ -134,19 +136,22 @@ class _Files:
         ]
         return Blob.of(json.dumps(rows).encode(), "listing")
 
-    def _fetch(self, path: str) -> Blob:
+    def _fetch(self, path: str, alive: Callable[[], None]) -> Blob:
         session = self._session = self._session or self._open(self._settings)
         folder, _, name = path.rpartition("/")
-        return session.fetch(CameraFile(folder, name)).blob
+        return session.fetch(CameraFile(folder, name), alive).blob
 
 
 def _serve(channel: ProcessChannel, files: _Files) -> None:
+    def alive() -> None:
+        channel.send({"coming": True}, timeout_s=_SEND_S)
+
     while True:
         question = channel.receive(_REST_S)
         if question is None:
             files.rest()
             continue
-        answer = files.answer(question.body)
+        answer = files.answer(question.body, alive)
         if isinstance(answer, str):
             channel.send({"error": answer}, timeout_s=_SEND_S)
             continue
