@@ -116,7 +116,6 @@ INSTANCE = (
     ("StateDirectory=dappled", "StateDirectory=dappled-%i"),
     ("RuntimeDirectory=dappled", "RuntimeDirectory=dappled-%i"),
     ("HOME=/var/lib/dappled", "HOME=/var/lib/dappled-%i"),
-    ("MemoryHigh=70%", "MemoryHigh=38%"),
     ("MemoryMax=85%", "MemoryMax=45%"),
 )
 """What the unit of one camera of several has in place of the unit of the only one: folders of its own, less memory."""

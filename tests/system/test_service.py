@@ -206,10 +206,28 @@ def test_two_cameras_share_no_folder_no_settings_and_no_memory() -> None:
     only, each = (files[Path(f"/usr/lib/systemd/system/dappled{at}.service")] for at in ("", "@"))
     assert "ExecStart=/usr/bin/dappled run --config /opt/etc/dappled/%i.toml\n" in each
     shared = set(only.splitlines()) & set(each.splitlines())
-    for name in ("ExecStart", "StateDirectory", "RuntimeDirectory", "Environment", "MemoryHigh", "MemoryMax"):
+    for name in ("ExecStart", "StateDirectory", "RuntimeDirectory", "Environment", "MemoryMax"):
         assert not [line for line in shared if line.startswith(f"{name}=")]
     assert "RuntimeDirectory=dappled-%i\n" in each  # not in /run/dappled, which goes with the other service
     assert len(only.splitlines()) == len(each.splitlines())
+
+
+def test_a_greedy_decoder_does_not_slow_down_what_feeds_the_watchdog(unit: Path) -> None:
+    """MemoryHigh= throttles the whole service: the watchdog ended it on a machine with 512 MB. At MemoryMax= the kernel
+    ends the process with the highest score, the console's or the decoder's, and the service goes on."""
+    lines = unit.read_text(encoding="utf-8").splitlines()
+    assert not [line for line in lines if line.startswith("MemoryHigh=")]
+    assert "OOMPolicy=continue" in lines
+
+
+def test_kinds_of_devices_that_come_with_a_module_are_there_before_the_service_starts(unit: Path) -> None:
+    """systemd looks up the kinds of DeviceAllow= once, when it starts the service; a port of a kind that comes later is
+    refused until a restart."""
+    lines = unit.read_text(encoding="utf-8").splitlines()
+    for kind, module in (("ttyACM", "cdc_acm"), ("ttyUSB", "usbserial")):
+        assert f"DeviceAllow=char-{kind} rw" in lines
+        for what in ("Wants=", "After="):
+            assert [line for line in lines if line.startswith(what) and f"modprobe@{module}.service" in line]
 
 
 def test_the_unit_leaves_the_daemon_what_tells_whether_its_clock_can_be_believed(unit: Path) -> None:
