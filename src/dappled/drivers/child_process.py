@@ -23,7 +23,7 @@ import subprocess
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -335,7 +335,24 @@ def raise_priority() -> None:
     """
     try:
         resource.setrlimit(resource.RLIMIT_RTTIME, (_REAL_TIME_US, 2 * _REAL_TIME_US))
-        os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(_RR_PRIORITY))
+        _in_real_time()
     except (PermissionError, ValueError):
         with contextlib.suppress(PermissionError):
             os.setpriority(os.PRIO_PROCESS, 0, NICENESS)
+
+
+def _in_real_time() -> None:
+    os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(_RR_PRIORITY))
+
+
+@contextlib.contextmanager
+def usual_priority() -> Iterator[None]:
+    """Leave real time, where this process is in it, for what may compute longer than that allows."""
+    real_time = os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_RR
+    if real_time:
+        os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
+    try:
+        yield
+    finally:
+        if real_time:
+            _in_real_time()

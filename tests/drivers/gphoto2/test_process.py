@@ -71,8 +71,10 @@ class FakeCamera:
     closed: int = 0
     looking: bool = False
     pieces: int = 0
+    policies: list[int] = field(default_factory=list)
 
     def open(self, _settings: GPhoto2Settings, _before: str | None) -> FakeCamera:
+        self.policies.append(os.sched_getscheduler(0))
         self._stumble("open")
         self.opened += 1
         return self
@@ -259,6 +261,18 @@ def test_absent_camera_is_looked_for_until_it_comes(harness: Harness) -> None:
     assert "nothing here" in failures(harness.turn())[1]
     assert states(harness.turn(1.1, steps=1)) == []  # the same state isn't sent twice
     assert states(harness.turn(1.1)) == [("ready", "")]
+
+
+def test_the_bus_is_looked_at_outside_of_real_time(harness: Harness, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It took over a second of CPU on a small machine: the kernel killed the process, each second anew."""
+    policy = [os.SCHED_RR | os.SCHED_RESET_ON_FORK]
+    monkeypatch.setattr(os, "sched_getscheduler", lambda _pid: policy[-1])
+    monkeypatch.setattr(os, "sched_setscheduler", lambda _pid, wanted, _param: policy.append(wanted))
+    harness.camera.errors["open"] = [AbsentError("no camera is on USB")]
+    harness.turn(steps=1)
+    harness.turn(60.0)
+    assert [one & ~os.SCHED_RESET_ON_FORK for one in harness.camera.policies] == [os.SCHED_OTHER] * 2
+    assert policy[-1] == policy[0]
 
 
 def test_one_shot_is_at_the_camera_at_a_time(ready: Harness) -> None:

@@ -23,7 +23,13 @@ from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.drivers.attribution import true_name
 from dappled.drivers.camera import Arrival, BodyState, SettingName, SettingsChanged, ShotFailed, StateChanged
-from dappled.drivers.child_process import ChannelError, ProcessChannel, die_with_parent, raise_priority
+from dappled.drivers.child_process import (
+    ChannelError,
+    ProcessChannel,
+    die_with_parent,
+    raise_priority,
+    usual_priority,
+)
 from dappled.drivers.gphoto2.messages import Carryover, EventSender
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -109,7 +115,8 @@ class CameraLoop:
                 self._session.close()
                 self._session = None
             with contextlib.suppress(SessionError):
-                self._session = self._open_camera(self._settings, self._state.serial)
+                with usual_priority():
+                    self._session = self._open_camera(self._settings, self._state.serial)
                 if self._session.identity.serial == self._state.serial:
                     self._sender.send(*self._state.left(self._session.contents(), self._now_ns()))
                     return
@@ -231,7 +238,8 @@ class CameraLoop:
         if self._sender.state is None:
             self._send_state("starting")
         try:
-            session = self._open_camera(self._settings, self._state.serial)
+            with usual_priority():  # libgphoto2 loads all of its drivers to look at the bus
+                session = self._open_camera(self._settings, self._state.serial)
         except SessionError as error:
             if quiet:
                 self._open_at_ns = self._now_ns() + round(_REOPEN_S * 1e9)
