@@ -48,7 +48,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "flight check": ("flight", "check that every byte is intact; exits 1 if not"),
     "flight report": (
         "flight",
-        "count which requests became frames; exits 1 if they don't agree or may lack some, no shot was, or a frame is in doubt",
+        "count which requests became frames; exits 1 if they don't agree, may lack some, or are in doubt",
     ),
     "flight seal": ("flight", "check a flight and sign it as it stands; exits 1 if it is not intact"),
     "flight offload": (
