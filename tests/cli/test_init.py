@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import pytest
@@ -38,9 +39,9 @@ def test_serial_devices_come_with_a_speed(tmp_path: Path) -> None:
 
 
 def test_an_empty_answer_takes_what_is_proposed_and_is_asked_again_without(capsys: pytest.CaptureFixture[str]) -> None:
-    answers = iter(["", " ", "mask-2"])
-    assert init.ask(init.Question("--camera", "which body", "auto"), lambda _: next(answers)) == "auto"
-    assert init.ask(init.Question("--mask", "which mask", "", ["mask-2"]), lambda _: next(answers)) == "mask-2"
+    answers, right = iter(["", " ", "mask-2"]), str
+    assert init.ask(init.Question("--camera", "which body", "auto"), lambda _: next(answers), right) == "auto"
+    assert init.ask(init.Question("--mask", "which mask", "", ["mask-2"]), lambda _: next(answers), right) == "mask-2"
     assert "which body [auto]" in capsys.readouterr().err
 
 
@@ -70,6 +71,47 @@ def test_the_file_is_written_and_passes_config_check(tmp_path: Path, capsys: pyt
     assert file.read_bytes() == before
     assert main([*words, "--overwrite"]) == 0
     assert [path.name for path in tmp_path.iterdir()] == ["dappled.toml"]
+
+
+def at_a_terminal(monkeypatch: pytest.MonkeyPatch, *answers: str) -> list[str]:
+    """A person who gives these answers; returns those that are left."""
+    left = list(answers)
+    for stream in (sys.stdin, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True)
+    monkeypatch.setattr("builtins.input", lambda _: left.pop(0))
+    return left
+
+
+@pytest.mark.usefixtures("alone")
+def test_a_wrong_answer_is_asked_again_with_the_nearest_name_and_the_others_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "dappled.toml"
+    cameras, masks = ("canon-eos-450", "fujifilm-s5200"), ("mask2", "mask-2")
+    left = at_a_terminal(
+        monkeypatch, *cameras, "gpio", "autopilot", *masks, "what:ever", "none", str(tmp_path / "flights")
+    )
+    assert main(["init", str(file)]) == 0
+    assert left == []
+    said = capsys.readouterr().err
+    for nearest in ("did you mean canon-eos-450d?", "did you mean mask-2?"):
+        assert nearest in said
+    loaded = settings.load(file)
+    assert (loaded.camera.profile, loaded.camera.shutter) == ("fujifilm-s5200", "autopilot")
+    assert (loaded.mask.profile, loaded.mavlink.url) == ("mask-2", ())
+
+
+@pytest.mark.usefixtures("alone")
+def test_nothing_is_asked_for_a_file_that_can_t_be_written_or_beside_a_wrong_flag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    left = at_a_terminal(monkeypatch, "auto")
+    assert main(["init", str(tmp_path / "missing" / "x.toml")]) == 1
+    assert main(["init", str(tmp_path / "x.toml"), "--mask", "mask2"]) == 2
+    assert left == ["auto"]
+    said = capsys.readouterr().err
+    assert "missing is no folder" in said
+    assert "did you mean mask-2?" in said
 
 
 @pytest.mark.usefixtures("alone")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ import tomli_w
 from dappled import durable
 from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, of_setting, option
 from dappled.config import profiles, settings
-from dappled.config.settings import CameraSettings, RecordSettings
+from dappled.config.schema import TomlSource
+from dappled.config.settings import CameraSettings, RecordSettings, SettingsFile
 from dappled.daemon import settings_check
 from dappled.drivers import usb_bus
 from dappled.drivers.usb_bus import UsbBody
@@ -27,6 +29,7 @@ _SERIAL = ("ttyACM*", "ttyUSB*", "ttyAMA0", "serial0", "ttyTHS1")
 _BAUD = {"ttyACM": ",115200", "ttyUSB": ",57600"}  # USB of an autopilot; a telemetry radio
 _WIRED_BAUD = ",921600"
 _DEFAULT_LINK = "udpin:0.0.0.0:14550"
+_NOT_YET = {"--camera": ANY, "--shutter": "outside", "--mask": NONE, "--link": NONE, "--folder": FLIGHTS}
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,7 @@ class InitSettings(Overwriting, Verb):
         asks = sys.stdin.isatty() and sys.stderr.isatty() and not self.json
         given = {"--camera": self.camera, "--shutter": self.shutter, "--mask": self.mask}
         given |= {"--link": self.link, "--folder": self.folder}
+        refuse_wrong({flag: said for flag, said in given.items() if said}, self.file)  # before anything is asked
         found = bodies()
         if asks:
             output.remark(f"on the bus: {', '.join(_named(body) for body in found) or 'no camera'}")
@@ -75,7 +79,7 @@ class InitSettings(Overwriting, Verb):
                 continue
             answer = given[question.flag]
             if answer is None:
-                answer = ask(question, input) if asks else question.proposed
+                answer = self._asked(question, answers) if asks else question.proposed
             if not answer:
                 raise DappledError(f"nobody is there to ask: give {question.flag} ({question.words})")
             answers[question.flag] = answer
@@ -84,6 +88,10 @@ class InitSettings(Overwriting, Verb):
         if not self.json:
             output.remark(f"{self.file}: good; next: dappled doctor --config {self.file}")
         return Report({"file": str(self.file), "settings": tables(answers)}, text.splitlines())
+
+    def _asked(self, question: Question, answers: dict[str, str]) -> str:
+        """The person's answer, which goes with those before it."""
+        return ask(question, input, lambda said: refuse_wrong(answers | {question.flag: said}, self.file))
 
 
 CLASSES = {"init": InitSettings}
@@ -105,8 +113,19 @@ def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]
     ]
 
 
-def ask(question: Question, answer: Callable[[str], str]) -> str:
-    """The person's answer, or what was proposed for an empty one. Asks again where there is neither."""
+def refuse_wrong(answers: dict[str, str], file: Path) -> None:
+    """Refuse answers of which `config check` would refuse the settings file. Raises DappledError."""
+    folder = file.absolute().parent
+    if not os.access(folder, os.W_OK):
+        raise DappledError(f"{file} can't be written: {folder} is no folder that you may write to")
+    read = settings.of_tables(tables(_NOT_YET | answers), str(file))
+    examined = SettingsFile(settings.resolve(read, folder), TomlSource(str(file)))
+    settings_check.checked(examined, by_this_user=False)
+
+
+def ask(question: Question, answer: Callable[[str], str], check: Callable[[str], object]) -> str:
+    """The person's answer, or what was proposed for an empty one. Asks again where there is neither, and where `check`
+    refuses it, with its sentences."""
     if question.choices:
         say(f"  {', '.join(question.choices)}", error=True)
     proposed = f" [{question.proposed}]" if question.proposed else ""
@@ -115,11 +134,17 @@ def ask(question: Question, answer: Callable[[str], str]) -> str:
         try:
             said = answer("").strip()
         except EOFError:
-            said = ""
             if not question.proposed:
                 raise DappledError(f"there was no answer: give {question.flag}") from None
-        if said or question.proposed:
-            return said or question.proposed
+            return question.proposed
+        said = said or question.proposed
+        try:
+            if said:
+                check(said)
+                return said
+        except DappledError as error:
+            for sentence in error.sentences:
+                say(f"  {sentence}", error=True)
 
 
 def tables(answers: dict[str, str]) -> dict[str, dict[str, Any]]:
