@@ -118,6 +118,16 @@ def test_a_plan_says_what_one_frame_brings(capsys: pytest.CaptureFixture[str]) -
     assert not any(text.startswith("one frame tells") for text in near["warnings"])
 
 
+def test_a_plan_says_how_slow_or_with_which_overlap_the_body_keeps_up(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["plan", "--camera", "reference-36mm", "--altitude", "10", "--interval", "3", "--speed"]
+    needs = "the body takes a photograph in 3 s, not in"
+    assert _json([*words, "4"], capsys)["warnings"] == [f"{needs} 0.28 s: fly at 0.36 m/s or slower"]
+    assert _json([*words, "0.36"], capsys)["warnings"] == []
+    (warning,) = _json([*words, "1"], capsys)["warnings"]
+    assert warning == f"{needs} 1.1 s: fly at 0.36 m/s or slower, or with an --overlap of 0.45 or less"
+    assert _json([*words, "1", "--overlap", "0.45"], capsys)["warnings"] == []
+
+
 def test_design_knows_cover_glass_and_stops(capsys: pytest.CaptureFixture[str]) -> None:
     words = ["mask", "design", "--altitude", "10", "--camera", "fujifilm-s5200", "--law", "geometric"]
     words += ["--focal-length", "63", "--film", "16k"]

@@ -217,6 +217,28 @@ def test_the_mount_says_which_side_of_the_frame_lies_along_the_line() -> None:
     assert made.trigger_m == pytest.approx(0.2 * ALONG_M, rel=0.05)
 
 
+def test_a_mission_is_as_slow_as_the_body_or_says_that_the_vehicle_is_too_fast_for_it() -> None:
+    frames = survey(np.random.default_rng(1), 80, lost=0.4)
+    covered = coverage.cover(seen(frames), grid(), square(80))
+    usual = refly.plan(seen(frames), covered)
+    assert usual is not None
+    assert (usual.speed_m_s, usual.body_s) == (8.0, None)
+    timed = [replace(one, tag=replace(one.tag, utc_ns=3_000_000_000 * one.frame.index)) for one in frames]
+    for made in (refly.plan(seen(timed), covered), refly.plan(seen(frames), covered, body_s=3.0)):
+        assert made is not None
+        assert made.interval_s == pytest.approx(3.0, rel=0.01)  # a photograph every 8.9 m: 8 m/s would be one in 1.1 s
+        assert made.body_s == 3.0
+        assert made.interval_s >= 3.0
+        (speed,) = [one for one in refly.qgc_plan(made)["mission"]["items"] if one["command"] == 178]
+        assert speed["params"][1] == made.speed_m_s
+    with pytest.raises(DappledError, match=r"in 3 s: one every 0\.89 m asks for 0\.29 m/s.* --overlap of 0\.96 or"):
+        refly.plan(seen(timed), covered, overlap=0.98)
+    with pytest.raises(DappledError, match=r"no slower than 12 m/s: give an --overlap of 0\.19 or less"):
+        refly.plan(seen(timed), covered, slowest_m_s=12.0)
+    with pytest.raises(DappledError, match="fly this area by hand, and higher"):
+        refly.plan(seen(timed), covered, slowest_m_s=20.0)
+
+
 SIMPLE = {
     "type": "object",
     "required": ["type", "autoContinue", "command", "doJumpId", "frame", "params"],
@@ -411,6 +433,8 @@ def test_the_command_writes_what_was_seen_and_the_mission(
         "position.without_fix",
     ]
     assert facts["unjudged"] == 1
+    assert facts["interval_s"] > 0
+    assert facts["speed_m_s"] == 8.0
     assert 0 < facts["holes_m2"] < facts["area_m2"] == pytest.approx(120**2, rel=0.02)
     with Image.open(tmp_path / "coverage.png") as picture:
         assert picture.width == 1080

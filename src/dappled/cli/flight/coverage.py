@@ -29,6 +29,13 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
     refly: Path | None = option("--refly", "write a mission over the holes (.plan)", None)
     overlap: float = option("--overlap", "of the mission, along a line", 0.8, metavar="SHARE", low=0, high=0.95)
     sidelap: float = option("--sidelap", "of the mission, between lines", 0.6, metavar="SHARE", low=0, high=0.95)
+    interval: float | None = option(
+        "--interval", "of the mission: time that the body needs for a photograph", None, unit="s", above=0.0,
+        otherwise="the flight's usual one",
+    )  # fmt: skip
+    slowest: float = option(
+        "--slowest", "of the mission: the vehicle's lowest speed", reflying.SLOWEST_M_S, unit="m/s", above=0.0,
+    )  # fmt: skip
     output: Path | None = option(
         "-o --output", "write coverage.tif, .geojson and .png into this folder", None, metavar="DIR",
     )  # fmt: skip
@@ -68,7 +75,15 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
             raise CallError(f"{self.area}: the area is smaller than a cell of the map: give a smaller --cell")
         mission = None
         if self.refly is not None:
-            mission = reflying.plan(seen, covered, least=self.least, overlap=self.overlap, sidelap=self.sidelap)
+            mission = reflying.plan(
+                seen,
+                covered,
+                least=self.least,
+                overlap=self.overlap,
+                sidelap=self.sidelap,
+                body_s=self.interval,
+                slowest_m_s=self.slowest,
+            )
         if self.output is not None:
             self.output.mkdir(parents=True, exist_ok=True)
             tif, geojson, png = files
@@ -103,6 +118,8 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
             "not_in_area": [] if area is None else list(area.left),
             "median_frames": float(_median(covered)),
             "lines": None if mission is None else len(mission.lines),
+            "speed_m_s": None if mission is None else mission.speed_m_s,
+            "interval_s": None if mission is None else mission.interval_s,
             "files": [str(file) for file in files],
         }
         cells = f"cells of {covered.grid.step_x:.2g} m"
@@ -123,8 +140,10 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         if unknown_m2:
             lines.append(f"the terrain has no height for {unknown_m2:.0f} m²: they count as not seen")
         if mission is not None:
-            every = f"a photograph every {mission.trigger_m:.1f} m"
+            every = f"a photograph every {mission.trigger_m:.1f} m at {mission.speed_m_s:g} m/s"
             lines.append(f"{counted(len(mission.lines), 'line')} at {mission.altitude_m:.0f} m above home, {every}")
+            body = "has to be able to: give --interval" if mission.body_s is None else f"needs {mission.body_s:.2g} s"
+            lines.append(f"that is one in {mission.interval_s:.2g} s; the body {body}")
         elif self.refly is not None:
             lines.append(f"{self.refly} was not written: there is nothing to fly again")
         return Report(values, [*lines, *map(str, files)], failed=bool(missed))

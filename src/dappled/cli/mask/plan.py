@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import profiles
 from dappled.config.profiles import CameraProfile
 from dappled.decode.optics import MaskedOptics, carrier_tables, lenses
-from dappled.decode.optics.lenses import SingleFrameDepth
+from dappled.decode.optics.lenses import SingleFrameDepth, SurveyPlan
 from dappled.decode.optics.mask_design import SMALL_VIEW_PX
 
 _SHALLOW = 0.05  # of the altitude: a house is no higher
@@ -35,6 +36,9 @@ class PlanFlight(AltitudeArguments, Verb):
     mask: str | None = option("--mask", "mask profile, for what its views and one frame's depth are worth", None)
     f_number: float | None = option(
         "--f-number", "f-number of the lens", None, above=0.0, otherwise="the mask's ideal one",
+    )  # fmt: skip
+    interval: float | None = option(
+        "--interval", "time that the body needs for a photograph", None, unit="s", above=0.0, otherwise="not looked at",
     )  # fmt: skip
     sideways: bool = flag("--sideways", "the width of the frame, not its height, lies along the flight line")
 
@@ -77,6 +81,8 @@ class PlanFlight(AltitudeArguments, Verb):
             view_columns=columns,
             sideways=self.sideways,
         )
+        if self.interval is not None and made.interval_s < self.interval:
+            warnings.append(_too_fast(made, self.interval, self.speed))
         views = "" if made.view_sample_m is None else f" of the picture, {made.view_sample_m * 100:.1f} cm of a view"
         lines = [
             f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight",
@@ -101,6 +107,15 @@ def _depth_line(depth: SingleFrameDepth) -> str:
         f"one frame  over the stop (f/{depth.f_number:.3g}) the ground moves by {depth.stop_px:.2g} px, a metre of "
         f"relief by {depth.relief_px:.2g} px more; a height is known to ±{_two_digits(depth.sigma_m)} m"
     )
+
+
+def _too_fast(made: SurveyPlan, body_s: float, speed_m_s: float) -> str:
+    """Which speed or overlap the body, which takes a photograph in `body_s`, keeps up with."""
+    slow = math.floor(100 * made.spacing_m / body_s) / 100
+    overlap = math.floor(100 * (1 - speed_m_s * body_s / made.footprint_m[0])) / 100
+    less = f", or with an --overlap of {overlap:g} or less" if overlap >= 0 else ""
+    needs = f"the body takes a photograph in {body_s:g} s, not in {made.interval_s:.2g} s"
+    return f"{needs}: fly at {slow:g} m/s or slower{less}"
 
 
 def _two_digits(value: float) -> str:

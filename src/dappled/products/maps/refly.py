@@ -28,6 +28,7 @@ _GLOBAL_RELATIVE, _MISSION = 3, 2  # MAV_FRAME
 _LEAST_SHARE = 0.5  # of the flight's usual height above ground: nearer to it a mission is not written
 _MOST_ASIDE_RAD = math.radians(15)
 _FAR_M, _FAR_SPANS = 5000.0, 5.0  # farther than both, an area is taken for another field's
+SLOWEST_M_S = 0.5  # of a multicopter that shall keep its spacing in wind
 _CLOSE = 2.0  # holes within so many line distances of each other are flown as one
 
 
@@ -42,7 +43,8 @@ class FlightLine:
 @dataclass(frozen=True, slots=True)
 class Refly:
     """A mission over a survey's holes. `altitude_m` is above home, `home` (latitude, longitude, metres above sea
-    level), `trigger_m` the distance between two photographs, `line_m` that between two lines."""
+    level), `trigger_m` the distance between two photographs, `line_m` that between two lines. The body is known to take
+    a photograph in `body_s`; None where that isn't known."""
 
     lines: tuple[FlightLine, ...]
     altitude_m: float
@@ -50,16 +52,31 @@ class Refly:
     line_m: float
     speed_m_s: float
     home: tuple[float, float, float]
+    body_s: float | None = None
+
+    @property
+    def interval_s(self) -> float:
+        """The time between two photographs."""
+        return self.trigger_m / self.speed_m_s
 
 
 def plan(
-    seen: FramesSeen, covered: Coverage, *, least: int = 1, overlap: float = 0.8, sidelap: float = 0.6
+    seen: FramesSeen,
+    covered: Coverage,
+    *,
+    least: int = 1,
+    overlap: float = 0.8,
+    sidelap: float = 0.6,
+    body_s: float | None = None,
+    slowest_m_s: float = SLOWEST_M_S,
 ) -> Refly | None:
     """Lines that cover the holes at the flight's own height; None where there is no hole.
 
-    The camera looks down with a side of the frame along the line, as `pose.mount` has it. Raises DappledError where it
-    doesn't, where the flight's height above home isn't known, or the ground anywhere on the way isn't, or rises to
-    half of the flight's usual height above it.
+    They are flown as fast as the flight was, or so much slower that the body, which takes a photograph in `body_s`
+    (None: as in the flight), keeps up. The camera looks down with a side of the frame along the line, as `pose.mount`
+    has it. Raises DappledError where it doesn't, where the flight's height above home isn't known, or the ground
+    anywhere on the way isn't, or rises to half of the flight's usual height above it, or the vehicle, which flies at
+    `slowest_m_s` or faster, is too fast for the body.
     """
     holes = covered.holes(least)
     if not holes.any():
@@ -91,13 +108,24 @@ def plan(
             f"the ground on the way rises to {base + altitude - above:.0f} m, {above:.0f} m below the mission's "
             f"{base + altitude:.0f} m; the flight was {usual:.0f} m above it: plan this area by hand"
         )
+    body_s = body_s or _usual_interval_s(seen)
+    speed = _speed(seen, trigger, body_s)
+    if body_s is not None and speed < slowest_m_s:
+        most = math.floor(100 * (1 - slowest_m_s * body_s / along)) / 100
+        able = most >= max(0.0, 1 - 1 / least)
+        raise DappledError(
+            f"the body takes a photograph in {body_s:.2g} s: one every {trigger:.2g} m asks for {speed:.2g} m/s, and "
+            f"the vehicle flies no slower than {slowest_m_s:g} m/s: "
+            + (f"give an --overlap of {most:.2g} or less" if able else "fly this area by hand, and higher")
+        )
     return Refly(
         tuple(FlightLine(_degrees(seen, begin), _degrees(seen, end)) for begin, end in lines),
         altitude,
         trigger,
         line,
-        _speed(seen),
+        speed,
         (first.latitude_deg, first.longitude_deg, base),
+        body_s,
     )
 
 
@@ -170,9 +198,19 @@ def _footprint(seen: FramesSeen, above_m: float) -> tuple[float, float]:
     return (width, height) if abs(forward[0]) > abs(forward[1]) else (height, width)
 
 
-def _speed(seen: FramesSeen) -> float:
+def _speed(seen: FramesSeen, trigger_m: float, body_s: float | None) -> float:
+    """The flight's speed (m/s), or the highest at which the body keeps up."""
     found = [math.hypot(*v[:2]) for one in seen.stations if (v := one.tag.pose.velocity_ned_m_s) is not None]
-    return round(max(1.0, float(np.median(found))), 1) if found else 5.0
+    usual = round(max(1.0, float(np.median(found))), 1) if found else 5.0
+    return usual if body_s is None else min(usual, math.floor(100 * trigger_m / body_s) / 100)
+
+
+def _usual_interval_s(seen: FramesSeen) -> float | None:
+    """The middle time between one photograph of the flight and the next, which the body has kept up; None where no two
+    of them follow each other."""
+    taken = {one.frame.index: one.tag.utc_ns for one in seen.stations}
+    apart = [after - utc_ns for index, utc_ns in taken.items() if (after := taken.get(index + 1, utc_ns)) > utc_ns]
+    return float(np.median(apart)) / 1e9 if apart else None
 
 
 def _parts(holes: NDArray[np.bool_], line_cells: float) -> list[NDArray[np.bool_]]:
