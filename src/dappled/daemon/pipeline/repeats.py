@@ -9,7 +9,8 @@
 3. One trigger, several messages. PX4 sends CAMERA_TRIGGER, IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL for one trigger,
    and a vehicle on two links sends each of them twice. Within 0.3 s of a shot's first message, a message of the same
    source belongs to that shot if the shot has none of this kind from this link yet, and none of this kind with another
-   sequence; the oldest such shot takes it (`RecentRequests`).
+   sequence; the oldest such shot takes it (`RecentRequests`). The same holds for a request that was refused: it is
+   refused once, however many messages carried it. A retry of it is judged anew.
 4. Echo. An autopilot that we command to fire the camera (a servo, a relay, its own trigger) reports that:
    CAMERA_TRIGGER, CAMERA_FEEDBACK, or the command for cameras. One message of each kind on each link within 2 s of our
    command is its echo and not a request, else every shot would ask for the next (`AutopilotCommands`).
@@ -48,6 +49,7 @@ TRIGGER_NS = 300_000_000
 ECHO_NS = 2 * 10**9
 FORWARDED_NS = 250_000_000
 _UNPAIRED_KEPT = 64
+_NO_SHOT = -1
 _PACKETS_KEPT = 1024
 _REQUESTS_KEPT = 256
 _COMMANDS_KEPT = 32
@@ -97,6 +99,7 @@ class RecentRequests:
 
     def __init__(self) -> None:
         self._requests: list[_Remembered] = []
+        self._refused: deque[tuple[_Remembered, Finding]] = deque(maxlen=_UNPAIRED_KEPT)
         self._instants: dict[tuple[str, str, int | None, int], int] = {}  # of triggers with a time; the oldest first
 
     def same(self, request: CaptureRequest, now_ns: int) -> int | None:
@@ -127,6 +130,23 @@ class RecentRequests:
             _Remembered(index, request.source, request.kind, request.sequence, request.series, now_ns, now_ns, parts)
         )
 
+    def refusal(self, request: CaptureRequest, now_ns: int) -> Finding | None:
+        """Why this request was refused, where another message has brought it: of another kind, or over another link.
+        None for a new one, and for a retry."""
+        for known, reason in self._refused:
+            if _belongs(known, request, now_ns):
+                known.parts[request.kind, request.link] = request.sequence
+                return reason
+        return None
+
+    def refuse(self, request: CaptureRequest, now_ns: int, reason: Finding) -> None:
+        """A request was refused."""
+        parts = {(request.kind, request.link): request.sequence}
+        known = _Remembered(
+            _NO_SHOT, request.source, request.kind, request.sequence, request.series, now_ns, now_ns, parts
+        )
+        self._refused.append((known, reason))
+
     def forget(self, request: CaptureRequest) -> None:
         """The next message like this is a new request."""
         self._requests = [known for known in self._requests if known.key() != _request_key(request)]
@@ -152,14 +172,16 @@ class RecentRequests:
     def _part(self, request: CaptureRequest, now_ns: int) -> _Remembered | None:
         if request.series is not None:
             return None
-        for known in self._requests:
-            if known.series is not None or known.source != request.source or now_ns - known.first_ns > TRIGGER_NS:
-                continue
-            if (request.kind, request.link) in known.parts:
-                continue
-            if all(sequence == request.sequence for (kind, _), sequence in known.parts.items() if kind == request.kind):
-                return known
-        return None
+        return next((known for known in self._requests if _belongs(known, request, now_ns)), None)
+
+
+def _belongs(known: _Remembered, request: CaptureRequest, now_ns: int) -> bool:
+    """Whether a message is one more of a known request (rule 3)."""
+    if (known.series, known.source) != (request.series, request.source) or now_ns - known.first_ns > TRIGGER_NS:
+        return False
+    if (request.kind, request.link) in known.parts:
+        return False
+    return all(sequence == request.sequence for (kind, _), sequence in known.parts.items() if kind == request.kind)
 
 
 @dataclass(frozen=True, slots=True)

@@ -279,7 +279,7 @@ class Shutter:
                 self._recent.add(request, now_ns, partner)
             self._follow_autopilot(request, now_ns, new=False)
             return ShotDecision("duplicate", index=partner)
-        if (refused := self._forwarded.refusal(request, now_ns)) is not None:
+        if (refused := self._refused_before(request, now_ns)) is not None:
             return ShotDecision("refused", reason=refused)  # the same request, which was counted already
         reason = self._why_not(happened=request.happened)
         if reason is None:
@@ -291,7 +291,7 @@ class Shutter:
             except (OSError, FlightError) as error:
                 reason = finding(Code.SHOT_NOT_NOTED, Subject("shot", shot.index), why=str(error))
         if reason is not None:
-            self._forwarded.refuse(request, now_ns, reason)
+            self._note_refusal(request, now_ns, reason)
             self._follow_autopilot(request, now_ns, new=True)
             return self._refuse(request, reason)
         self._next_index += 1
@@ -309,6 +309,22 @@ class Shutter:
             self._failed += 1
             raise
         return ShotDecision("shot", index=shot.index)
+
+    def _refused_before(self, request: CaptureRequest, now_ns: int) -> Finding | None:
+        """Why the same request was refused, where another message has brought it. An exposure can't be refused."""
+        if request.happened:
+            return None
+        own = request.kind in OWN_KINDS
+        refused = None if own else self._recent.refusal(request, now_ns)
+        if refused is None and (refused := self._forwarded.refusal(request, now_ns)) is not None and not own:
+            self._recent.refuse(request, now_ns, refused)
+        return refused
+
+    def _note_refusal(self, request: CaptureRequest, now_ns: int, reason: Finding) -> None:
+        """Its other messages are refused as well, and not counted."""
+        if request.kind not in OWN_KINDS:
+            self._recent.refuse(request, now_ns, reason)
+        self._forwarded.refuse(request, now_ns, reason)
 
     def _follow_autopilot(self, request: CaptureRequest, now_ns: int, *, new: bool) -> None:
         """Where the autopilot runs the interval as well: it sets the pace, and its `new` request is the next shot."""
