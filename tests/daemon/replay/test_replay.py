@@ -6,8 +6,10 @@ import dataclasses
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from dappled import codec
+from dappled.cli import main
 from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
@@ -22,6 +24,8 @@ from dappled.errors import DappledError
 from dappled.findings import Code, Subject, finding, told
 from dappled.flight import Cause, FlightError, Shot, TimeSource
 from tests.daemon.fakes import FakeCamera, FakeDecoder, eventually, failed, fired, good, rig
+from tests.drivers.mavlink import logs_here
+from tests.drivers.mavlink.true_logs import written
 from tests.simulated.finepix import picture
 
 
@@ -211,6 +215,46 @@ def test_the_only_telemetry_beside_the_frames_is_theirs(tmp_path: Path) -> None:
         replay.of_folder(tmp_path, "*", None, 5, 1.0)
     given = replay.of_folder(tmp_path, "*", tmp_path / "other.tlog", 5, 1.0)
     assert given.telemetry == tmp_path / "other.tlog"
+
+
+@pytest.fixture
+def logs_read_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a process for each."""
+    monkeypatch.setattr("dappled.drivers.reader_process.read", logs_here.read)
+
+
+def photographed(folder: Path, *taken: str) -> Path:
+    (folder / "frames").mkdir()
+    for number, time in enumerate(taken, 1):
+        exif = Image.Exif()
+        exif[306] = time
+        Image.new("RGB", (16, 16)).save(folder / "frames" / f"{number}.jpg", exif=exif)
+    return folder / "frames"
+
+
+@pytest.mark.usefixtures("logs_read_here")
+@pytest.mark.parametrize(
+    ("taken", "words", "off_s"),
+    [
+        (("2026:11:21 10:15:03", "2026:11:21 10:15:04"), [], 0),
+        (("2026:11:21 15:45:03", "2026:11:21 15:45:04"), [], 0),  # in another zone
+        (("2026:11:21 10:16:14", "2026:11:21 10:16:15"), [], 71),
+        (("2026:11:21 05:14:01", "2026:11:21 05:14:02"), [], -62),
+        (("2026:11:21 10:16:14", "2026:11:21 10:16:15"), ["--start", "2026-11-21T10:15:05Z"], 0),
+        (("2026:11:21 10:15:03", "2026:11:21 10:15:07"), [], 3),
+        (("2026:11:21 10:15:03", "2026:11:21 10:15:07"), ["--interval", "4"], 0),
+        (("2020:01:01 00:00:00", "2020:01:01 00:00:04"), ["--start", "2026-11-21T10:15:04Z"], 3),
+    ],
+)
+def test_pictures_that_say_another_time_than_where_they_are_placed_are_in_doubt(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], taken: tuple[str, str], words: list[str], off_s: int
+) -> None:
+    """The first was placed at the telemetry's first position, whatever it said itself."""
+    frames = photographed(tmp_path, *taken)
+    for log in written(tmp_path):
+        assert main(["replay", str(frames), "--telemetry", str(log), *words]) == bool(off_s)
+        said = capsys.readouterr().err
+        assert (f"by its EXIF, in any time zone, it was taken {off_s:+d} s from" in said) == bool(off_s)
 
 
 def test_a_shot_that_never_ends_is_given_up(tmp_path: Path) -> None:

@@ -220,6 +220,22 @@ def test_where_time_can_t_tell_the_report_names_both(
     assert (one.number, one.instead) == (removed, ())
 
 
+@pytest.mark.parametrize("fired_by", ["", "outside"])
+def test_requests_that_a_link_has_held_are_late_unless_the_autopilot_fires_the_camera(
+    fly: Callable[..., Path], bin_log: Path, fired_by: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """3 to 7 came together when the link delivered at 5.1 s: five photographs of one place, and the books balanced."""
+    add_triggers(bin_log, TIMES_S)
+    held = {number: 5.1 + number / 1e3 if 3 <= number <= 7 else t_s for number, t_s in TIMES_S.items()}
+    shots = requested(held, "CAMERA_FEEDBACK" if fired_by else "IMAGE_START_CAPTURE")
+    code, said = report(capsys, fly(shots, fired_by=fired_by), "--log", bin_log)
+    late = [line.split()[2] for line in said if line.startswith("late: trigger")]
+    assert (code, late) == ((0, []) if fired_by else (1, ["3", "4", "5", "6", "7"]))
+    if not fired_by:
+        assert any("its request came 3.1 s later" in line for line in said)
+        assert said[-1] == "THE THREE BOOKS DO NOT BALANCE: 5 late"
+
+
 def test_a_long_row_of_triggers_in_doubt_is_counted() -> None:
     one = three_books.Imbalance("lost", 12, (), None, None, "no request", (9, 10, 11, 13, 14))
     assert one.text() == "lost: trigger 12 or one of 5 others from 9 to 14: no request"
@@ -338,9 +354,33 @@ def test_a_file_that_is_no_sound_log_is_one_sentence(
         three_books.reconcile(fly(requested()), [tmp_path / name])
 
 
-def test_a_log_without_a_trigger_says_what_to_set(fly: Callable[..., Path], bin_log: Path) -> None:
-    with pytest.raises(AutopilotLogError, match=r"no trigger of CAM1 .*LOG_BITMASK"):
-        three_books.reconcile(fly(requested()), [bin_log])
+@pytest.mark.parametrize("form", ["bin", "ulg"])
+def test_a_log_without_a_trigger_is_in_doubt_and_says_what_to_set(
+    fly: Callable[..., Path], tmp_path: Path, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was an error instead of a report. A station's own shots need no trigger, but the log proves nothing."""
+    if form == "ulg":
+        pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+    log = written(tmp_path)[0] if form == "bin" else ulog_written(tmp_path)
+    code, said = report(capsys, fly(requested()), "--log", log)
+    assert code == 1
+    assert "not judged: 9 shots (shots 0 to 8) at times that the log does not hold" in said
+    assert said[-1] == "the three books can't be compared"
+    flight = fly([(t_s, STATION, "IMAGE_START_CAPTURE", 0) for t_s in TIMES_S.values()])
+    assert main(["flight", "report", str(flight), "--log", str(log)]) == 1
+    (doubt,) = capsys.readouterr().err.splitlines()
+    records = "CAM or TRIG of CAM1" if form == "bin" else "camera_trigger or camera_capture"
+    assert doubt.startswith(f"in doubt: log {log.name}: it holds no trigger ({records}): none was given, or they were")
+    assert "LOG_BITMASK" in doubt
+
+
+def test_beside_a_log_with_triggers_one_without_is_of_a_start_in_which_none_was_given(
+    fly: Callable[..., Path], bin_log: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "other").mkdir()
+    other, _ = written(tmp_path / "other")
+    add_triggers(bin_log, TIMES_S)
+    assert three_books.reconcile(fly(requested()), [other, bin_log]).balanced
 
 
 @pytest.mark.parametrize(  # both readers run in processes of their own, which take their time to begin
@@ -362,5 +402,6 @@ def test_a_damaged_log_is_read_or_refused(
             data[places.randrange(places.choice((1200, len(data))))] = places.randrange(256)
         log.write_bytes(data)
         with contextlib.suppress(AutopilotLogError):
-            assert (dataflash.triggers(log, 0) if kind == "bin" else ulog.triggers(log)).triggers
+            read = dataflash.triggers(log, 0) if kind == "bin" else ulog.triggers(log)
+            assert read.begins_us <= read.ends_us
     assert not capsys.readouterr().out

@@ -109,12 +109,13 @@ class ReportFlight(FlightArgument, Verb):
         values = {**codec.plain(found), "sources": sources, "balanced": found.balanced if known else None}
         agree = found.balanced and found.wishes > 0
         said = [*flight_lines.of_report(found, by_source)]
+        doubts = [*found.doubts, *filter(None, [found.cut_short])]
         if self.log:
             from dappled.cli.flight import books  # noqa: PLC0415  # the logs' readers take a second to load
 
             third = books.compared(flight, self.log)
             values["log"], said, agree = third.values, [*said, *third.lines], agree and third.balanced
-        doubts = [*found.doubts, *filter(None, [found.cut_short])]
+            doubts += third.findings
         return Report(values, said, findings=doubts, failed=not agree)
 
 

@@ -12,6 +12,7 @@ from dappled import codec
 from dappled.daemon.replay import three_books
 from dappled.daemon.replay.three_books import ThreeBooks
 from dappled.errors import counted
+from dappled.findings import Finding
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,6 +22,7 @@ class Compared:
     values: dict[str, Any]
     lines: tuple[str, ...]
     balanced: bool
+    findings: tuple[Finding, ...]
 
 
 def compared(flight: Path, logs: Sequence[Path]) -> Compared:
@@ -28,7 +30,7 @@ def compared(flight: Path, logs: Sequence[Path]) -> Compared:
     found = three_books.reconcile(flight, logs)
     values = {"files_read": [str(path) for path in logs], **codec.plain(found), "balanced": found.balanced}
     values["imbalances"] = [{**codec.plain(one), "text": one.text()} for one in found.imbalances]
-    return Compared(values, tuple(_lines(found, logs)), found.balanced)
+    return Compared(values, tuple(_lines(found, logs)), found.balanced, found.findings)
 
 
 def _lines(found: ThreeBooks, logs: Sequence[Path]) -> Iterator[str]:
@@ -45,6 +47,9 @@ def _lines(found: ThreeBooks, logs: Sequence[Path]) -> Iterator[str]:
         yield f"not judged: {counted(len(found.uncovered), 'shot')} ({names}) at times that the log does not hold"
     if found.balanced:
         yield "the three books balance: the autopilot's triggers, the requests and the files"
+        return
+    if found.findings and not found.imbalances:
+        yield "the three books can't be compared"
         return
     kinds = Counter(one.kind for one in found.imbalances)
     counts = [f"{count} {kind}" for kind, count in kinds.items()]

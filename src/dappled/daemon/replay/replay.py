@@ -42,6 +42,8 @@ from dappled.flight import (
 from dappled.flight.records import DOUBT
 
 _DATED = 8  # frames whose own time is asked
+_ZONES_S = 900  # time zones are whole quarters of an hour apart
+_AGREES_S = 2.5  # two times of a picture, of which EXIF's has whole seconds
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 
 
@@ -132,7 +134,8 @@ def of_folder(
     now_ns: int | None = None,
 ) -> RecordedFlight:
     """Frames in a folder, in the order of their EXIF's times or else of their names; the first at `start_utc_ns` (None:
-    the telemetry's first position, or 1970 without telemetry), the others at `interval_s` after each other. A single
+    the telemetry's first position, or 1970 without telemetry), the others at `interval_s` after each other; where EXIF
+    contradicts that, the telemetry's positions are in doubt. A single
     .tlog (or, without one, a single .bin of ArduPilot or .ulg of PX4) in the folder is the telemetry, where none is
     named. `vehicle`: the system id of the one whose telemetry counts (see `vehicle_of`). `now_ns`: no log is of a
     later time."""
@@ -140,12 +143,15 @@ def of_folder(
         raise DappledError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
     named = [path for path in folder.glob(match) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
-    ordered = picture_order.by_time(named, Path.as_posix, _taken_s)
+    taken_s = {path: _taken_s(path) for path in named}
+    ordered = picture_order.by_time(named, Path.as_posix, taken_s.get)
     paths = ordered.items
     if not paths:
         raise DappledError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     system, told = _vehicle(telemetry, vehicle)
-    bounds = _bounds(paths, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
+    times_s = [taken_s[path] for path in paths]
+    bounds = _bounds(times_s, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
+    given = start_utc_ns is not None
     if start_utc_ns is None:
         start_utc_ns = _first_position_utc_ns(telemetry, bounds, system) if telemetry else 0
         if telemetry and not own_log(telemetry) and bounds.judge(start_utc_ns) is not Date.TRUE:
@@ -166,6 +172,9 @@ def of_folder(
         shots.append(shot)
         files.append(RecordedShot(index, path, path.name, (utc_ns, utc_ns), utc_ns))
         expected.append(Expected(ShotRow(shot, "safe", None, utc_ns, utc_ns), frame))
+    if telemetry is not None and (away := _away_s(times_s, [shot.wished_utc_ns for shot in shots], given=given)):
+        place, off_s = away
+        told.append(finding(Code.PICTURE_TIME_DISAGREES, Subject("picture", paths[place].name), off_s=off_s))
     found = tuple(told)
     if ordered.against is not None:  # the better evidence decides
         before, name, earlier_s = ordered.against
@@ -185,9 +194,21 @@ def _vehicle(telemetry: Path | None, vehicle: int | None) -> tuple[int | None, l
     return None, []
 
 
-def _bounds(paths: Sequence[Path], start_utc_ns: int | None, now_ns: int) -> UtcBounds:
+def _away_s(taken_s: Sequence[float | None], placed_ns: Sequence[int], *, given: bool) -> tuple[int, float] | None:
+    """Which picture's own time contradicts most the time that it was placed at, and by how much: a camera's clock has
+    no zone, and may be wrong throughout where a person has `given` the first picture's time. None where all agree."""
+    away = [(place, own_s - placed_ns[place] / 1e9) for place, own_s in enumerate(taken_s) if own_s is not None]
+    if not away:
+        return None
+    first_s = away[0][1]
+    begins_s = 0.0 if given else math.remainder(first_s, _ZONES_S)
+    worst = max(((place, begins_s + off_s - first_s) for place, off_s in away), key=lambda one: abs(one[1]))
+    return worst if abs(worst[1]) > _AGREES_S else None
+
+
+def _bounds(taken_s: Sequence[float | None], start_utc_ns: int | None, now_ns: int) -> UtcBounds:
     """Which dates of a log beside these frames can be true: their own tell, and that of the first by the user."""
-    taken = [round(taken_s * 1e9) for path in paths[:_DATED] if (taken_s := _taken_s(path)) is not None]
+    taken = [round(own_s * 1e9) for own_s in taken_s[:_DATED] if own_s is not None]
     return UtcBounds.of_log(now_ns, [*taken, *([] if start_utc_ns is None else [start_utc_ns])])
 
 

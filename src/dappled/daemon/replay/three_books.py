@@ -29,12 +29,14 @@ from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.drivers.mavlink.log_packets import LoggedTrigger, TriggerLog
 from dappled.drivers.utc_choice import LOGS_FROM_NS, UtcBounds
 from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import LedgerReader, ShotRow, Stray, Tag, layout, log_reading
 from dappled.flight.logs import MAVLINK_2
 
 _NUMBERED_US = 6_000_000  # a trigger that is reported later than 5 s is no shot
 _LATE_US = 2_600_000  # over a second link
 _BROADCAST_US = 300_000
+_HELD_US = 1_000_000  # a request that comes so long after its trigger was held by its link
 _SAME_BOOT_US = 3_000_000
 _STEADY_US = 100_000  # a link that delays less places a log so well
 _WINDOW_US = 15_000_000  # of SYSTEM_TIME: the one that was delayed least counts
@@ -48,7 +50,7 @@ _READ = {
     mavlink.MAVLINK_MSG_ID_CAMERA_TRIGGER,
 }
 
-Kind = Literal["lost", "refused", "without a file", "doubled", "phantom"]
+Kind = Literal["lost", "refused", "without a file", "late", "doubled", "phantom"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,8 @@ class ThreeBooks:
     """The books side by side. `triggers` of the logs within the flight, `shots` made for them, `files` of these.
 
     `elsewhere` counts triggers before or after the flight was recorded; `uncovered` are shots of the autopilot at times
-    that no log holds, which can't be judged. `contacts`: what the feedback pin saw, None without one.
+    that no log holds, which can't be judged. `contacts`: what the feedback pin saw, None without one. `findings`: the
+    logs, where none of them holds a trigger: then nobody can say whether none was given, or none was logged.
     """
 
     by: str
@@ -92,11 +95,17 @@ class ThreeBooks:
     elsewhere: int
     uncovered: tuple[int, ...]
     imbalances: tuple[Imbalance, ...]
+    findings: tuple[Finding, ...] = ()
 
     @property
     def balanced(self) -> bool:
         """Whether every trigger is one shot with one file, and every shot of the autopilot's one trigger of its."""
-        return not self.imbalances and not self.uncovered and self.triggers == self.shots == self.files
+        return (
+            not self.findings
+            and not self.imbalances
+            and not self.uncovered
+            and self.triggers == self.shots == self.files
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,12 +190,14 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     known_ns = [utc_ns for index in found.rows if (utc_ns := found.utc_ns(found.at_us(index) * 1000)) is not None]
     bounds = UtcBounds.of_log(TimeOfDayClock().utc_ns(), known_ns[:1])
     read = [(path, _read(path, settings.mavlink.cam_idx, bounds)) for path in logs]
+    logged = any(log.triggers for _, log in read)
     triggers: list[_Trigger] = []
     spans, elsewhere, steady = [], 0, True
     for path, log in read:
         offsets, late_us = _placed(path, log, heard)
         steady = steady and late_us <= _STEADY_US
-        spans.append((_at_us(log.begins_us, offsets), _at_us(log.ends_us, offsets)))
+        if logged:
+            spans.append((_at_us(log.begins_us, offsets), _at_us(log.ends_us, offsets)))
         within = [one for one in _triggers(log, offsets) if (heard.first_us or 0) <= one.at_us <= heard.last_us]
         elsewhere += len(log.triggers) - len(within)
         triggers += within
@@ -208,7 +219,12 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
         files=len(found.files.intersection(made)),
         elsewhere=elsewhere,
         uncovered=uncovered,
-        imbalances=tuple(_Comparison(triggers, pairs, found, heard).imbalances(uncovered)),
+        imbalances=tuple(
+            _Comparison(triggers, pairs, found, heard, settings.camera.fired_outside).imbalances(uncovered)
+        ),
+        findings=()
+        if logged
+        else tuple(finding(Code.LOG_NO_TRIGGER, Subject("log", path.name), records=log.records) for path, log in read),
     )
 
 
@@ -359,12 +375,14 @@ def _number(flight: _Flight, index: int, kinds: frozenset[str]) -> int | None:
 
 @dataclass(frozen=True, slots=True)
 class _Comparison:
-    """Triggers and shots with what belongs together (see `_paired`)."""
+    """Triggers and shots with what belongs together (see `_paired`). `outside`: the autopilot fires the camera, and a
+    late message is about an exposure that was in time."""
 
     triggers: Sequence[_Trigger]
     pairs: _Pairs
     flight: _Flight
     heard: _Heard
+    outside: bool
 
     def imbalances(self, uncovered: Sequence[int]) -> Iterator[Imbalance]:
         """What does not balance, but for shots that no log covers."""
@@ -397,6 +415,12 @@ class _Comparison:
             row = self.flight.rows[self.pairs.shots[place]]
             reason = row.reason or f"the shot is {row.state}"
             yield Imbalance("without a file", number, (row.shot.index,), *at, reason, instead)
+        elif not self.outside:
+            index = self.pairs.shots[place]
+            late_us = self.flight.at_us(index) - one.at_us
+            if late_us > _HELD_US:
+                reason = f"its request came {late_us / 1e6:.1f} s later, and the photograph shows what was there then"
+                yield Imbalance("late", number, (index,), *at, reason, instead)
 
     def _reached(self, one: _Trigger) -> bool:
         """Whether a message with a trigger's number reached the camera."""

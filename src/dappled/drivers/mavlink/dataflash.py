@@ -81,13 +81,10 @@ def triggers(path: Path, cam_idx: int, bounds: UtcBounds | None = None) -> Trigg
             ),
             key=lambda one: one.boot_us,
         )
-        if not found:
-            raise DataFlashError(
-                f"{path} holds no trigger of CAM{cam_idx + 1} (messages CAM and TRIG): choose Camera in LOG_BITMASK"
-            )
         times_us = [int(row.TimeUS) for name in rows for row in rows[name]]
         contacts = len(mine["CAM"]) if mine["TRIG"] else None
-        return TriggerLog("ArduPilot", tuple(found), contacts, min(times_us), max(times_us), clock)
+        records = f"CAM or TRIG of CAM{cam_idx + 1}"
+        return TriggerLog("ArduPilot", tuple(found), contacts, min(times_us), max(times_us), clock, records)
 
 
 @contextlib.contextmanager

@@ -73,7 +73,7 @@ class TriggerLog:
     """The triggers of one camera in an autopilot's log, in the order of time.
 
     `contacts` counts what a feedback pin saw, None where none is set up. The log holds from `begins_us` to `ends_us`
-    since boot. `by`: "ArduPilot" or "PX4".
+    since boot. `by`: "ArduPilot" or "PX4". `records`: the messages that would hold a trigger.
     """
 
     by: str
@@ -82,6 +82,7 @@ class TriggerLog:
     begins_us: int
     ends_us: int
     clock: LogClock
+    records: str
 
 
 def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> LogClock:

@@ -75,25 +75,22 @@ def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
         clock, _, _ = _clock(path, log, bounds)
         topics = log.first
         given = topics.get(_TRIGGERS, topics.get(_CAPTURES))
-        if given is None or "seq" not in given:
-            raise AutopilotLogError(
-                f"{path} holds no trigger ({_TRIGGERS} or {_CAPTURES}): was TRIG_MODE set, and are they logged?"
-            )
-        at, numbers = log.times(given, "timestamp"), given["seq"].astype(np.int64)
-        told = log_evidence.in_time(at)
-        back = given["feedback"] != 0 if "feedback" in given else np.zeros(len(at), dtype=bool)
-        found = [
-            LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(log, int(at[n]))) for n in np.flatnonzero(told & ~back)
-        ]
-        if not found:
-            raise AutopilotLogError(
-                f"{path} holds no trigger ({_TRIGGERS}), only contacts of a feedback pin: nothing to compare"
-            )
-        all_us = np.concatenate([log.times(topic, "timestamp") for topic in topics.values()])
+        found, contacts = [], None
+        if given is not None and "seq" in given:
+            at, numbers = log.times(given, "timestamp"), given["seq"].astype(np.int64)
+            told = log_evidence.in_time(at)
+            back = given["feedback"] != 0 if "feedback" in given else np.zeros(len(at), dtype=bool)
+            contacts = int((told & back).sum()) if back.any() else None
+            found = [
+                LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(log, int(at[n])))
+                for n in np.flatnonzero(told & ~back)
+            ]
+        all_us = np.concatenate([clock.boots_us, *(log.times(topic, "timestamp") for topic in topics.values())])
         all_us = all_us[log_evidence.in_time(all_us)]
-        contacts = int((told & back).sum()) if back.any() else None
         ordered = tuple(sorted(found, key=lambda one: one.boot_us))
-        return TriggerLog("PX4", ordered, contacts, int(all_us.min()), int(all_us.max()), clock)
+        return TriggerLog(
+            "PX4", ordered, contacts, int(all_us.min()), int(all_us.max()), clock, f"{_TRIGGERS} or {_CAPTURES}"
+        )
 
 
 @contextlib.contextmanager
