@@ -90,6 +90,21 @@ def test_the_report_says_what_stood_and_when(flight: Recording, capsys: pytest.C
     assert json.loads(capsys.readouterr().out)["stood"][1]["finding"]["code"] == "disk.filling"
 
 
+@pytest.mark.parametrize("verdict", ["good", {"state": 7}, {"state": "good", "reasons": "none"}, None])
+def test_a_verdict_that_is_none_leaves_the_rest_of_the_flight_to_be_read(
+    flight: Recording, verdict: object, capsys: pytest.CaptureFixture[str]
+) -> None:
+    request(flight, 0)
+    deliver(flight, 0, bytes(1000))
+    details = {"verdict": verdict}
+    flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted", details=details))
+    flight.close()
+    assert main(["flight", "show", str(flight.folder.path)]) == 0
+    assert "12/13 carriers" in capsys.readouterr().out
+    assert main(["flight", "report", str(flight.folder.path)]) == 0
+    assert "judged" not in capsys.readouterr().out
+
+
 def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys: pytest.CaptureFixture[str]) -> None:
     states = ("good", "bad", "unknown")
     for index in range(len(states) + 1):
