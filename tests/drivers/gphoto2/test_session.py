@@ -5,14 +5,12 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from typing import Any
-from unittest.mock import MagicMock
 
 import gphoto2 as gp
 import pytest
 
-from dappled.drivers.gphoto2.protocol import CameraFile, HeldError, RefusedError, SettingTurned
-from dappled.drivers.gphoto2.session import GPhoto2Session, open_session
-from dappled.drivers.gphoto2.settings import GPhoto2Settings
+from dappled.drivers.gphoto2.protocol import CameraFile, RefusedError, SettingTurned
+from dappled.drivers.gphoto2.session import GPhoto2Session
 
 FOLDER = "/store/DCIM/100CANON"
 
@@ -135,28 +133,3 @@ def test_mirror_lock_up_is_one_of_canon_s_custom_functions(
 ) -> None:
     library.widgets = {"customfuncex": Widget(text, kind=gp.GP_WIDGET_TEXT)}
     assert [one.value for one in session.settings()] == ([] if value is None else [value])
-
-
-@pytest.mark.parametrize(
-    ("code", "cause", "other"),
-    [
-        (gp.GP_ERROR_IO_USB_CLAIM, "gvfs", "cable"),
-        (gp.GP_ERROR_IO_LOCK, "gvfs", "cable"),
-        (gp.GP_ERROR_TIMEOUT, "cable", "gvfs"),
-        (gp.GP_ERROR_CAMERA_BUSY, "cable", "gvfs"),
-        (gp.GP_ERROR, "cable", "gvfs"),
-    ],
-)
-def test_another_program_is_named_only_where_one_holds_the_camera(
-    monkeypatch: pytest.MonkeyPatch, code: int, cause: str, other: str
-) -> None:
-    camera = MagicMock()
-    camera.autodetect.return_value.count.return_value = 1
-    camera.autodetect.return_value.get_value.return_value = "usb:001,002"
-    camera.return_value.init.side_effect = gp.GPhoto2Error(code)
-    for name, fake in (("Camera", camera), ("PortInfoList", MagicMock()), ("CameraAbilitiesList", MagicMock())):
-        monkeypatch.setattr(gp, name, fake)
-    with pytest.raises(HeldError) as raised:
-        open_session(GPhoto2Settings())
-    assert cause in str(raised.value)
-    assert other not in str(raised.value)

@@ -46,8 +46,7 @@ _LOST = {gp.GP_ERROR_IO, gp.GP_ERROR_TIMEOUT, gp.GP_ERROR_IO_INIT, gp.GP_ERROR_I
     gp.GP_ERROR_LIBRARY,
 }
 """Errors after which the session is unusable."""
-_HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK}
-"""Errors of a camera that another program has open; a slow one, or a bad cable, makes others."""
+_HELD = {gp.GP_ERROR_IO_USB_CLAIM, gp.GP_ERROR_IO_LOCK, gp.GP_ERROR_CAMERA_BUSY, gp.GP_ERROR}
 _GONE = {gp.GP_ERROR_IO, gp.GP_ERROR_IO_USB_FIND, gp.GP_ERROR_MODEL_NOT_FOUND, gp.GP_ERROR_UNKNOWN_PORT}
 _WIDGETS: dict[SettingName, tuple[str, ...]] = {
     "focal_length": ("focallength",),
@@ -159,9 +158,7 @@ def _opened(model: str, port: str) -> Any:
             ) from error
         if error.code in _GONE:
             raise AbsentError(f"no camera answers at {port} ({error.string}): connect it and switch it on") from error
-        raise HeldError(
-            f"the camera at {port} can't be opened ({error.string}): look at its cable, and switch it off and on"
-        ) from error
+        raise HeldError(f"the camera at {port} can't be opened: {error.string}; switch it off and on") from error
     return camera
 
 
