@@ -6,6 +6,7 @@ What `each` and `share` compute is the same for any number of threads.
 from __future__ import annotations
 
 import logging
+import os
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable
@@ -183,6 +184,12 @@ class Worker(Loop, Generic[Item]):
                 receiver(*facts)
         except Exception as error:  # noqa: BLE001  # nor must a receiver
             report(log, f"{self.name}: reporting an item", error)
+
+
+def renice(by: int) -> None:
+    """Change the calling thread's own niceness by so much; others run before it where it grows. Raises OSError."""
+    me = threading.get_native_id()
+    os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + by)
 
 
 Part = TypeVar("Part")

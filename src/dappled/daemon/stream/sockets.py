@@ -8,7 +8,6 @@ import logging
 import os
 import socket
 import stat
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from dappled.daemon.stream.relay import TcpRelay, tcp_address
 from dappled.daemon.stream.wire import WireError
 from dappled.findings import Code, Subject, finding
 from dappled.refusals import RefusalLog
-from dappled.workers import Loop
+from dappled.workers import Loop, renice
 
 log = logging.getLogger(__name__)
 NICENESS = 12  # below the decoder's 10
@@ -199,8 +198,7 @@ def niced_context() -> zmq.Context[Any]:
     made: zmq.Context[Any] = zmq.Context()
 
     def begin() -> None:
-        me = threading.get_native_id()
-        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + NICENESS)
+        renice(NICENESS)
         made.socket(zmq.PAIR).close()
 
     starter = Loop("publisher context", begin)

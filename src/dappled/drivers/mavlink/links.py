@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -17,7 +16,7 @@ from dappled.drivers.mavlink.framing import Framed, Framer, MavlinkMessage, Pack
 from dappled.drivers.mavlink.log_budget import LogBudget
 from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningStatistics
 from dappled.findings import Finding
-from dappled.workers import Loop
+from dappled.workers import Loop, renice
 
 __all__ = [
     "Framed",
@@ -41,7 +40,7 @@ _FRAMERS = 8  # clients of a TCP server that are read in turn, and some that hav
 _STAMP_BYTES = 8  # before each packet in the telemetry log
 _POLL_S = 0.2
 _RETURNS_NS = 30 * 10**9  # a radio may hold packets for seconds
-_NICER = 5  # below the process' own niceness: it acknowledges, and the unit allows it (LimitNICE)
+_NICENESS = -5  # of who receives, to the process' own: it acknowledges, and the unit allows it (LimitNICE)
 
 
 # --- one packet
@@ -382,7 +381,8 @@ class MavlinkLinks:
     # --- the receiving threads
 
     def _receive(self, link: Link, receiver: PacketReceiver | None) -> None:
-        _go_first()
+        with contextlib.suppress(OSError):  # as far as this user may
+            renice(_NICENESS)
         framers = dict[int, Framer]()  # by origin
         while not self._stop.is_set():
             channel = link.channel
@@ -481,10 +481,3 @@ class MavlinkLinks:
     def _close_channels(self) -> None:
         for link in self._links:
             link.close()
-
-
-def _go_first() -> None:
-    """Let the kernel run this thread before the others, as far as this user may."""
-    me = threading.get_native_id()
-    with contextlib.suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) - _NICER)
