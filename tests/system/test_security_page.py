@@ -3,23 +3,13 @@
 from __future__ import annotations
 
 import ast
-import subprocess
-import sys
 import tomllib
-from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
+from tests.made_pages import ROOT, assert_made
 
 
 def test_the_page_is_made_from_the_promises() -> None:
-    made = subprocess.run(
-        [sys.executable, "-c", "import promises_page; print(promises_page.page(), end='')"],
-        cwd=ROOT / "tools",
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert (ROOT / "docs" / "security.md").read_text("utf-8") == made.stdout, "run tools/promises_page.py"
+    assert_made("security.md", "promises_page")
 
 
 def test_each_promise_names_a_test_that_is_there() -> None:

@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-from pathlib import Path
-
 from dappled.findings import WORDS
-
-ROOT = Path(__file__).parents[2]
+from tests.made_pages import ROOT, assert_made
 
 
 def test_the_page_of_all_findings_is_that_of_the_table() -> None:
-    made = subprocess.run(
-        [sys.executable, "-c", "import findings_page; print(findings_page.page(), end='')"],
-        cwd=ROOT / "tools",
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert (ROOT / "docs" / "findings.md").read_text("utf-8") == made.stdout, "run tools/findings_page.py"
+    assert_made("findings.md", "findings_page")
 
 
 def test_each_finding_leads_to_a_page_that_is_there() -> None:
