@@ -24,8 +24,8 @@ from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
 from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.simulation import free_port
-from tests.daemon.fakes import eventually
 from tests.system.conftest import dappled
+from tests.waiting import eventually
 
 HELD_UP = 0.2  # of the objects of the process may be looked at while it flies
 LONG_S = "120"  # a bound, never waited for

@@ -275,13 +275,6 @@ class NoPoses:
         return None
 
 
-def eventually(condition: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < until, f"never: {what}"
-        threading.Event().wait(0.002)
-
-
 @contextmanager
 def rig(
     flights: Path,

@@ -24,7 +24,8 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.mocks.simulation import Simulation, World
 from dappled.workers import Loop
-from tests.daemon.fakes import CallingObserver, eventually
+from tests.daemon.fakes import CallingObserver
+from tests.waiting import eventually
 
 _PARTS = {
     "Service", "MavlinkLinks", "PacketSender", "Component", "OwnAutopilot", "Parameters", "FlightControl", "Shutter",

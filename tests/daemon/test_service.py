@@ -36,9 +36,10 @@ from dappled.findings import told as findings_told
 from dappled.flight import FlightError, LedgerReader, Recording, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.camera_protocol.rig import Peer
-from tests.daemon.fakes import CallingObserver, FakeCamera, eventually, good
+from tests.daemon.fakes import CallingObserver, FakeCamera, good
 from tests.daemon.test_settings_check import MASK, calibration
 from tests.standing import codes, problems
+from tests.waiting import eventually
 
 S = 10**9
 

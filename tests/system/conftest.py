@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from tests import shared
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 FRAMES = 3
 

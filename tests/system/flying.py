@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -19,16 +18,9 @@ from dappled.flight import LedgerReader, flight_report
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import CallingObserver
 from tests.standing import problems
+from tests.waiting import eventually
 
 DEADLINE_S = 60.0
-
-
-def eventually(condition: Callable[[], object], what: str, deadline_s: float = DEADLINE_S) -> None:
-    """Wait until the condition holds; fails after the deadline."""
-    until = time.monotonic() + deadline_s
-    while not condition():
-        assert time.monotonic() < until, f"not within {deadline_s} s: {what}"
-        threading.Event().wait(0.005)
 
 
 def settings_of(folder: Path, **tables: Mapping[str, Any]) -> Settings:

@@ -27,7 +27,8 @@ from dappled.flight import FlightsLock, LedgerReader, flight_report
 from dappled.flight.checks import flight_check
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.scene.masked_camera import reference_camera
-from tests.system.flying import Flying, assert_whole, eventually, flying, settings_of, told
+from tests.system.flying import Flying, assert_whole, flying, settings_of, told
+from tests.waiting import eventually
 
 FOCAL_LENGTH = b"\x0a\x92\x05\x00"  # EXIF tag 37386, a rational: as it stands in a little-endian folder
 MASKED = {"camera": {"profile": "reference-36mm"}, "mask": {"profile": "reference-5x5"}}

@@ -9,7 +9,8 @@ import pytest
 from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.flight import Frame, LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
-from tests.system.flying import eventually, flying, settings_of
+from tests.system.flying import flying, settings_of
+from tests.waiting import eventually
 
 SIZE, SHOTS = 1_000_001, 5
 

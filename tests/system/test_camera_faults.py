@@ -25,7 +25,8 @@ from dappled.flight import LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
 from tests.standing import codes
-from tests.system.flying import Flying, eventually, flying, settings_of, told
+from tests.system.flying import Flying, flying, settings_of, told
+from tests.waiting import eventually
 
 SIZE = 2_000_001
 STALL_S = 2.4

@@ -8,7 +8,8 @@ import pytest
 
 from dappled.cli import main
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
-from tests.system.flying import eventually, flying, settings_of
+from tests.system.flying import flying, settings_of
+from tests.waiting import eventually
 
 
 def test_settings_without_a_series_refuse_to_begin_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,8 @@ from dappled.mocks.simulation import free_port
 from dappled.testing import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix
 from tests.standing import problems
-from tests.system.flying import Flying, eventually, flying, settings_of
+from tests.system.flying import Flying, flying, settings_of
+from tests.waiting import eventually
 
 Wrong = tuple[list[str], str]
 

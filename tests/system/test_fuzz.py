@@ -14,7 +14,8 @@ import pytest
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.body.ptp import init_command_ack
 from dappled.mocks.scene.masked_camera import reference_camera
-from tests.system.flying import eventually, flying, settings_of
+from tests.system.flying import flying, settings_of
+from tests.waiting import eventually
 
 
 @contextmanager

@@ -21,7 +21,8 @@ from tests.drivers.gnss.test_ubx import NEW_FALLING, UTC_BASE, VALID, mark, mess
 from tests.needs import without
 from tests.standing import codes
 from tests.system.conftest import dappled
-from tests.system.flying import eventually, flying, settings_of
+from tests.system.flying import flying, settings_of
+from tests.waiting import eventually
 
 FRAMES = 3
 GPS_EPOCH_S, WEEK_S = 315_964_800, 604_800

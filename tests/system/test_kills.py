@@ -20,7 +20,7 @@ from dappled.flight import layout, log_reading
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 from dappled.workers import Loop
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 START_S = 60.0
 

@@ -25,7 +25,8 @@ from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import Simulation, World, free_port
 from tests.daemon.camera_protocol.rig import Peer
 from tests.system.conftest import dappled
-from tests.system.flying import Flying, eventually, flying, settings_of, told
+from tests.system.flying import Flying, flying, settings_of, told
+from tests.waiting import eventually
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 URL = "udpin:127.0.0.1:0"

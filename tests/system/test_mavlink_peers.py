@@ -16,8 +16,9 @@ from dappled.flight import flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
-from tests.system.flying import Flying, eventually, flying, settings_of
+from tests.system.flying import Flying, flying, settings_of
 from tests.system.peers.mavproxy import PYTHON, MavProxy
+from tests.waiting import eventually
 
 pytestmark = [
     pytest.mark.peers,

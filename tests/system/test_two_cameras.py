@@ -22,7 +22,7 @@ from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 from tests.daemon.camera_protocol.rig import Peer
 from tests.standing import codes
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 BYTES = {"left": 50_000, "right": 60_000}  # so that a frame shows which body it is of
 

@@ -17,7 +17,7 @@ from dappled.cli import main
 from dappled.daemon.stream.subscriber import Subscriber
 from dappled.mocks.simulation import free_port
 from tests.schemas import schema
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 
 def watch(folder: Path, *arguments: str) -> subprocess.Popen[str]:

@@ -23,7 +23,8 @@ from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Signin
 from dappled.findings import Finding
 from dappled.flight import Cause, Shot
 from dappled.flight.layout import DiskSpace
-from tests.daemon.fakes import Nowhere, eventually
+from tests.daemon.fakes import Nowhere
+from tests.waiting import eventually
 
 
 class NothingEarlier:

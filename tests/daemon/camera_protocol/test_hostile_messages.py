@@ -26,7 +26,7 @@ from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.links import Framer, Packet, mavlink
 from tests.daemon.camera_protocol.rig import Camera, Peer
 from tests.daemon.camera_protocol.test_component import Rig
-from tests.daemon.fakes import eventually
+from tests.waiting import eventually
 
 ACCEPTED = mavlink.MAV_RESULT_ACCEPTED
 FLOOD = Path(__file__).parent / "flood.py"

@@ -14,7 +14,7 @@ import pytest
 from dappled.clock import RecordedClock
 from dappled.drivers.mavlink import mavlink
 from tests.daemon.camera_protocol.rig import Camera, Peer
-from tests.daemon.fakes import eventually
+from tests.waiting import eventually
 
 SCRIPTS = Path(__file__).parent / "scripts"
 NOW_NS = 1_800_000_000 * 10**9

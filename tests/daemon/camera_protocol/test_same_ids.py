@@ -10,7 +10,7 @@ from dappled.clock import RecordedClock
 from dappled.drivers.mavlink import mavlink
 from dappled.findings import Code, told
 from tests.daemon.camera_protocol.rig import Camera, Peer
-from tests.daemon.fakes import eventually
+from tests.waiting import eventually
 
 OURS = (1, 100)
 NOW_NS = 1_800_000_000 * 10**9

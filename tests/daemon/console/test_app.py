@@ -8,8 +8,7 @@ import logging
 import re
 import socket
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from dappled.decode.geometry.area import PlannedArea
 from dappled.drivers.child_process import ChannelError, ProcessChannel
 from dappled.findings import FRAME, Code, Subject, finding
 from tests import globe
+from tests.waiting import eventually
 
 STACK = (np.random.default_rng(1).random((2, 30, 40)) + 0.1).astype(np.complex64)
 POSE = {
@@ -87,13 +87,6 @@ class Rig:
         given = {"origin": self.url, **headers}
         with self.client(**given) as client:
             return client.post(path, json=body)
-
-
-def eventually(condition: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < until, f"never: {what}"
-        threading.Event().wait(0.01)
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from dappled.daemon.console import connection
 from dappled.daemon.console.__main__ import configuration
 from dappled.daemon.console.connection import Connection
 from dappled.refusals import RefusalLog
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 WHOLE = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n"
 ENDLESS = b"GET /endless HTTP/1.1\r\nHost: x\r\n\r\n"

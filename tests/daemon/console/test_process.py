@@ -24,7 +24,7 @@ from dappled.daemon.console import process
 from dappled.daemon.console.process import Console
 from dappled.drivers.child_process import RestartBudget
 from dappled.errors import DappledError
-from tests.daemon.fakes import eventually
+from tests.waiting import eventually
 
 TOKEN = "a-token-of-many-letters"  # noqa: S105  # it opens nothing
 

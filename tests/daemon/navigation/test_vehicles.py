@@ -29,7 +29,8 @@ from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.errors import DappledError
 from dappled.flight import digest, recording
 from tests.daemon.camera_protocol.rig import Peer
-from tests.daemon.fakes import CallingObserver, FakeCamera, eventually
+from tests.daemon.fakes import CallingObserver, FakeCamera
+from tests.waiting import eventually
 
 OURS, THEIRS = 1, 2
 PLACES_DEG = {OURS: 47, THEIRS: 10}

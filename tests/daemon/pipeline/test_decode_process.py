@@ -19,7 +19,7 @@ from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.workers import Loop
-from tests.daemon.fakes import eventually
+from tests.waiting import eventually
 
 RECIPE = Recipe("reference-36mm", "reference-5x5")
 

@@ -23,8 +23,9 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
 from dappled.findings import FRAME, Code, finding
 from dappled.flight import Cause, Frame, Shot, TimeSource
-from tests.daemon.fakes import FakeCamera, eventually, no_pose
+from tests.daemon.fakes import FakeCamera, no_pose
 from tests.schemas import schema
+from tests.waiting import eventually
 
 DOUBT = finding(Code.FRAME_CLIPPED, FRAME, share=0.03)
 

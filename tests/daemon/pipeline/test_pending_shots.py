@@ -12,7 +12,8 @@ from dappled.daemon.pipeline import capture as module
 from dappled.daemon.pipeline.capture import GIVEN_UP, Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.flight import Cause, FlightError, Frame, Shot, Tag
-from tests.daemon.fakes import CallingObserver, FakeCamera, arrival, eventually, fired, rig
+from tests.daemon.fakes import CallingObserver, FakeCamera, arrival, fired, rig
+from tests.waiting import eventually
 
 
 class Events:

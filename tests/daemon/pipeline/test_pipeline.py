@@ -32,7 +32,8 @@ from dappled.drivers.raw.recipe import LawDecision, of_flight
 from dappled.findings import FRAME, Code, Finding, Subject, finding, text, told
 from dappled.flight import FlightError, Recording, ShotState, TimeSource, flight_report, layout
 from dappled.flight.checks import flight_check
-from tests.daemon.fakes import FakeCamera, Rig, arrival, eventually, failed, fired, good, rig
+from tests.daemon.fakes import FakeCamera, Rig, arrival, failed, fired, good, rig
+from tests.waiting import eventually
 
 
 def states(flight: Path) -> dict[int, ShotState]:

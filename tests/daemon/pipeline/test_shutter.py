@@ -17,7 +17,8 @@ from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutte
 from dappled.findings import Code, Subject, finding
 from dappled.flight import Shot
 from dappled.refusals import PEERS
-from tests.daemon.fakes import NO_CAMERA, FakeSink, eventually
+from tests.daemon.fakes import NO_CAMERA, FakeSink
+from tests.waiting import eventually
 
 PILOT = "mavlink:255/190"
 VEHICLE = "mavlink:1/1"

@@ -24,7 +24,8 @@ from dappled.drivers.mavlink import mavlink
 from dappled.flight import FlightsLock, LedgerReader, TimeSource, layout, recovery
 from dappled.flight.checks import flight_check
 from tests.daemon.camera_protocol.rig import Peer
-from tests.daemon.fakes import CallingObserver, FakeCamera, eventually
+from tests.daemon.fakes import CallingObserver, FakeCamera
+from tests.waiting import eventually
 
 
 @pytest.fixture

@@ -23,10 +23,11 @@ from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
 from dappled.findings import Code, Subject, finding, told
 from dappled.flight import Cause, FlightError, Shot, TimeSource
-from tests.daemon.fakes import FakeCamera, FakeDecoder, eventually, failed, fired, good, rig
+from tests.daemon.fakes import FakeCamera, FakeDecoder, failed, fired, good, rig
 from tests.drivers.mavlink import logs_here
 from tests.drivers.mavlink.true_logs import written
 from tests.simulated.finepix import picture
+from tests.waiting import eventually
 
 
 def record(flights: Path) -> Path:

@@ -14,8 +14,9 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.stream import answers
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.wire import Message, WireError
-from tests.daemon.fakes import FakeDecoder, Rig, eventually, rig
+from tests.daemon.fakes import FakeDecoder, Rig, rig
 from tests.schemas import schema
+from tests.waiting import eventually
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import stat
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from dappled.daemon.stream.subscriber import AsyncSubscriber, Subscriber, subscr
 from dappled.daemon.stream.wire import Message, WireError
 from dappled.errors import DappledError
 from tests.schemas import schema
+from tests.waiting import eventually
 
 STACK = np.arange(24, dtype=np.complex64).reshape(2, 3, 4)
 
@@ -391,13 +392,6 @@ def test_an_answer_that_cannot_be_sent_is_no_loss_of_the_stream(endpoint: str) -
     assert not any(one.statistics().dropped.values())
     assert one.statistics().refused == 1
     one.stop(0.0)
-
-
-def eventually(condition: Callable[[], object], what: str) -> None:
-    until = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < until, f"never: {what}"
-        threading.Event().wait(0.01)
 
 
 def test_asyncio_recovers_what_was_lost(endpoint: str) -> None:

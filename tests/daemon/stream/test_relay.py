@@ -17,7 +17,7 @@ from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import Message, WireError
 from dappled.mocks.simulation import free_port
 from dappled.refusals import RefusalLog
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 
 def test_a_killed_relay_costs_viewers_a_moment_and_the_publisher_nothing() -> None:

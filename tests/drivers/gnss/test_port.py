@@ -21,7 +21,7 @@ from dappled.errors import DappledError
 from dappled.findings import text, told
 from tests.drivers.gnss.test_ubx import GPS_MS, NEW_FALLING, SATURDAY_S, VALID, WEEK, mark, message
 from tests.needs import without
-from tests.system.flying import eventually
+from tests.waiting import eventually
 
 MARK = message((0x0D, 0x03), mark(NEW_FALLING | VALID | 0x08, rising=(0, 0, 0), falling=(WEEK, GPS_MS, 500_000)))
 RAW = message((0x02, 0x15), bytes(range(256)) * 4)

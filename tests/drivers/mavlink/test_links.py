@@ -21,6 +21,7 @@ from dappled.drivers.mavlink import channels
 from dappled.drivers.mavlink.channels import Address, ByteStream
 from dappled.drivers.mavlink.links import Framer, LinkError, MavlinkLinks, Packet, PacketParser, mavlink, pack
 from tests.needs import without
+from tests.waiting import eventually
 
 
 class Side:
@@ -144,10 +145,7 @@ def test_a_receiving_thread_that_ended_is_named() -> None:
         open_one = side.links._links[0].channel
         assert open_one is not None
         side.links._links[0].channel = Broken()  # type: ignore[assignment]  # all that the thread asks
-        deadline = time.monotonic() + 60
-        while side.links.dead_threads() != ["mavlink 0"]:
-            assert time.monotonic() < deadline
-            time.sleep(0.01)
+        eventually(lambda: side.links.dead_threads() == ["mavlink 0"], "the dead thread is told")
         open_one.close()
     assert side.links.dead_threads() == []  # it was asked to end
 
@@ -258,10 +256,7 @@ def test_a_serial_device_that_comes_late_is_opened(tmp_path: Path) -> None:
         with Side(f"{device},57600") as side:
             assert side.links.statistics()[0].error is not None
             device.symlink_to(os.ttyname(near))
-            until = time.monotonic() + 60
-            while side.links.statistics()[0].error is not None:
-                assert time.monotonic() < until
-                time.sleep(0.02)
+            eventually(lambda: side.links.statistics()[0].error is None, "the link is open")
     finally:
         os.close(near)
         os.close(far)
@@ -287,10 +282,7 @@ def test_a_serial_device_that_may_not_be_opened_yet_is_waited_for(
         with Side(device) as side:
             assert words in (side.links.statistics()[0].error or "")
             shut.clear()
-            until = time.monotonic() + 60
-            while side.links.statistics()[0].error is not None:
-                assert time.monotonic() < until
-                time.sleep(0.02)
+            eventually(lambda: side.links.statistics()[0].error is None, "the link is open")
     finally:
         os.close(near)
         os.close(far)

@@ -8,8 +8,8 @@ import pytest
 
 from dappled.mocks.autopilot.ground_station import GroundStation
 from tests.daemon.camera_protocol.rig import Camera
-from tests.daemon.fakes import eventually
 from tests.simulated.bad_link import BadLink, LinkFaults
+from tests.waiting import eventually
 
 
 @pytest.mark.parametrize(
