@@ -21,7 +21,7 @@ from dappled.flight.checks import chain_check
 from dappled.flight.errors import FlightError
 from dappled.flight.stored_rows import StoredRows
 from dappled.flight.trees import Tree
-from dappled.flight.verified_copy import Proved, prove
+from dappled.flight.verified_copy import Proved, different, prove
 
 
 def is_part(name: str) -> bool:
@@ -146,5 +146,4 @@ def _content(tree: Tree, name: str) -> bytes:
 
 
 def _proved(source: Tree, there: Tree, name: str, image: bytes) -> Proved:
-    wrong = f"{there.path / name} reads back different from {source.path / name}: check that disk; nothing was removed"
-    return prove(there, name, hashlib.sha256(image).hexdigest(), wrong)
+    return prove(there, name, hashlib.sha256(image).hexdigest(), different(source, there, name))

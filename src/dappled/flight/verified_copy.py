@@ -37,8 +37,12 @@ def copy_verified(origin: Tree, goal: Tree, name: str, before: FileIdentity | No
         _refuse_changed(origin, name, before or found, found)
         goal.write(name, _hashed(durable.pieces(fd, found.size), sha256.update))
         _refuse_changed(origin, name, found, FileIdentity.of_fd(fd))
-    wrong = f"{goal.path / name} reads back different from {origin.path / name}: check that disk; nothing was removed"
-    return prove(goal, name, sha256.hexdigest(), wrong, found)
+    return prove(goal, name, sha256.hexdigest(), different(origin, goal, name), found)
+
+
+def different(origin: Tree, goal: Tree, name: str) -> str:
+    """The sentence on a file that was written, and reads back with other bytes."""
+    return f"{goal.path / name} reads back different from {origin.path / name}: check that disk; nothing was removed"
 
 
 def hashed(tree: Tree, name: str) -> tuple[FileIdentity, str]:
