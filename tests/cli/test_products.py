@@ -148,6 +148,15 @@ def test_stack_eyes_and_all_in_focus(field: str, tmp_path: Path, capsys: pytest.
     assert "have a sharpest picture" in capsys.readouterr().out
 
 
+def test_all_in_focus_alone_takes_planes_through_the_scene(
+    field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["refocus", field, "--all-in-focus", "-o", str(tmp_path / "f.npy"), "--json"]) == 0
+    assert np.load(tmp_path / "f.npy").shape == (60, 80)
+    (note,) = json.loads(capsys.readouterr().out)["notes"]
+    assert note["from_px"] < DISPARITY < note["to_px"]
+
+
 def test_depth_in_pixels_and_in_metres(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["depth", field, "-o", str(tmp_path / "d.png"), str(tmp_path / "d.pfm")]) == 0
     assert "relative depth only" in capsys.readouterr().out
@@ -304,7 +313,7 @@ def test_wrong_calls_are_one_sentence(
         ),
         (["refocus", "{}", "--eyes", "anaglyph", "--tilt", "1", "0", "-o", "{out}.png"], "doesn't go with --tilt"),
         (["refocus", "{}", "--alpha", "1", "--fourier", "--magnify", "-o", "{out}.png"], "doesn't go with --magnify"),
-        (["refocus", "{}", "--all-in-focus", "-o", "{out}.png"], "needs --stack"),
+        (["refocus", "{}", "--all-in-focus", "--alpha", "1", "-o", "{out}.png"], "or those of --stack"),
         (["refocus", "{}", "--stack", "0", "1", "0.5", "-o", "{out}.png"], "not a number of pictures"),
         (["refocus", "{}", "--stack", "0", "1", "501", "-o", "{out}.png"], "at most 500"),
         (["depth", "{}", "--focus", "inf", "--flight", "{}", "-o", "{out}.ply"], "--frame N"),

@@ -116,6 +116,8 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
         elif "mcap" in self.kinds:  # its altitudes are above the ellipsoid, or unknown
             geoid = geoid_or_none(self.geoid, output)
         placed, _ = geotags.read(folder.path, options.mounting, geoid, marked)
+        if "photos" in self.kinds:
+            output.remark(f"{folder.name}: {photo_files.ground_words(placed)}")
         by_index = {one.frame.index: one for one in placed}
         return batch.plan(folder.path, recipe, options, self.kinds, self.output, placed=by_index), placed, doubts
 

@@ -110,7 +110,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
                 depths = FrameDepths(scratch, lambda found: found.depth(), self.focus)
             made = self.survey(flight, output, stack, missing, watch=depths)
-            files = self._draw(made, folder)
+            files = self._draw(made, folder, output)
             if made.lens is not None and self.solve_lens is not None:
                 lens.write(self.camera or _camera_of(flight), made.lens.lens, self.solve_lens)
                 files.append(self.solve_lens)
@@ -151,14 +151,19 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         low, high = self.between or (None, None)
         return terrain.of(made, output.show, lowest_m=low, highest_m=high)
 
-    def _draw(self, made: Survey, folder: Path) -> list[Path]:
+    def _draw(self, made: Survey, folder: Path, output: Output) -> list[Path]:
         files: list[Path] = []
+        maps = [kind for kind in _EACH if kind in self.kinds]
+        steps = len(maps) * (1 + len(made.photographs) * self.each)
+        if maps:
+            output.show("draw maps", 0, steps)
         gain = map_files.gain_of(made)
         if "kmz" in self.kinds:
             files.append(map_files.mosaic_kmz(made, folder / "mosaic.kmz", gain))
         if "cog" in self.kinds:
             files.append(map_files.mosaic_cog(made, folder / "mosaic.tif", gain))
-        for one in made.photographs if self.each else ():
+        for number, one in enumerate(made.photographs if self.each else ()):
+            output.show("draw maps", len(maps) * (1 + number), steps)
             beside = folder / "frames" / one.name
             if "kmz" in self.kinds:
                 files.append(map_files.frame_kmz(made, one, beside.with_suffix(".kmz"), gain, quad=self.quad))

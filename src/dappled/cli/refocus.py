@@ -17,6 +17,7 @@ from dappled import codec, durable
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
+from dappled.decode.depth.estimate import disparity_range
 from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
 from dappled.decode.lightfield.refocus import StereoPair, all_in_focus, anaglyph, focal_stack, magnified, side_by_side
 from dappled.products.exports import prints
@@ -26,6 +27,7 @@ from dappled.products.survey import stereo_pair, synthetic_aperture
 from dappled.products.survey.synthetic_aperture import WAYS
 
 _MOST_PICTURES = 500  # of a stack, all held in memory at once
+_STEP_PX = 0.25  # from plane to plane, of the outermost views
 Picture = NDArray[np.float32]
 
 
@@ -73,7 +75,9 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         "--tilt", "tilted plane: change of disparity over the picture's height and width", (0.0, 0.0),
         metavar=("H", "W"),
     )  # fmt: skip
-    all_in_focus: bool = flag("--all-in-focus", "with --stack: take each pixel from the picture where it is sharpest")
+    all_in_focus: bool = flag(
+        "--all-in-focus", "take each pixel from where it is sharpest: of --stack, else of planes through the scene"
+    )
     index: Path | None = option("--index", "with --all-in-focus: draw which plane each pixel came from", None)
     eyes: str | None = option("--eyes", "make a stereo pair", None, choices=("anaglyph", "side-by-side", "crossed"))
     fourier: bool = flag("--fourier", "refocus by a slice of the 4D spectrum (Ng), and compare with shift and add")
@@ -100,8 +104,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         self.check_source("flight", "height", "combine")
         if self.field is None:
             self._check_flight()
-        elif self._sharpest and not self.stack:
-            raise CallError("--all-in-focus needs --stack FROM TO N: the planes to choose from")
+        elif self._sharpest and (self.alpha or self.disparity or self.distance):
+            raise CallError("--all-in-focus chooses from planes through the scene, or those of --stack FROM TO N")
         if self.stack:
             count = self.stack[2]
             if not count >= 1 or count % 1:
@@ -219,6 +223,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
             return [(f"{d:.3g} px/view", float(d)) for d in np.linspace(low, high, round(count))]
         if self.disparity:
             return [(f"{d:g} px/view", d) for d in self.disparity]
+        if self._sharpest:
+            return [(f"{d:.3g} px/view", float(d)) for d in _through_scene(found)]
         return [("as taken", 0.0)]
 
     def _sharp(self, found: OpenedLightField, planes: NDArray[np.float64]) -> tuple[Picture, Note]:
@@ -228,10 +234,19 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         if self.index:
             disparity = np.where(known, planes[made.index], np.nan)
             prints.save(self.index, prints.with_scale(disparity, float(planes[0]), float(planes[-1]), "px/view"))
-        return made.picture, Note(f"{share:.0%} of the pixels have a sharpest picture", {"sharpest_share": share})
+        planes_said = f"of {len(planes)} from {planes[0]:.3g} to {planes[-1]:.3g} px/view"
+        facts = {"sharpest_share": share, "from_px": float(planes[0]), "to_px": float(planes[-1])}
+        return made.picture, Note(f"{share:.0%} of the pixels have a sharpest picture {planes_said}", facts)
 
 
 CLASSES = {"refocus": RefocusLightField}
+
+
+def _through_scene(found: OpenedLightField) -> NDArray[np.float64]:
+    """Disparities of planes through the scene, so close that the outermost views move by a quarter of a pixel."""
+    low, high = disparity_range(replace(found.evidence, filled=None), workers=found.workers)
+    count = math.ceil((high - low) * found.stack.reach / _STEP_PX) + 1
+    return np.linspace(low, high, min(max(count, 2), _MOST_PICTURES))
 
 
 def _seen(pair: StereoPair, form: str) -> Picture:

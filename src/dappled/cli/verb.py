@@ -106,7 +106,7 @@ class Output(Protocol):
         """A bar of so many units; the function adds to it."""
 
     def show(self, what: str, done: int, total: int) -> None:
-        """So many frames of a stretch of work are done."""
+        """So many steps of a stretch of work are done."""
 
 
 @dataclass(frozen=True, slots=True)

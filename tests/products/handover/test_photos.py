@@ -135,6 +135,14 @@ def test_exiv2_reads_exif_and_xmp(photos: Path) -> None:
         assert words["Xmp.exif.GPSMapDatum"].strip() == "WGS-84"
 
 
+def test_what_a_pixel_covers_is_told_where_pictures_are_promised(short_flight: Flown) -> None:
+    placed, _ = geotags.read(short_flight.folder, Mounting())
+    heights = [-truth.pose.position_ned_m[2] for truth in short_flight.truths if truth.pose is not None]
+    cm = 100 * float(np.median(heights)) * 0.01 / 50  # of 10 µm behind 50 mm
+    assert photo_files.ground_words(placed).startswith(f"pictures: {cm:.2g} cm of ground per pixel from ")
+    assert "is unknown" in photo_files.ground_words([])
+
+
 def test_marks_are_of_one_flight(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "another").mkdir()
     two = [str(short_flight.folder), str(tmp_path / "another")]

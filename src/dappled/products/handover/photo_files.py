@@ -5,16 +5,21 @@ from __future__ import annotations
 import io
 import struct
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from statistics import StatisticsError, median
 
 import numpy as np
 import tifffile
 from PIL import Image
 
 from dappled import __version__, durable
+from dappled.config import profiles
 from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
+from dappled.decode.optics.lenses import ground_sample_m
+from dappled.errors import DappledError
 from dappled.flight import Frame, Tag
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
@@ -35,6 +40,17 @@ _FIRST_OF_JPEG: list[Entry] = [
     (0x0128, _SHORT, 1, struct.pack("<H", 2)),
     (0x0213, _SHORT, 1, struct.pack("<H", 1)),
 ]
+
+
+def ground_words(placed: Sequence[Placed]) -> str:
+    """What a pixel of a flight's pictures covers on the ground, in the middle one."""
+    heights = [h for one in placed if one.camera is not None and (h := one.camera.height_above_home_m) is not None]
+    lengths = [length for one in placed if (length := one.tag.focal_length_mm) is not None]
+    with suppress(StatisticsError, DappledError):  # none is known; another camera's profile, or taken on the ground
+        height_m, sensor = median(heights), profiles.camera(placed[0].tag.camera).raw[0].sensor
+        sample_m = ground_sample_m(sensor.size_mm[1] / sensor.shape[1], median(lengths), height_m)
+        return f"pictures: {100 * sample_m:.2g} cm of ground per pixel from {height_m:.3g} m above home"
+    return "pictures: how much ground a pixel covers is unknown: focal length or height above home is"
 
 
 def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, bytes]:
