@@ -31,6 +31,7 @@ from dappled.flight import (
     Stray,
     layout,
     offload,
+    places,
     pruning,
     read_back,
     recording,
@@ -323,6 +324,16 @@ def test_a_copy_that_can_be_read_from_memory_only_proves_nothing(
     assert done.doubts[0].code is Code.COPY_IN_MEMORY
     with pytest.raises(FlightError, match="nothing was removed; offload without --prune"):
         go(closed, tmp_path / "disk", prune=True)
+    assert frames(closed) == TWO
+
+
+def test_a_prune_that_is_refused_leaves_no_empty_folder(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(places, "file_system", lambda fd: "strangefs")
+    with pytest.raises(FlightError, match=rf"can't be sure of .*{closed.name}: its file system is strangefs"):
+        go(closed, tmp_path / "disk", prune=True)
+    assert not (tmp_path / "disk").exists()
     assert frames(closed) == TWO
 
 

@@ -77,10 +77,10 @@ def offload(
             _finish_seal(folder, clock)
         source = stack.enter_context(Tree(folder.path))
         names = [name for name in source.walk() if _is_copied(name)]
-        there = _open_copy(stack, source, destination, same_device=same_device)
+        there = _open_copy(stack, source, destination, prune=prune, same_device=same_device)
         system = places.file_system(there.folders[""])
         if prune:
-            _refuse_unprovable(there, system, same_device=same_device)
+            _refuse_unprovable(there, there.path, same_device=same_device)
         return _Copying(folder, source, there, system).run(names, prune=prune, clock=clock, key=key, progress=progress)
 
 
@@ -292,17 +292,20 @@ def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
         seals.seal(folder, clock, PRUNES)
 
 
-def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, same_device: bool) -> Tree:
+def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, prune: bool, same_device: bool) -> Tree:
     """Open the flight's folder at the destination with all folders of the source, made where they are missing, and hold
     the lock of the destination: work on the flights there would take half-written files for its own. `stack` closes
     both.
 
-    Raises FlightError where one of them is the source's, before anything is written, and where others work there.
+    Raises FlightError where one of them is the source's, or to `prune` can't be proved there, before anything is
+    written, and where others work there.
     """
     top = destination.resolve()
     existing = next(path for path in (top, *top.parents) if path.is_dir())
     with Tree(existing) as above:
         places.refuse_same_place(source, above, same_device=same_device)
+        if prune and not os.path.lexists(top / source.path.name):  # no folder is made that would stay empty
+            _refuse_unprovable(above, top / source.path.name, same_device=same_device)
     try:
         durable.make_folder(top)
     except OSError as error:
@@ -321,10 +324,10 @@ def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, same_device
     return there
 
 
-def _refuse_unprovable(copy: Tree, system: str, *, same_device: bool) -> None:
-    """Raise FlightError where a file system is not known to keep what was fsynced, or its disk is not known or forgets
-    what it holds."""
-    there = copy.path
+def _refuse_unprovable(copy: Tree, there: Path, *, same_device: bool) -> None:
+    """Raise FlightError where the file system of an open folder, for a copy that is or will be `there`, is not known to
+    keep what was fsynced, or its disk is not known or forgets what it holds."""
+    system = places.file_system(copy.folders[""])
     if system not in places.KEEPS_FSYNC | places.NETWORK:
         raise FlightError(
             f"--prune can't be sure of {there}: its file system is {system}, of which dappled doesn't know that an "
