@@ -36,6 +36,15 @@ def test_the_camera_is_the_one_of_the_settings(camera: str, mask: str, wanted: S
     assert SimulatedCamera.of(settings(camera, mask)) == wanted
 
 
+def test_a_law_that_is_not_that_of_the_profile_is_told() -> None:
+    told = SimulatedCamera("canon-eos-450d", "mask-2").other_law
+    assert "its rays obey the law geometric" in told
+    assert "the profile canon-eos-450d says fd" in told
+    assert SimulatedCamera("reference-36mm", "reference-5x5").other_law == ""
+    optics = eos450d_camera(1, profiles.mask("mask-2").mask, scene="white").optics
+    assert optics.law == "geometric"
+
+
 def test_a_mask_that_cannot_be_simulated_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "coarse.toml").write_text("frequency_per_mm = 0.5\n")
     with pytest.raises(DappledError, match=r"^mask\.profile '.*coarse\.toml' can't be simulated: carriers 0\.00"):

@@ -50,6 +50,7 @@ class World:
     real: bool = False
 
 
+_RAYS = "geometric"  # the law of the simulated lens
 _ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
 
 
@@ -71,6 +72,17 @@ class SimulatedCamera:
 
     def __str__(self) -> str:
         return f"a Canon EOS 450D with {self.mask}" if self.profile == EOS_450D else "a masked camera"
+
+    @property
+    def other_law(self) -> str:
+        """What differs from the camera's profile: rays obey geometry, whatever law the profile has; "" for nothing."""
+        law = profiles.camera(self.profile).law
+        if law == _RAYS:
+            return ""
+        return (
+            f"its rays obey the law {_RAYS}, which its calibration finds; the profile {self.profile} says {law}, by "
+            "which dappled plan tells the size of views: its warning tells both"
+        )
 
     def on_a_bench(self, world: World) -> MaskedCamera:
         """The camera before a white card. Raises DappledError for a mask that can't be simulated."""
