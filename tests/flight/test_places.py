@@ -176,6 +176,13 @@ def test_a_copy_in_memory_is_made_and_doubted_and_nothing_is_removed_for_it(clos
     whole(closed)
 
 
+def test_a_copy_in_doubt_is_no_success(closed: Path, memory: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["flight", "offload", str(memory), str(closed)]
+    assert main(words) == 1
+    assert "in doubt: copy" in capsys.readouterr().err
+    assert main([*words, "--anyway"]) == 0
+
+
 def test_a_partition_a_volume_and_an_image_are_on_their_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def device(path: str, number: str) -> Path:
         (tmp_path / path).mkdir(parents=True)

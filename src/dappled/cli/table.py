@@ -53,7 +53,7 @@ VERBS: dict[str, tuple[str, str]] = {
     "flight seal": ("flight", "check a flight and sign it as it stands; exits 1 if it is not intact"),
     "flight offload": (
         "flight",
-        "copy a flight to another disk and prove the copy; remove the frames here on request",
+        "copy a flight to another disk and prove the copy (exits 1 in doubt); remove the frames here on request",
     ),
     "flight coverage": (
         "flight.coverage",

@@ -9,7 +9,7 @@ from dappled import codec
 from dappled.cli import sealing
 from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
-from dappled.cli.verb import CallError, Output, Report, SettingsArgument, Verb, argument, flag, option
+from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
 from dappled.clock import SystemClock
 from dappled.flight import flight_report, offload, owner_seal
 from dappled.flight.checks import flight_check
@@ -120,7 +120,7 @@ class ReportFlight(FlightArgument, Verb):
 
 
 @dataclass(frozen=True, kw_only=True)
-class OffloadFlight(FlightArgument, Verb):
+class OffloadFlight(Doubtable, FlightArgument, Verb):
     """Copy a flight to another disk."""
 
     examples = (
@@ -146,7 +146,7 @@ class OffloadFlight(FlightArgument, Verb):
                 key=sealing.key_of(self.config),
                 progress=add,
             )
-        return Report(codec.plain(done), list(flight_lines.of_offload(done)))
+        return Report(codec.plain(done), list(flight_lines.of_offload(done)), findings=done.doubts)
 
 
 CLASSES: dict[str, type[Verb]] = {

@@ -143,10 +143,9 @@ def _table(sources: Sequence[SourceReport]) -> Iterator[str]:
 
 
 def of_offload(done: Offloaded) -> Iterator[str]:
-    """How many files were copied and proved, how, what is in doubt, and how many were removed here."""
+    """How many files were copied and proved, how, and how many were removed here."""
     counts = f"{counted(done.copied, 'file')} copied and verified, {done.there_already} already there"
     yield f"{done.destination}: {counts}; read back from {done.file_system} by {' and '.join(done.read_back)}"
-    yield from (f"in doubt: {findings.told(one)}" for one in done.doubts)
     if done.brought_home:
         yield f"{counted(done.brought_home, 'row')} that work at the copy had added to the ledger were brought here"
     if done.pruned:
