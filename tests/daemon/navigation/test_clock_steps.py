@@ -12,8 +12,8 @@ from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.navigation.clocks import from_arrivals
 from dappled.decode.geometry import Pose, metres_per_radian
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.findings import Code, Finding
-from dappled.flight import TimeSource
+from dappled.findings import Code, Finding, text
+from dappled.flight import Cause, Shot, TimeSource
 from dappled.mocks.autopilot.autopilot import BootTime
 
 START_NS = 1_790_000_000 * 10**9
@@ -95,6 +95,38 @@ def test_telemetry_that_was_late_for_a_while_is_no_step(late_s: float) -> None:
     assert vehicle.locate(25.0)[2] < 1.2
 
 
+@pytest.mark.parametrize("answers", [True, False])
+@pytest.mark.parametrize("fast_port", [True, False])
+def test_a_request_that_a_link_held_is_known_as_late(answers: bool, fast_port: bool) -> None:
+    """From 10 s to 13.5 s a link holds its bytes, then brings all: five photographs of one place, in no doubt. What a
+    second port brings in time says nothing about them."""
+    vehicle, boot = Vehicle(answers=answers), BootTime(drift=20e-6)
+    receive = vehicle.feed
+
+    def stamp_ns(utc_ns: int) -> int:
+        t_s = (utc_ns - START_NS) / 1e9
+        return START_NS + round((13.5 + (t_s - 10) / 2000) * 1e9) if 10 <= t_s < 13.5 else utc_ns
+
+    def hold(utc_ns: int, message: MavlinkMessage, component: int = 1) -> None:
+        receive(stamp_ns(utc_ns), message, component)
+
+    vehicle.feed = hold  # type: ignore[method-assign]  # the link between
+    vehicle.fly(boot, 0, 10)
+    if fast_port:
+        receive(START_NS + round(13.499e9), mavlink.MAVLink_attitude_message(boot.ns(13.49) // 10**6, *[0] * 6))
+    vehicle.fly(boot, 10, 30)
+    for t_s in (3.02, 10.22, 11.02, 12.22, 13.22, 20.02):
+        heard_ns = stamp_ns(START_NS + round(t_s * 1e9))
+        shot = Shot(0, Cause("mavlink:1/1", "IMAGE_START_CAPTURE", 1), heard_ns, heard_ns)
+        exposure = clocks.asked(clocks.mid_exposure(heard_ns, LATENCY, None), shot)
+        doubts = vehicle.telemetry.locate(exposure)[0].doubts
+        late_s = (heard_ns - START_NS) / 1e9 - t_s
+        held = late_s > 1.05 and not fast_port
+        assert [one.code for one in doubts] == [Code.FRAME_REQUEST_LATE] * held, t_s
+        if held:
+            assert doubts[0].facts["late_s"] == pytest.approx(late_s, abs=0.1)
+
+
 @pytest.mark.parametrize("by_s", [0.12, 0.4, -0.12, -0.4, 1.5])
 def test_a_pose_next_to_a_step_is_in_doubt_and_those_around_it_are_right(by_s: float) -> None:
     """The clock steps at 20.05 s, between two answers (20.02 and 20.22 s)."""
@@ -143,7 +175,13 @@ def test_a_clock_that_runs_fast_gives_no_confident_pose(drift: float) -> None:
         assert [one.code for one in doubts] == [Code.CLOCK_STEPPED]
         worst = max(worst, sigmas)
     assert worst < 3
-    assert [one.code for one in vehicle.telemetry.doubts()] == [Code.CLOCK_UNSTEADY]
+    (told,) = vehicle.telemetry.doubts()
+    if drift < 0.2:
+        assert told.code is Code.CLOCK_UNSTEADY
+    else:
+        assert told.code is Code.CLOCK_NOT_REAL_TIME
+        assert told.facts["rate"] == pytest.approx(1 + drift, rel=0.05)
+        assert f"{1 + drift:.1f} times as fast" in text(told)
 
 
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -400e-6])

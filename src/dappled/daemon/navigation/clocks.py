@@ -39,6 +39,8 @@ _REACH_NS = 10_000_000  # with the default 30 ms in all 130 ms: at 5 Hz the next
 _AFTER_CALL_NS = 3_000_000
 _HEARD_NS = 300_000_000
 _OWN_NS = 2_500_000_000  # a message that a slow link repeats is the same until then
+_HELD_NS = 10**9  # no link that works delays a request so long
+_OF_AUTOPILOT, _ASKED_HERE = "/1", ("interval", "distance")
 _BOUNCE_NS = 100_000_000  # no body here takes two photographs within this time
 _CAMERA_SHOTS_KEPT = 256
 _CAMERA_SHOTS_LEAST = 3
@@ -86,7 +88,7 @@ class ExposureTime:
 
     `half_ns` is half the exposure as far as known. `called_utc_ns` is when the trigger call was made: nothing exposes
     before it; None where that is unknown. `trigger` is the message whose time the shot owns, where there is one.
-    `doubts` are those about the time.
+    `doubts` are those about the time. `asked_utc_ns` is when the autopilot's request was heard that made the shot.
     """
 
     utc_ns: int
@@ -96,6 +98,15 @@ class ExposureTime:
     called_utc_ns: int | None = None
     trigger: TriggerMessage | None = None
     doubts: tuple[Finding, ...] = ()
+    asked_utc_ns: int | None = None
+
+
+def asked(exposure: ExposureTime, shot: Shot) -> ExposureTime:
+    """The exposure with when the autopilot's request was heard, where the shot has no message with a time of its own:
+    a link may have held it."""
+    by_request = exposure.trigger is None and shot.cause.source.endswith(_OF_AUTOPILOT)
+    known = by_request and shot.cause.kind not in _ASKED_HERE
+    return replace(exposure, asked_utc_ns=shot.wished_utc_ns) if known else exposure
 
 
 def owned(exposure: ExposureTime, shot: Shot, latency: BodyLatency) -> ExposureTime:
@@ -440,11 +451,15 @@ def camera_time(taken: str | None) -> tuple[int, int] | None:
     return seconds * 10**9 + int(digits.ljust(9, "0") or 0), 10 ** (9 - len(digits))
 
 
-def in_doubt(exposure: ExposureTime, clock: BootClock | None) -> ExposureTime:
-    """The exposure with the doubt of the clock that places it."""
-    if clock is None or clock.stepped is None:
+def in_doubt(exposure: ExposureTime, clock: BootClock | None, late_ns: int | None = None) -> ExposureTime:
+    """The exposure with the doubts of the clock that places it, and of a request that came `late_ns` (None: unknown)
+    after it was sent."""
+    if clock is None:
         return exposure
-    return replace(exposure, doubts=(*exposure.doubts, clock.stepped))
+    found = [] if clock.stepped is None else [clock.stepped]
+    if late_ns is not None and late_ns > _HELD_NS + 3 * clock.sigma_ns:
+        found.append(finding(Code.FRAME_REQUEST_LATE, FRAME, late_s=late_ns / 1e9))
+    return replace(exposure, doubts=(*exposure.doubts, *found)) if found else exposure
 
 
 class UtcLearner:

@@ -22,7 +22,9 @@ def doubts(history: VehicleHistory) -> Iterator[Finding]:
     heard_ns, placed_ns = time.heard_ns, history.placed_ns
     step = time.last_step()
     if step is not None and step.step_ns is not None and heard_ns - step.since_ns <= _CLEAR_NS:
-        if time.is_unsteady():
+        if time.is_unsteady() and (rate := history.rate()) is not None:
+            yield finding(Code.CLOCK_NOT_REAL_TIME, _AUTOPILOT, rate=rate)
+        elif time.is_unsteady():
             yield finding(Code.CLOCK_UNSTEADY, _AUTOPILOT)
         else:
             yield finding(Code.CLOCK_STEPPED, _AUTOPILOT, steps=1, by_s=step.step_ns / 1e9)

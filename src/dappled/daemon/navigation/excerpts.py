@@ -26,6 +26,12 @@ def latest(history: Sequence[N], window_ns: int) -> Sequence[N]:
     return history[bisect_left(history, since, key=lambda sample: sample.stamp_ns) :]
 
 
+def beside(history: Sequence[N], stamp_ns: int, within_ns: int) -> Sequence[N]:
+    """The last that arrived up to a time, and the first after it, each within so much of it."""
+    at = bisect_left(history, stamp_ns, key=lambda sample: sample.stamp_ns)
+    return [one for one in history[max(0, at - 1) : at + 1] if abs(one.stamp_ns - stamp_ns) <= within_ns]
+
+
 def around_instant(history: Sequence[S], boot_ns: int, *, gap_ns: int) -> tuple[S, ...]:
     """The two samples around an instant, not more than `gap_ns` apart; or the nearest one, if it is near enough; or
     none. `boot_ns` of the history must rise."""

@@ -188,13 +188,16 @@ class Telemetry:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit, exposure.utc_ns)
             events = self._history.feedbacks(limit, exposure.utc_ns)
+            late_ns = None
+            if clock is not None and exposure.asked_utc_ns is not None:
+                late_ns = self._history.late_ns(exposure.asked_utc_ns, limit, clock)
         event, trigger = None, exposure.trigger
         if clock is not None:
             event = own_feedback(events, trigger) if trigger else choose_feedback(events, exposure, clock)
         if clock is None or event is None:
             exposure = unseen(exposure) if trigger else exposure
             pose = self.pose_at(exposure.utc_ns, exposure.sigma_ns, upto_packet=limit)
-            return in_doubt(exposure, clock), pose
+            return in_doubt(exposure, clock, late_ns), pose
         sigma_ns = event.sigma_ns
         if trigger:
             better, boot_ns, sigma_ns = by_trigger(exposure, trigger, event, clock, events)
@@ -204,7 +207,7 @@ class Telemetry:
             with self._lock:
                 clock = self._history.clock(limit, better.utc_ns) or clock
         pose = self.pose_at(better.utc_ns, sigma_ns, upto_packet=limit, boot_ns=boot_ns, clock=clock)
-        return in_doubt(better, clock), pose
+        return in_doubt(better, clock, late_ns), pose
 
     def pose_at(
         self,

@@ -9,6 +9,7 @@ import math
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any, Generic, TypeVar
 
 from dappled.daemon.navigation import samples as telemetry_samples
@@ -21,7 +22,7 @@ from dappled.daemon.navigation.clocks import (
     from_timesync,
     step_ns,
 )
-from dappled.daemon.navigation.excerpts import around_instant, between, latest
+from dappled.daemon.navigation.excerpts import around_instant, beside, between, latest
 from dappled.daemon.navigation.ground_height import ground_sample
 from dappled.daemon.navigation.jumps import JumpFinder
 from dappled.daemon.navigation.samples import (
@@ -59,6 +60,8 @@ TIMESYNC_WINDOW_NS, ARRIVAL_WINDOW_NS = 120 * 10**9, 60 * 10**9
 REBOOT_BACK_NS, REBOOT_CONFIRM_NS = 2 * 10**9, 500_000_000
 _REQUESTS_KEPT = _REPEATS = 64
 _UNSTEADY_NS = 10 * 10**9  # two steps within this time: the clock does not run steadily
+_TOGETHER_NS = 200_000_000
+_PART_NS, _FAST = 2 * 10**9, 0.2
 _ALIVE_NS, _ANSWERS_COME_NS = 5 * 10**9, 10**9
 _SILENT_NS = 10 * 10**9  # an autopilot that has answered within this time shows its steps by its answers
 _LOOKED_AT = 64  # answers: more than come in the ten seconds that `step_ns` looks back
@@ -381,6 +384,22 @@ class VehicleHistory:
         """When the last position came; 0: none did."""
         return self._positions[-1].stamp_ns if self._positions else 0
 
+    def rate(self) -> float | None:
+        """How many times as fast as ours its clock runs, where each two of the last ten seconds say that it is another
+        one than ours; else None."""
+        known = latest(self._positions, _UNSTEADY_NS)
+        if not known or known[-1].stamp_ns - known[0].stamp_ns < _UNSTEADY_NS - _PART_NS:
+            return None
+        begins = range(known[-1].stamp_ns - _UNSTEADY_NS + _PART_NS, known[-1].stamp_ns, _PART_NS)
+        places = [bisect_left(known, since, key=lambda one: one.stamp_ns) for since in begins]
+        marks = [known[0], *(known[place] for place in places), known[-1]]
+        whole, *rates = [
+            (b.boot_ns - a.boot_ns) / (b.stamp_ns - a.stamp_ns)
+            for a, b in ((known[0], known[-1]), *pairwise(marks))
+            if b.stamp_ns > a.stamp_ns
+        ]
+        return whole if min(rates) > 1 + _FAST or max(rates) < 1 / (1 + _FAST) else None
+
     def reached(self, boot_ns: int) -> bool:
         """Whether samples from after this instant have arrived. Attitude counts only if some arrived in the last five
         seconds."""
@@ -389,6 +408,17 @@ class VehicleHistory:
             return False
         alive = bool(attitudes) and attitudes[0].boot_ns >= positions[0].boot_ns - _ALIVE_NS
         return not alive or attitudes[0].boot_ns >= boot_ns
+
+    def late_ns(self, heard_ns: int, limit: int, clock: BootClock) -> int | None:
+        """How late a message without a time came that was heard then: as late as the samples that came with it, whose
+        time is known. None where none did."""
+        histories: tuple[Sequence[Sample], ...] = (self._positions, self._attitudes)
+        late = [
+            one.stamp_ns - clock.utc_ns(one.boot_ns)
+            for history in histories
+            for one in beside(between(history, *self.time.span(limit, heard_ns)), heard_ns, _TOGETHER_NS)
+        ]
+        return min(late, default=None)
 
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""

@@ -189,6 +189,10 @@ class Tagging:
             return FrameSettings()
 
     def _expected(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
+        """When the frame was exposed, and when it was requested (see `clocks.asked`)."""
+        return clocks.asked(self._timed(pending, settings), pending.shot)
+
+    def _timed(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
         """When the frame was exposed, as far as trigger call and file say. See `clocks.owned` for a shot that the
         autopilot's message created.
 
