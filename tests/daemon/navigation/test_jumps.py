@@ -88,8 +88,39 @@ def test_poses_around_a_jump_contain_it(rate_hz: float) -> None:
     for t_s in (AT_S - 8, AT_S - 1, *(AT_S - share / rate_hz for share in (1.1, 0.9, 0.5, 0.1)), AT_S, AT_S + 25):
         assert 29 < sigma_m(telemetry, t_s) < 36, t_s
     assert (at(telemetry, AT_S).vertical_sigma_m or 9) < 1
-    for t_s in (5.0, 9.0, 51.0, 55.0):
+    for t_s in (5.0, 9.0):
         assert sigma_m(telemetry, t_s) < 1, t_s
+    assert sigma_m(telemetry, 55.0) > 29  # it has not jumped back: no time ends this
+    assert telemetry.statistics().jumps == 1
+
+
+@pytest.mark.parametrize("steps_s", [(), (AT_S + 4, AT_S + 12), (AT_S, AT_S + 20)])
+def test_a_doubt_of_the_position_outlives_steps_of_the_clock_and_ends_when_it_is_back(
+    steps_s: tuple[float, ...],
+) -> None:
+    """A simulator's clock steps each few seconds: the doubt was forgotten, and a jump beside one was missed."""
+    telemetry, boot = Telemetry(), BootTime(jumps=tuple((t_s, 0.4) for t_s in steps_s))
+    packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    for number, (t_s, message) in enumerate(messages(PATH, stepped(33.0, until_s=AT_S + 40), 5.0, AT_S + 50)):
+        if message.get_type() == "GLOBAL_POSITION_INT":
+            message.time_boot_ms = boot.ns(t_s) // 10**6
+            message.pack(packer)
+        telemetry.feed(number, START_NS // 1000 + round(t_s * 1e6) + 3000, message)
+    for t_s in (AT_S - 2, AT_S + 2, AT_S + 14, AT_S + 37):
+        assert 30 < sigma_m(telemetry, t_s) < 37, t_s
+    assert sigma_m(telemetry, AT_S + 42) < 1
+
+
+def test_a_position_that_comes_to_where_the_receiver_stayed_is_in_doubt_no_longer() -> None:
+    """An estimator that was set anew to its receiver: those before the jump are in doubt."""
+    telemetry = Telemetry()
+    there = messages(PATH, lambda _, pose: moved(pose, 12.0), 5.0, AT_S + 10)
+    both = zip(messages(PATH, stepped(12.0), 5.0, AT_S + 10), there, strict=True)
+    for number, ((t_s, estimated), (_, true)) in enumerate(both):
+        message = true if true.get_type() == "GPS_RAW_INT" else estimated
+        telemetry.feed(number, START_NS // 1000 + round(t_s * 1e6) + 3000, message)
+    assert sigma_m(telemetry, AT_S - 2) > 11
+    assert sigma_m(telemetry, AT_S + 2) < 1
     assert telemetry.statistics().jumps == 1
 
 
@@ -112,8 +143,9 @@ def test_a_covariance_contains_the_jump() -> None:
 @pytest.mark.parametrize("until_s", [AT_S + 0.1, AT_S + 5])
 def test_there_and_back_is_in_doubt_by_the_way_and_not_by_twice_of_it(until_s: float) -> None:
     telemetry = telemetry_of(changed=stepped(30.0, until_s=until_s))
-    for t_s in (AT_S - 2, AT_S + 0.02, AT_S + 2, AT_S + 8):
+    for t_s in (AT_S - 2, AT_S + 0.02, until_s - 0.02):
         assert 29 < sigma_m(telemetry, t_s) < 36, t_s
+    assert sigma_m(telemetry, until_s + 1) < 1
     assert telemetry.statistics().jumps == (1 if until_s < AT_S + 1 else 2)
 
 

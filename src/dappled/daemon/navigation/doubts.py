@@ -1,6 +1,7 @@
 """Say for which reasons poses are in doubt: steps of the clock, impossible messages, jumps.
 
-Each stands until a minute of telemetry has come without another: while nothing is heard, nothing is over.
+Each stands until a minute of telemetry has come without another: while nothing is heard, nothing is over. A jump stands
+until there is evidence that it is over as well.
 """
 
 from __future__ import annotations
@@ -32,5 +33,5 @@ def doubts(history: VehicleHistory) -> Iterator[Finding]:
         yield date
     if counts.impossible and heard_ns - counts.impossible_ns <= _CLEAR_NS:
         yield finding(Code.POSITION_IMPOSSIBLE, _AUTOPILOT)
-    if counts.jumps and placed_ns - counts.jump_ns <= _CLEAR_NS:
+    if history.displaced or (counts.jumps and placed_ns - counts.jump_ns <= _CLEAR_NS):
         yield finding(Code.POSITION_JUMPED, _AUTOPILOT, by_m=counts.jump_m)

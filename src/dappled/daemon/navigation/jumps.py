@@ -1,23 +1,28 @@
 """Find positions that contradict the velocities sent with them: jumps.
 
 A receiver that has lost its way, or an estimator that was reset, moves the position by metres while the velocity says
-nothing of it. Which side of a jump is right can't be known: a position near one is in doubt by its size.
+nothing of it. Which side of a jump is right can't be known: a position near one is in doubt by its size, and all those
+after it are until there is evidence that it is over. It is over when the position has jumped back, or is where a
+receiver is that has not jumped itself.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from dappled.daemon.navigation.samples import NEAREST_NS, Jump, PositionSample
-from dappled.decode.geometry import Vector3, displacement
+from dappled.daemon.navigation.samples import NEAREST_NS, GnssSample, Jump, PositionSample
+from dappled.decode.geometry import Vector3, displacement, norm
 
 _WINDOW_NS = 10**9  # a jump that is spread over several samples is whole within
 _FLOOR_M = 2.0  # a position and a velocity that drift apart as filters do
 _STALE_S = 0.25  # by which a position may be older than its time says: a receiver's interval, in messages sent faster
 _BETWEEN_M_S2 = 2.5  # × time²: there and back at 10 m/s² between two samples with the same velocity
+_BACK = 0.1  # of the largest doubt: so near to where it was is back
+_APART_M, _APART_S = 5.0, 0.6  # by which estimator and receiver may differ; the age of a receiver's message
 _UNKNOWN_M_S = 60.0  # of a vehicle whose messages have no velocity (exactly 0, 0, 0)
+_NONE: Vector3 = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +40,11 @@ class JumpFinder:
     def __init__(self) -> None:
         self._last: PositionSample | None = None
         self._sums: deque[_Sum] = deque()
+        self._widest_m, self.standing_m = 0.0, _NONE
 
     def jump(self, sample: PositionSample, first: int) -> Jump | None:
-        """Take the next position; `first` is the first packet of its epoch of the autopilot's clock. The jump that ends
-        there, if any."""
+        """Take the next position; `first` is the first packet of the autopilot's boot. The jump that ends there, if
+        any."""
         last, self._last = self._last, sample
         if last is None or last.number < first or sample.boot_ns - last.boot_ns > NEAREST_NS:
             self._sums = deque([_Sum(sample.boot_ns, (0.0, 0.0, 0.0), 0.0)])
@@ -63,7 +69,43 @@ class JumpFinder:
         if most > 0:
             self._sums.clear()
         self._sums.append(found)
-        return Jump(sample.number, sample.stamp_ns, sample.boot_ns, by_m) if most > 0 else None
+        if most <= 0:
+            return None
+        north, east, down = (a + b for a, b in zip(self.standing_m, by_m, strict=True))
+        self._widest_m = max(self._widest_m, norm((north, east, down)))
+        back = norm((north, east, down)) <= _FLOOR_M + _BACK * self._widest_m < self._widest_m
+        if back:
+            self._widest_m = 0.0
+        self.standing_m = _NONE if back else (north, east, down)
+        return Jump(sample.number, sample.stamp_ns, sample.boot_ns, by_m, self.standing_m)
+
+    def over(self, sample: PositionSample, number: int, stamp_ns: int) -> Jump:
+        """That the doubt is over from this packet on, by other evidence; `sample` is the last position."""
+        self._widest_m, self.standing_m = 0.0, _NONE
+        return Jump(number, stamp_ns, sample.boot_ns, _NONE, _NONE)
+
+
+class ReceiverTrack:
+    """Whether the receiver has jumped, by the estimator's velocities, and whether the estimator is where it is."""
+
+    def __init__(self) -> None:
+        self._finder = JumpFinder()
+
+    def confirms(self, heard: GnssSample, estimate: PositionSample, first: int) -> bool:
+        """Take the receiver's place with a fix. Whether it has not jumped, and the last position is there as well."""
+        latitude_rad, longitude_rad, altitude_m = heard.place
+        there = replace(
+            estimate,
+            number=heard.number,
+            stamp_ns=heard.stamp_ns,
+            latitude_rad=latitude_rad,
+            longitude_rad=longitude_rad,
+            altitude_msl_m=altitude_m,
+        )
+        self._finder.jump(there, first)
+        apart_m = norm(displacement(there, estimate))
+        near_m = _APART_M + _APART_S * norm(estimate.velocity_ned_m_s)
+        return self._finder.standing_m == _NONE and apart_m <= near_m
 
 
 def _unexplained(a: PositionSample, b: PositionSample) -> tuple[Vector3, float]:

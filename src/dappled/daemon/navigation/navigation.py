@@ -63,7 +63,7 @@ from dappled.flight import LedgerReader, Recording
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
 AHEAD_NS = 10**9  # a body's latency and half an exposure; an exposure further ahead is not waited for
 RATES_GAP_NS, TURN_GAP_NS = 150_000_000, 60_000_000  # a multicopter sways within more; without rates in the messages
-JUMP_AFTER_NS, JUMP_BEFORE_NS = 30 * 10**9, 10 * 10**9  # so long after and before a jump a position is in doubt
+JUMP_BEFORE_NS = 10 * 10**9  # so long before a jump a position is in doubt
 _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
 _PRUNE_EVERY, _LOOK_S = 256, 0.005
@@ -435,14 +435,14 @@ def position_at(samples: Sequence[PositionSample], boot_ns: int) -> tuple[Positi
 
 
 def _jumped_m(at: Around) -> tuple[float, float]:
-    """How far the positions around an instant contradict that of the instant, metres horizontally and vertically: over
-    jumps up to `JUMP_AFTER_NS` before it and `JUMP_BEFORE_NS` after it. A jump there and back is one of them."""
-    before = [one for one in at.jumps if at.boot_ns - JUMP_AFTER_NS < one.boot_ns <= at.boot_ns]
-    after = [one for one in at.jumps if at.boot_ns < one.boot_ns < at.boot_ns + JUMP_BEFORE_NS]
-    across_m = upright_m = 0.0
-    for side in (before[::-1], after):
-        north = east = down = 0.0
-        for one in side:
+    """How far the position of an instant is in doubt, metres horizontally and vertically: by the jumps before it that
+    are not over, and by those up to `JUMP_BEFORE_NS` after it. A jump there and back is one of them."""
+    before = [one for one in at.jumps if one.boot_ns <= at.boot_ns]
+    north, east, down = before[-1].standing_m if before else (0.0, 0.0, 0.0)
+    across_m, upright_m = math.hypot(north, east), abs(down)
+    north = east = down = 0.0
+    for one in at.jumps:
+        if at.boot_ns < one.boot_ns < at.boot_ns + JUMP_BEFORE_NS:
             north, east, down = north + one.by_m[0], east + one.by_m[1], down + one.by_m[2]
             across_m, upright_m = max(across_m, math.hypot(north, east)), max(upright_m, abs(down))
     return across_m, upright_m

@@ -75,12 +75,16 @@ class PositionSample:
 
 @dataclass(frozen=True, slots=True)
 class Jump:
-    """What the position moved (north, east, down) up to a sample beyond what its velocity explains."""
+    """What the position moved (north, east, down) up to a sample beyond what its velocity explains.
+
+    `standing_m` is how far it is in doubt from then on: all jumps since the doubt began, or nothing where it is over.
+    """
 
     number: int
     stamp_ns: int
     boot_ns: int
     by_m: Vector3
+    standing_m: Vector3
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,11 +102,13 @@ class AttitudeSample:
 
 @dataclass(frozen=True, slots=True)
 class GnssSample:
-    """One GPS_RAW_INT, of age 0; what the receiver doesn't report is None."""
+    """One GPS_RAW_INT, of age 0; what the receiver doesn't report is None. `place`: latitude and longitude
+    (rad), height above the sea (m)."""
 
     number: int
     stamp_ns: int
     reported: Gnss
+    place: Vector3
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,7 +244,7 @@ class Around:
 
     `boot_ns` is the instant on the autopilot's clock, known to `sigma_ns` (1 σ); `gimbal_boot_ns` on the gimbal's.
     `placed`: False where the clock stepped so near to it that the samples may be from before or after it. `jumps`: all
-    that are known of, near to it or not.
+    that are known of, near to it or not, as if all were of one epoch.
     """
 
     utc_ns: int
@@ -346,7 +352,8 @@ def gnss(number: int, stamp_ns: int, message: MavlinkMessage) -> GnssSample:
         _scaled(message.vel_acc, 2**32 - 1, 1000),
         age_ms=0.0,
     )
-    return GnssSample(number, stamp_ns, reported)
+    place = (math.radians(message.lat / 1e7), math.radians(message.lon / 1e7), message.alt / 1e3)
+    return GnssSample(number, stamp_ns, reported, place)
 
 
 def gimbal(number: int, stamp_ns: int, message: MavlinkMessage, epoch: int = 0) -> GimbalSample | None:

@@ -24,7 +24,7 @@ from dappled.daemon.navigation.clocks import (
 )
 from dappled.daemon.navigation.excerpts import around_instant, beside, between, latest
 from dappled.daemon.navigation.ground_height import ground_sample
-from dappled.daemon.navigation.jumps import JumpFinder
+from dappled.daemon.navigation.jumps import JumpFinder, ReceiverTrack
 from dappled.daemon.navigation.samples import (
     NEAREST_NS,
     Around,
@@ -125,6 +125,13 @@ class AutopilotTime:
     def first(self, limit: int) -> int:
         """The packet number at which the epoch began that was current below `limit`."""
         return self._epochs[self._place(limit)].number
+
+    def boot_first(self, limit: int) -> int:
+        """The packet number at which the boot began that was current below `limit`."""
+        at = self._place(limit)
+        while at > 0 and self._epochs[at].step_ns is not None:
+            at -= 1
+        return self._epochs[at].number
 
     def span(self, limit: int, utc_ns: int) -> tuple[int, int]:
         """The packets of an instant's epoch, as known below `limit`: from the first to before the second."""
@@ -344,14 +351,14 @@ class VehicleHistory:
         self.time = AutopilotTime(component_id)
         self.gimbals = Gimbals()
         self._positions: list[PositionSample] = []
-        self._finder, self._jumps = JumpFinder(), list[Jump]()
+        self._finder, self._receiver_track, self._jumps = JumpFinder(), ReceiverTrack(), list[Jump]()
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
         self._second: list[GnssSample] = []  # of another receiver: it counts while the first one has no fix
         self._ground: list[GroundSample] = []
         self._feedbacks: list[Feedback] = []
-        self._histories: tuple[list[Any], ...] = (self._positions, self._jumps, self._attitudes, self._receiver,
-                                                  self._second, self._ground, self._feedbacks)  # fmt: skip
+        self._histories: tuple[list[Any], ...] = (self._positions, self._attitudes, self._receiver, self._second,
+                                                  self._ground, self._feedbacks)  # fmt: skip
         self._steady_positions = Steady[PositionSample](counts, OF_PLACES, OF_VELOCITIES)
         self._steady_attitudes = Steady[AttitudeSample](counts, OF_ATTITUDES)
         self._attitude_sigma: tuple[float | None, int] = (None, 0)  # as the autopilot told it, and when
@@ -364,6 +371,7 @@ class VehicleHistory:
         """Forget what came before."""
         for history in self._histories:
             prune(history, before_ns)
+        del self._jumps[: max(0, bisect_left(self._jumps, before_ns, key=lambda one: one.stamp_ns) - 1)]
         self.gimbals.prune(before_ns)
         self.time.prune(before_ns)
 
@@ -383,6 +391,11 @@ class VehicleHistory:
     def placed_ns(self) -> int:
         """When the last position came; 0: none did."""
         return self._positions[-1].stamp_ns if self._positions else 0
+
+    @property
+    def displaced(self) -> bool:
+        """Whether a jump of the position is not over."""
+        return norm(self._finder.standing_m) > 0
 
     def rate(self) -> float | None:
         """How many times as fast as ours its clock runs, where each two of the last ten seconds say that it is another
@@ -422,6 +435,7 @@ class VehicleHistory:
 
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
         """The samples around an instant (`boot_ns` ± σ on the autopilot's clock), from the packets below `limit`."""
+        jumps = between(self._jumps, 0, limit)
         first, limit = self.time.span(limit, utc_ns)
         heard, other = (
             min(
@@ -442,7 +456,10 @@ class VehicleHistory:
             gimbals,
             gimbal_boot_ns,
             placed,
-            between(self._jumps, first, limit),
+            [
+                one if first <= one.number < limit else replace(one, boot_ns=boot_ns + one.stamp_ns - utc_ns)
+                for one in jumps
+            ],
             between(self._ground, first, limit),
         )
 
@@ -456,7 +473,7 @@ class VehicleHistory:
             if not _rises(self._positions, one, first):
                 continue
             keep(self._positions, one)
-            jump = self._finder.jump(one, first)
+            jump = self._finder.jump(one, self.time.boot_first(number + 1))
             if jump is not None:
                 self.counts.jumped(stamp_ns, norm(jump.by_m))
                 keep(self._jumps, jump)
@@ -482,8 +499,19 @@ class VehicleHistory:
 
     def _gnss(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message):
-            history = self._receiver if message.get_type() == "GPS_RAW_INT" else self._second
-            keep(history, telemetry_samples.gnss(number, stamp_ns, message))
+            first_one = message.get_type() == "GPS_RAW_INT"
+            heard = telemetry_samples.gnss(number, stamp_ns, message)
+            keep(self._receiver if first_one else self._second, heard)
+            if first_one and _fixed(heard) and self._positions:
+                self._compare(heard, self._positions[-1])
+
+    def _compare(self, heard: GnssSample, estimate: PositionSample) -> None:
+        """A doubt of the position is over where a receiver that has not jumped is."""
+        if abs(heard.stamp_ns - estimate.stamp_ns) > _TOGETHER_NS:
+            return
+        confirms = self._receiver_track.confirms(heard, estimate, self.time.boot_first(heard.number + 1))
+        if confirms and self.displaced:
+            keep(self._jumps, self._finder.over(estimate, heard.number, heard.stamp_ns))
 
     def _height(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
         if self._ours(message) and (sample := ground_sample(number, stamp_ns, message)):
