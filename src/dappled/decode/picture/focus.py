@@ -52,11 +52,13 @@ def band_of(frame: Singles, step: tuple[int, int], shadow: Shadow) -> Singles:
     widths = [(margin, whole - n - margin) for n, margin, whole in zip(frame.shape, margins, size, strict=True)]
     padded = np.pad(frame, [(a, min(b, n - 1)) for (a, b), n in zip(widths, frame.shape, strict=True)], mode="reflect")
     waves = fft.rfft2(padded)
-    fy, fx = fft.fftfreq(padded.shape[0])[:, None] / step[0], fft.rfftfreq(padded.shape[1])[None, :] / step[1]
-    inverse = np.linalg.inv(shadow.lattice.matrix())
+    inverse = np.linalg.inv(shadow.lattice.matrix()) / (_EDGE[1] - _EDGE[0])
+    fy, fx = fft.fftfreq(padded.shape[0]) / step[0], fft.rfftfreq(padded.shape[1]) / step[1]
     for column in (0, 1):
-        out = np.abs(fy * inverse[0, column] + fx * inverse[1, column])
-        waves *= np.clip((_EDGE[1] - out) / (_EDGE[1] - _EDGE[0]), 0, 1).astype(np.float32)
+        down, across = (np.float32(f * inverse[axis, column]) for axis, f in enumerate((fy, fx)))
+        share = np.abs(np.add.outer(down, across))
+        np.subtract(np.float32(_EDGE[1] / (_EDGE[1] - _EDGE[0])), share, out=share)
+        waves *= np.clip(share, 0, 1, out=share)
     made = fft.irfft2(waves, s=padded.shape)
     top, left = margins
     return np.ascontiguousarray(made[top : top + frame.shape[0], left : left + frame.shape[1]], dtype=np.float32)

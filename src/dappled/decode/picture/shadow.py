@@ -118,23 +118,25 @@ def shadow_of(
     for _ in range(_STEPS):
         if (finer := equations.lattice()) is None:
             break
-        equations = _Equations.of(means, finer, half)
+        # Where pixels are left out, a block's middle is not where its samples are.
+        equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half)
     first = equations.fitted(0)
-    if first.depth > _DEEP or mosaic.valid is not None:  # where the light was is known better behind a known shadow
-        means = _Means.of(mosaic, means.period, first)
+    if known := first.depth > _DEEP or mosaic.valid is not None:
+        means = _Means.of(mosaic, means.period, first)  # where the light was is known better behind a known shadow
+    if known or equations.at != found:
         equations = _Equations.of(means, equations.at, half)
+    if mosaic.valid is None and equations.at != found and (finer := equations.lattice()) is not None:
+        equations = _Equations.of(means, finer, half)
     best, gain = no_shadow(mosaic.shape, equations.at, half, mosaic.colours), 0.0
     for degree in _DEGREES:
         held = equations.held_out(degree)
         if held > gain + _SURE:
             best, gain = equations.fitted(degree), held
-    none = equations.explained(None)
-    known: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
+    at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
     for one in others:
-        if (where := (one.lattice, one.orders)) not in known:
-            known[where] = _Equations.of(means, *where)
-        there = known[where]
-        if (told := there.explained(one, equations.weights) - none) > gain:
+        if (where := (one.lattice, one.orders)) not in at:
+            at[where] = _Equations.of(means, *where)
+        if (told := at[where].explained(one, equations.weights) - equations.unexplained) > gain:
             best, gain = one, told
     return best
 
@@ -282,17 +284,30 @@ class _Equations:
             for values, into in ((high * high, energy), (keep, count)):
                 into[place.colour] += block_sums(values, edges[0], edges[1]).ravel()
         right[..., half:] = right[..., 1:half].conj()
-        whole = gram[..., index]
-        whole = np.where(sign > 0, whole, whole.conj())
-        middles = [
-            (np.arange(number) + 0.5) * one - (full - 1) / 2
-            for number, one, full in zip(blocks, across, mosaic.shape, strict=True)
-        ]
+        whole = np.ascontiguousarray(gram[..., index])
+        np.conjugate(whole, out=whole, where=sign < 0)
+        middles = []
+        for number, one, full in zip(blocks, across, mosaic.shape, strict=True):
+            ends = np.append(np.arange(number) * one, full)  # the last is longer
+            middles.append((ends[1:] + ends[:-1]) / 2 - full / 2)
         y, x = np.meshgrid(*middles, indexing="ij")
         odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
         return cls(
             mosaic.shape, lattice, orders, np.column_stack([y.ravel(), x.ravel()]), whole, right, energy, count, odd
         )
+
+    def moved(self, lattice: Lattice) -> _Equations:
+        """About the same at a lattice so near that waves turn little within a block."""
+        every = np.array([(0, 0), *self.orders, *((-ky, -kx) for ky, kx in self.orders)], dtype=np.float64)
+        off = self.centres @ (every @ (lattice.matrix() - self.at.matrix())).T
+        turns = np.exp(-2j * np.pi * off).astype(np.complex64)
+        gram = self.gram * turns[:, :, None] * turns[:, None, :].conj()
+        return replace(self, at=lattice, gram=gram, right=self.right * turns)
+
+    @cached_property
+    def _gram_parts(self) -> Floats:
+        """`gram` (colours, blocks, 2 n n), real and imaginary."""
+        return self.gram.reshape(*self.gram.shape[:2], -1).astype(np.complex128).view(np.float64)
 
     @cached_property
     def weights(self) -> Floats:
@@ -324,17 +339,20 @@ class _Equations:
         """Coefficients (n, terms), and the inverse of their normal equations."""
         terms, n = self._terms(degree), self.right.shape[2]
         count = terms.shape[1]
-        pairs = (weights[:, None, None] * terms[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
-        gram = (pairs.T @ self.gram[colour].reshape(len(terms), -1)).reshape(count, count, n, n)
-        whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count).astype(np.complex128)
+        first, second = np.triu_indices(count)
+        pairs = weights[:, None] * terms[:, first] * terms[:, second]
+        gram = np.empty((count, count, n, n), dtype=np.complex128)
+        gram[first, second] = (pairs.T @ self._gram_parts[colour]).view(np.complex128).reshape(-1, n, n)
+        gram[second, first] = gram[first, second]
+        whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count)
         right = (self.right[colour].T @ (weights[:, None] * terms)).reshape(n * count).astype(np.complex128)
         whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole).real) / len(whole), 1e-30)
         inverse = np.linalg.inv(whole)
-        return (inverse @ right).reshape(n, count), inverse
+        return np.asarray((inverse @ right).reshape(n, count)), np.asarray(inverse)
 
     def held_out(self, degree: int) -> float:
         """Log likelihood that coefficients gain over the mean alone, on the blocks that they were not fitted to."""
-        total = -self.explained(None)
+        total = -self.unexplained
         for colour, weights in enumerate(self.weights):
             for fold in (self.odd, ~self.odd):
                 if not fold.any() or fold.all():
@@ -342,6 +360,11 @@ class _Equations:
                 c, _ = self._solved(colour, np.where(fold, 0.0, weights), degree)
                 total += float((weights * self._gains(colour, self._local(c, degree)))[fold].sum()) / 2
         return total
+
+    @cached_property
+    def unexplained(self) -> float:
+        """`explained` without a shadow."""
+        return self.explained(None)
 
     def explained(self, other: Shadow | None, weights_of_blocks: Floats | None = None) -> float:
         """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none.

@@ -67,7 +67,7 @@ def sigma_file(made: MadePicture) -> bytes:
 
 
 def _eight(shown: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    return np.asarray((shown.astype(np.uint32) * 255 + 32767) // 65535, dtype=np.uint8)
+    return np.asarray(shown * np.float32(255 / 65535) + np.float32(0.5), dtype=np.uint8)
 
 
 def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:
