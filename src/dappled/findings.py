@@ -74,6 +74,7 @@ class Code(StrEnum):
     CARRIERS_HALF_WAY = "carriers.half_way"
     CARRIERS_LACKING = "carriers.lacking"
     CARRIERS_MISSING = "carriers.missing"
+    CARRIERS_OFF_CALIBRATION = "carriers.off_calibration"
     CARRIERS_OTHER_LAW = "carriers.other_law"
     CARRIERS_OTHER_PEAKS = "carriers.other_peaks"
     CARRIERS_OTHER_SIZE = "carriers.other_size"

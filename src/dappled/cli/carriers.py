@@ -45,6 +45,7 @@ class Table:
     own: Lattice | None = None
     rotation_rad: float | None = None
     checked: LawCheck | None = None
+    off: Finding | None = None
 
     @property
     def search(self) -> LawSearch | None:
@@ -54,7 +55,7 @@ class Table:
     @property
     def doubt(self) -> Finding | None:
         """Why the carriers can't be where slices are cut, or what can't be told of them; None where nothing is."""
-        return None if self.checked is None else self.checked.contradiction or self.checked.unsettled
+        return None if self.checked is None else self.checked.contradiction or self.off or self.checked.unsettled
 
     @property
     def used(self) -> Lattice:
@@ -176,6 +177,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
                 decoder = checked.decoder
                 predicted = decoder.predict(length)
                 used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
+            off = decoder.off_calibration(spectrum, length, predicted, seen, carriers_from)
             known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
             lattice = decoder.lattice_at(length)
             mask = decoder.optics.mask
@@ -198,6 +200,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
                 own=used,
                 rotation_rad=turned,
                 checked=checked,
+                off=off,
             )
 
 
@@ -339,4 +342,5 @@ def _summary(table: Table) -> str:
             f"{start}; no carriers in this frame: it was taken without this mask, or near the mask's ideal "
             f"aperture, where flat areas show none; a decode uses the {whose} prediction"
         )
-    return f"{start}; {table.seen} of {there} carriers seen, too few or weak: a decode uses the {whose} prediction"
+    why = "too few or weak" if table.doubt is None else told(table.doubt, FRAME)
+    return f"{start}; {table.seen} of {there} carriers seen, {why}: a decode uses the {whose} prediction"

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dappled import codec
 from dappled.decode.array_types import Singles
 from dappled.decode.calibration.calibration import Calibration, LatticeFit, moved
+from dappled.decode.calibration.testimony import off_calibration
 from dappled.decode.errors import DecodeError
 from dappled.decode.joint.clipping import clipped_shares, unclipped
 from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of
@@ -46,11 +47,12 @@ from dappled.decode.spectrum.peaks import (
     farther_lattice,
     measure,
     own_lattice,
+    stretch,
     turn_between,
 )
 from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, padded_shape, transform
-from dappled.findings import Finding
+from dappled.findings import Code, Finding
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
@@ -241,6 +243,7 @@ class MaskDecoder:
                 spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=min(0.5, needed))
             slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
             noise = noise_rms(spectrum)
+            off = self.off_calibration(spectrum, focal_length_mm, predicted, measured, carriers_from)
         if views:
             clips = self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
             made = self.views(
@@ -254,6 +257,9 @@ class MaskDecoder:
             )
         else:
             made = MadeViews(*no_views(slices.values.shape[1:]))
+        place = made.moved or self._moved(slices, lattice, focal_length_mm)
+        if off is not None:  # by the carriers themselves: beyond what a search by parallax reaches
+            place = (off, *(one for one in place if one.code is not Code.MASK_TURNED))
         report = DecodeReport(
             tuple(predicted),
             tuple(measured),
@@ -261,7 +267,7 @@ class MaskDecoder:
             carriers_from,
             made.source,
             noise,
-            (*(made.moved or self._moved(slices, lattice, focal_length_mm)), *made.findings),
+            (*place, *made.findings),
         )
         facts: dict[str, Any] = {
             "law": self.optics.law,
@@ -326,6 +332,26 @@ class MaskDecoder:
             return lattice, kept, "predicted"
         at_own = measure(spectrum, own.carriers([(c.ky, c.kx) for c in predicted]), 2.0)
         return own, at_own, "measured"
+
+    def off_calibration(
+        self,
+        spectrum: Spectrum,
+        focal_length_mm: float,
+        predicted: Sequence[Carrier],
+        measured: Sequence[Measured | None],
+        carriers_from: CarriersFrom,
+    ) -> Finding | None:
+        """That carriers, each too weak to overrule the calibration, together contradict it; None where they don't."""
+        if carriers_from != "calibrated" or self.calibration is None:
+            return None
+        longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers([(c.ky, c.kx) for c in predicted])
+        return off_calibration(
+            spectrum,
+            predicted,
+            measured,
+            lattice_bins=self.calibration.nearest(focal_length_mm).residual_bins,
+            off_sigma=abs(stretch(longer, predicted)),
+        )
 
     def radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
         """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""
