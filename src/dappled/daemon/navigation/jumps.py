@@ -89,10 +89,14 @@ class ReceiverTrack:
     """Whether the receiver has jumped, by the estimator's velocities, and whether the estimator is where it is."""
 
     def __init__(self) -> None:
-        self._finder = JumpFinder()
+        self._finder, self._compared = JumpFinder(), -1
 
     def confirms(self, heard: GnssSample, estimate: PositionSample, first: int) -> bool:
-        """Take the receiver's place with a fix. Whether it has not jumped, and the last position is there as well."""
+        """Take the receiver's place with a fix, once for each position. Whether it has not jumped, and the last
+        position is there as well."""
+        if estimate.number == self._compared:
+            return False
+        self._compared = estimate.number
         latitude_rad, longitude_rad, altitude_m = heard.place
         there = replace(
             estimate,
