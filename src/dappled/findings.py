@@ -229,6 +229,7 @@ class Code(StrEnum):
     LOG_BYTES_SKIPPED = "log.bytes_skipped"
     LOG_CORE = "log.core"
     LOG_CUT_SHORT = "log.cut_short"
+    LOG_FRAMES_UNPLACED = "log.frames_unplaced"
     LOG_NO_TRIGGER = "log.no_trigger"
     LOG_RECEIVER_BETTER = "log.receiver_better"
     LOG_RECEIVER_USED = "log.receiver_used"

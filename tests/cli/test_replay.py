@@ -1,10 +1,13 @@
-"""What `dappled replay` refuses before it reads a frame."""
+"""What `dappled replay` refuses before it reads a frame, and how it ends when its reader has gone."""
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from dappled.cli import main
 from dappled.clock import RecordedClock
@@ -30,3 +33,19 @@ def test_what_is_for_folders_is_refused_for_a_flight(
     usage, sentence = capsys.readouterr().err.splitlines()
     assert usage.startswith("usage: dappled replay ")
     assert sentence.startswith(f"dappled replay: {words[-2]} is for a folder of frames: ")
+
+
+@pytest.mark.parametrize("pace", ["max", "1000"])
+def test_it_ends_when_its_reader_has_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], pace: str
+) -> None:
+    """The lines are printed in a thread of the pipeline. Standard error would say that a shot did not end."""
+    for name in ("1.jpg", "2.jpg"):
+        Image.new("RGB", (16, 16)).save(tmp_path / name)
+    read, write = os.pipe()
+    os.close(read)
+    with os.fdopen(write, "w", encoding="utf-8") as gone:
+        monkeypatch.setattr(sys, "stdout", gone)
+        assert main(["replay", str(tmp_path), "--rate", pace]) == 1
+        monkeypatch.undo()
+    assert capsys.readouterr().err == ""

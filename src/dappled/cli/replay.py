@@ -247,7 +247,6 @@ class PrintedProgress(ReplayProgress):
         super().__init__()
         self._output = output
 
-    def finished(self, pending: PendingShot) -> None:
-        """Nothing more is expected of a shot."""
+    def tell(self, pending: PendingShot) -> None:
+        """Print the line of a shot that has ended."""
         self._output.row(frame_values(pending), frame_line(pending))
-        super().finished(pending)

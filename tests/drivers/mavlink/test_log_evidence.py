@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +14,7 @@ from PIL import Image
 
 from dappled.cli import main
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
-from dappled.drivers.mavlink import dataflash, ulog
+from dappled.drivers.mavlink import PacketParser, dataflash, mavlink, pack, ulog
 from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds
 from dappled.findings import Code, Finding, Level, text
 from dappled.flight.log_reading import split
@@ -158,6 +159,26 @@ def test_the_receiver_that_has_a_fix_counts(tmp_path: Path, first: tuple[int, ..
         assert same_fix(here, there)
 
 
+@pytest.mark.parametrize("turn", [20, 40])
+def test_receivers_that_have_a_fix_in_turn_count_in_turn(tmp_path: Path, turn: int) -> None:
+    log, link = written(tmp_path)
+    count = 0
+
+    def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+        nonlocal count
+        if kind == "GPA":
+            return [(kind, row), (kind, (row[0], 1, *row[2:]))]
+        if kind != "GPS":
+            return [(kind, row)]
+        count += 1
+        dead = (1, 0, 0, *row[5:7], 0, 0, 0)
+        first, second = (row[2:], dead) if count < turn else (dead, row[2:])
+        return [(kind, (row[0], 0, *first)), (kind, (row[0], 1, *second))]
+
+    found_in(rewritten(log, change))
+    assert all(same_fix(here, there) for here, there in zip(poses(log), poses(link), strict=True))
+
+
 def test_of_two_receivers_with_a_fix_the_one_in_use_counts(tmp_path: Path) -> None:
     log, link = written(tmp_path)
     rewritten(log, with_receivers((6, 2445), (6, 2445), 1), "U")
@@ -252,6 +273,63 @@ def test_a_log_that_was_cut_short_is_in_doubt_where_frames_need_the_rest(
     assert main([*call, "--anyway"]) == 0
 
 
+@pytest.mark.parametrize(
+    ("change", "start_s", "interval_s", "said"),
+    [
+        (lambda kind, row: [(kind, (*row[:4], NAN) if kind == "XKF1" else row)], 1.0, 3, "2 frames got no position"),
+        (lambda kind, row: [(kind, row)], 3600.0, 3, "2 frames got no position"),
+        (lambda kind, row: [(kind, row)], 4.5, 60, "1 frame got no position"),
+        (lambda kind, row: [(kind, row)], 1.0, 3, ""),
+    ],
+)
+def test_frames_that_a_log_gives_no_position_are_in_doubt(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Change, start_s: float, *, interval_s: int, said: str
+) -> None:
+    log = rewritten(written(tmp_path)[0], change)
+    (tmp_path / "frames").mkdir()
+    for name in ("1.jpg", "2.jpg"):
+        Image.new("RGB", (16, 16)).save(tmp_path / "frames" / name)
+    start = datetime.fromtimestamp(UTC_US / 1e6 + start_s, UTC).isoformat()
+    call = ["replay", str(tmp_path / "frames"), "--telemetry", str(log), "--start", start]
+    assert main([*call, "--interval", str(interval_s)]) == bool(said)
+    assert said in (shown := capsys.readouterr().err)
+    assert ("in doubt" in shown) == bool(said)
+
+
+@pytest.mark.parametrize("form", ["bin", "tlog"])
+def test_a_position_that_contradicts_its_velocity_is_told_beside_the_frames_near_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], form: str
+) -> None:
+    """One position is 40 m off: less than a vehicle may have moved since the one before."""
+    log, link = written(tmp_path)
+    if form == "bin":
+        count = 0
+
+        def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
+            nonlocal count
+            count += kind == "POS"
+            return [(kind, (row[0], row[1] + 3600 * (count == 13), *row[2:]) if kind == "POS" else row)]
+
+        rewritten(log, change)
+    else:
+        parts, count, log = [], 0, link
+        for stamp_us, raw in split(link.read_bytes()):
+            message = PacketParser()(raw)
+            if message is not None and message.get_type() == "GLOBAL_POSITION_INT":
+                count += 1
+                message.lat += 3600 * (count == 13)
+                packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+                parts.append(struct.pack(">Q", stamp_us) + pack(message, packer, version_1=False))
+            else:
+                parts.append(struct.pack(">Q", stamp_us) + raw)
+        link.write_bytes(b"".join(parts))
+    (tmp_path / "frames").mkdir()
+    Image.new("RGB", (16, 16)).save(tmp_path / "frames" / "1.jpg")
+    start = datetime.fromtimestamp(UTC_US / 1e6 + 1.25, UTC).isoformat()
+    assert main(["replay", str(tmp_path / "frames"), "--telemetry", str(log), "--start", start]) == 1
+    assert "jumped by" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("start_s", "code"), [(1.0, 0), (2.5, 1)])
 def test_a_hole_in_a_tlog_is_in_doubt_where_a_frame_lies_in_it(tmp_path: Path, start_s: float, code: int) -> None:
     _, link = written(tmp_path)
@@ -268,16 +346,17 @@ def test_a_hole_in_a_tlog_is_in_doubt_where_a_frame_lies_in_it(tmp_path: Path, s
 
 
 def test_the_leap_seconds_are_those_of_the_flight(tmp_path: Path) -> None:
-    """16 in May 2015, 17 a year later."""
+    """16 in May 2015, 17 a year later; and on the day that the leap second came, in the middle of a week of GPS."""
 
-    def in_week(week: int) -> int:
+    def in_week(week: int, later_ms: int = 0) -> int:
         def change(kind: str, row: Row) -> Iterable[tuple[str, Row]]:
-            return [(kind, (*row[:4], week, *row[5:]) if kind == "GPS" else row)]
+            return [(kind, (*row[:3], row[3] - later_ms, week, *row[5:]) if kind == "GPS" else row)]
 
         packets = dataflash.packets(rewritten(written(tmp_path)[0], change))
         return next(stamp_us for _, stamp_us, _ in packets) // 10**6
 
     assert (in_week(1894) - in_week(1844)) % (7 * 86400) == 7 * 86400 - 1
+    assert in_week(1851) - in_week(1851, 5 * 86_400_000) == 5 * 86400 - 1  # Saturday and Monday, July 2015
 
 
 UNIX_US = 1_790_000_000 * 10**6

@@ -44,6 +44,7 @@ from dappled.flight.records import DOUBT
 _DATED = 8  # frames whose own time is asked
 _ZONES_S = 900  # time zones are whole quarters of an hour apart
 _AGREES_S = 2.5  # two times of a picture, of which EXIF's has whole seconds
+_FAR_M = 10.0  # a receiver alone jumps by less
 FRAME_SUFFIXES = (".raf", ".cr2", ".dng", ".tif", ".tiff", ".png", ".npy", ".nef", ".arw", ".jpg", ".jpeg")
 
 
@@ -277,6 +278,8 @@ class RecordedTelemetry:
         self._packets = packets(path, self._found, bounds) if path else iter(())
         self._fed = self._last_ns = 0
         self._gaps: list[_Gap] = []
+        self._of_folder = bounds is not None
+        self._unplaced, self._jump_m = 0, 0.0
 
     @classmethod
     def flown(
@@ -324,7 +327,11 @@ class RecordedTelemetry:
         for gap in self._gaps:
             within = gap.after_ns is not None and gap.after_ns < exposure.utc_ns
             gap.frames += within and (gap.before_ns is None or exposure.utc_ns < gap.before_ns)
-        return self._telemetry.locate(exposure, upto_packet=horizon)
+        time, pose = self._telemetry.locate(exposure, upto_packet=horizon)
+        self._unplaced += pose.latitude_rad is None
+        jumps = [float(one.facts["by_m"] or 0) for one in self._telemetry.doubts() if one.code is Code.POSITION_JUMPED]
+        self._jump_m = max([self._jump_m, *jumps])
+        return time, pose
 
     def rates(self, pose: Pose) -> Vector3 | None:
         """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
@@ -333,10 +340,15 @@ class RecordedTelemetry:
     def findings(self) -> list[Finding]:
         """What is to be said of what was fed, and of what is missing in the log."""
         gaps = sorted((gap.finding() for gap in self._gaps), key=lambda one: -one.level)
-        if not (count := self._telemetry.statistics().impossible):
-            return gaps
-        subject = Subject("log", str(self._path))
-        return [*gaps, finding(Code.LOG_VALUES_MISSING, subject, values=f"{count} of its messages")]
+        count, subject = self._telemetry.statistics().impossible, Subject("log", str(self._path))
+        if count:
+            gaps.append(finding(Code.LOG_VALUES_MISSING, subject, values=f"{count} of its messages"))
+        if self._of_folder and self._path and self._unplaced:  # of a flight these are told beside each frame
+            gaps.append(finding(Code.LOG_FRAMES_UNPLACED, subject, frames=self._unplaced))
+        if self._of_folder and self._jump_m:
+            level = Level.CAUTION if self._jump_m > _FAR_M else Level.NOTE
+            gaps.append(finding(Code.POSITION_JUMPED, subject, level, by_m=self._jump_m))
+        return gaps
 
     def _found(self, one: Finding) -> None:
         """Report what was found in the log; of a gap the frames decide how much it weighs."""
@@ -352,14 +364,33 @@ class ReplayProgress(Observer):
     """Counts the shots of a replay that have come to their end: frames, and frames with a problem."""
 
     def __init__(self) -> None:
-        self.ended = threading.Semaphore(0)
+        self._ended = threading.Semaphore(0)
+        self._untold: OSError | None = None
         self.frames = self.bad = 0
+
+    def tell(self, pending: PendingShot) -> None:
+        """Tell of a shot that has ended. May raise OSError, which ends the replay."""
 
     def finished(self, pending: PendingShot) -> None:
         """Nothing more is expected of a shot."""
+        try:
+            self.tell(pending)
+        except OSError as error:  # whom it is told has gone
+            self._untold = error
         self.frames += pending.frame is not None
         self.bad += bool(pending.problem) and pending.frame is not None
-        self.ended.release()
+        self._ended.release()
+
+    def await_end(self, shot: Shot, timeout_s: float) -> None:
+        """Wait until one more shot has ended. Raises DappledError where none does, and what `tell` raised."""
+        if not self._ended.acquire(timeout=timeout_s):
+            raise DappledError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+        self.check()
+
+    def check(self) -> None:
+        """Raise what `tell` raised."""
+        if self._untold is not None:
+            raise self._untold
 
 
 Pace = Callable[[Shot, Shot | None], None]  # waits between the shot before (None for the first) and this one
@@ -397,13 +428,13 @@ def play(
             pace(shot, before)
         time.advance_to(shot.wished_utc_ns)
         shots.fire(shot)
-        if pace is None and not progress.ended.acquire(timeout=timeout_s):
-            raise DappledError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+        if pace is None:
+            progress.await_end(shot, timeout_s)
+        progress.check()
         before = shot
     if pace:
         for shot in recording.shots:
-            if not progress.ended.acquire(timeout=timeout_s):
-                raise DappledError(f"shot {shot.index} did not come to an end within {timeout_s:g} s")
+            progress.await_end(shot, timeout_s)
 
 
 def verifier(recording: RecordedFlight, keep: ResultWriter | None = None) -> ReplayVerifier:

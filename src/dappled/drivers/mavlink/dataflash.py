@@ -34,7 +34,8 @@ from dappled.findings import Code, Finding, Subject, finding
 _USED = ["POS", "ATT", "GPS", "GPA", "XKF1", "NKF1", "XKF4", "NKF4"]
 _OF_CAMERAS = ["CAM", "TRIG"]
 _GPS_EPOCH_US = 315_964_800 * 10**6
-_WEEK_US = 7 * 86400 * 10**6
+_DAY_US = 86400 * 10**6
+_WEEK_US = 7 * _DAY_US
 _MOST_WEEKS = 2**16
 _CORES_AGREE_M_S = 0.5
 _METRES_PER_DEG = 111_195.0
@@ -134,7 +135,7 @@ def _clock(
         clock, doubts = log_evidence.utc_clock(path, counting, receivers, bounds)
     except AutopilotLogError as error:
         raise DataFlashError(str(error)) from None
-    return clock, counting, [*told, *doubts]
+    return clock, log_evidence.in_turn(counting, receivers), [*told, *doubts]
 
 
 def _receivers(rows: dict[str, list[Any]]) -> Iterator[Receiver]:
@@ -155,8 +156,9 @@ def _receivers(rows: dict[str, list[Any]]) -> Iterator[Receiver]:
         sound = (weeks > 0) & (weeks < _MOST_WEEKS) & (ms >= 0) & (ms < _WEEK_US / 1000)
         whole_weeks = np.where(sound, weeks, 0).astype(np.int64)
         gps_us = whole_weeks * _WEEK_US + np.where(sound, ms, 0).astype(np.int64) * 1000
-        of_week = {week: _leaps_us(week) for week in set(whole_weeks.tolist())}
-        leap_us, later_us = np.array([of_week[week] for week in whole_weeks.tolist()], np.int64).reshape(-1, 2).T
+        days = (gps_us // _DAY_US).tolist()
+        of_day = {day: _leaps_us(day) for day in set(days)}
+        leap_us, later_us = np.array([of_day[day] for day in days], np.int64).reshape(-1, 2).T
         yield Receiver(
             number + 1,
             at,
@@ -174,11 +176,11 @@ def _receivers(rows: dict[str, list[Any]]) -> Iterator[Receiver]:
         )
 
 
-def _leaps_us(week: int) -> tuple[int, int]:
-    """By how much GPS time is ahead of UTC in a week, and how much later in UTC the date is that its missing roll-overs
-    give."""
-    gps = GPS_EPOCH + timedelta(weeks=week)
-    later = gps + 1024 * rollovers((_GPS_EPOCH_US + week * _WEEK_US) * 1000) * timedelta(weeks=1)
+def _leaps_us(day: int) -> tuple[int, int]:
+    """By how much GPS time is ahead of UTC on a day of it, and how much later in UTC the date is that its missing
+    roll-overs give."""
+    gps = GPS_EPOCH + timedelta(days=day)
+    later = gps + 1024 * rollovers((_GPS_EPOCH_US + day * _DAY_US) * 1000) * timedelta(weeks=1)
     leap_us, later_leap_us = (round((one - gps_to_utc(one)).total_seconds()) * 10**6 for one in (gps, later))
     return leap_us, (later - gps) // timedelta(microseconds=1) - (later_leap_us - leap_us)
 

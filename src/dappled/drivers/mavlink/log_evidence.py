@@ -197,6 +197,32 @@ def chosen(path: Path, receivers: Sequence[Receiver]) -> tuple[list[tuple[Receiv
     return [(best, np.ones(len(best.boots_us), dtype=bool))], told if best.number > 1 else []
 
 
+def in_turn(counting: list[tuple[Receiver, Chosen]], others: Sequence[Receiver]) -> list[tuple[Receiver, Chosen]]:
+    """The messages that count, and where a log doesn't say which receiver was used, those with a fix of the next best
+    one where all before it had none for two of the best one's messages."""
+    if not counting or counting[0][0].used is not None:
+        return counting
+    best, which = counting[0]
+    gap_us = 2 * int(np.median(np.diff(best.boots_us))) if len(best.boots_us) > 1 else _GAP_US
+    found, known_us = [], best.boots_us[best.fixed]
+    for one in sorted((one for one in others if one is not best), key=Receiver._rank, reverse=True):
+        instead = one.fixed & (_away_us(one.boots_us, known_us) > gap_us)
+        if instead.any():
+            found.append((one, instead))
+            known_us = np.concatenate([known_us, one.boots_us[instead]])
+    by_others_us = np.concatenate([one.boots_us[instead] for one, instead in found] or [known_us[:0]])
+    replaced = ~best.fixed & (_away_us(best.boots_us, by_others_us) <= gap_us)
+    return [(best, which & ~replaced), *found]
+
+
+def _away_us(times_us: NDArray[np.int64], others_us: NDArray[np.int64]) -> NDArray[np.int64]:
+    """How far the nearest of some other times is from each (n,)."""
+    known_us = np.concatenate([[-(2**62)], np.sort(others_us), [2**62]])
+    after = np.searchsorted(known_us, times_us)
+    nearest: NDArray[np.int64] = np.minimum(times_us - known_us[after - 1], known_us[after] - times_us)
+    return nearest
+
+
 def utc_clock(
     path: Path, ranked: Sequence[tuple[Receiver, Chosen]], others: Sequence[Receiver], bounds: UtcBounds | None
 ) -> tuple[LogClock, list[Finding]]:

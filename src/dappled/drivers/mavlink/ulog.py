@@ -200,7 +200,7 @@ def _clock(
         clock, doubts = log_evidence.utc_clock(path, counting, [*merged, *own], bounds)
     except AutopilotLogError as error:
         raise AutopilotLogError(str(error)) from None
-    return clock, counting, [*told, *doubts]
+    return clock, log_evidence.in_turn(counting, own), [*told, *doubts]
 
 
 def _receiver(path: Path, log: _Topics, number: int, topic: Columns) -> Receiver:
