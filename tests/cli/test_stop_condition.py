@@ -12,11 +12,12 @@ from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.flight import Frame
 from tests.flight.makers import shot
+from tests.standing import failure
 
 
 def ended(index: int, problem: str = "") -> PendingShot:
     frame = None if problem else Frame(index, f"frames/{index:06d}.cr2", "IMG_0001.CR2", 10, "0" * 64, 5)
-    return PendingShot(shot(index), frame=frame, problem=problem)
+    return PendingShot(shot(index), frame=frame, problem=failure(problem) if problem else None)
 
 
 @dataclass

@@ -22,6 +22,7 @@ from dappled.findings import Code, Finding, Subject, finding
 from tests.daemon.health.test_metrics import HEALTH
 from tests.daemon.health.test_systemd import read
 from tests.flight.makers import shot
+from tests.standing import failure
 
 
 def test_a_line_for_each_frame(capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,7 +119,7 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
         root.setLevel(logging.INFO)
         try:
             frames = FrameLines()
-            frames.finished(PendingShot(shot(42), problem="it hangs"))
+            frames.finished(PendingShot(shot(42), problem=failure("it hangs")))
             CameraRemarks().changed(StateChanged("ready", "", 0))
             frames.close()
             told = {entry["MESSAGE"]: entry for entry in (read(listener.recv(10_000)), read(listener.recv(10_000)))}
@@ -127,7 +128,7 @@ def test_in_the_journal_a_frame_can_be_asked_for(tmp_path: Path, capsys: pytest.
             root.setLevel(before)
             handler.close()
     assert capsys.readouterr() == ("", "")
-    frame = told[frame_line(PendingShot(shot(42), problem="it hangs"))]
+    frame = told[frame_line(PendingShot(shot(42), problem=failure("it hangs")))]
     asked = {name: frame[f"DAPPLED_{name}"] for name in ("FRAME", "STATE", "PROBLEM")}
     assert asked == {"FRAME": "42", "STATE": "failed", "PROBLEM": "it hangs"}
     assert frame["PRIORITY"] == "4"

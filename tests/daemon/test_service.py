@@ -38,7 +38,7 @@ from dappled.flight.checks import flight_check
 from tests.daemon.camera_protocol.rig import Peer
 from tests.daemon.fakes import CallingObserver, FakeCamera, good
 from tests.daemon.test_settings_check import MASK, calibration
-from tests.standing import codes, problems
+from tests.standing import codes, problems, words
 from tests.waiting import eventually
 
 S = 10**9
@@ -434,7 +434,7 @@ def test_frames_that_do_not_decode_are_a_caution_then_no_go_and_are_recorded(
     ):  # the fake camera's files are no pictures
         assert service.request(CaptureRequest("test", "console", index)).accepted
         eventually(lambda: len(shots) == index + 1, "the shot's end")  # noqa: B023  # called before the next turn
-        assert shots[-1].problem.startswith("not decoded")
+        assert words(shots[-1].problem).startswith("not decoded")
         assert f"decode.{state}" in decoding(service)
     assert any(text.startswith("decoding fails: the last 4 frames") for text in problems(service.health()))
     service.stop()

@@ -49,6 +49,7 @@ IN_NAMESPACE = """
 import json, os, subprocess, sys
 from pathlib import Path
 from dappled.clock import RecordedClock
+from dappled.findings import text
 from dappled.flight import recording
 from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
@@ -66,7 +67,7 @@ def shoot(index, size=2_500_000):
         told.append(str(error))
 {fault}
 frames = sorted(os.listdir(flight.folder.frames))
-rows = {{row.shot.index: [row.state, row.reason] for row in flight.ledger.shots()}}
+rows = {{row.shot.index: [row.state, row.reason and text(row.reason)] for row in flight.ledger.shots()}}
 flight.close()
 print(json.dumps({{"told": told, "safe": safe, "frames": frames, "rows": rows,
                   "problems": [str(one) for one in check(flight.folder.path).problems]}}))

@@ -12,6 +12,7 @@ from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import FlightFolder, Recording, Result, flight_report
 from dappled.flight.flight_report import SourceReport, by_source
 from tests.flight.makers import deliver, request, tag
+from tests.standing import failure
 
 
 @pytest.fixture
@@ -22,7 +23,7 @@ def recorded(flight: Recording) -> FlightFolder:
     for index in range(2):
         flight.ledger.add_tag(tag(deliver(flight, index, bytes(1000))))
     flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
-    flight.ledger.failed(2, "no file came")
+    flight.ledger.failed(2, failure("no file came"))
     flight.close()
     return flight.folder
 

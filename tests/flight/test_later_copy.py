@@ -34,6 +34,7 @@ from dappled.flight.seal_key import SealKey
 from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, mavlink_2, request, words_of
+from tests.standing import failure
 
 CLOCK = RecordedClock(START_UTC_NS)
 
@@ -48,7 +49,7 @@ def closed(flight: Recording) -> Path:
         request(flight, index)
     for index in range(2):
         deliver(flight, index, b"raw %d" % index * 1000)
-    flight.ledger.follows(2, "its file stays at the camera")
+    flight.ledger.follows(2, failure("its file stays at the camera"))
     flight.telemetry.append(1, mavlink_2(b"a"))
     flight.close()
     return flight.folder.path

@@ -19,6 +19,7 @@ from dappled.flight.ledger import advance
 from dappled.flight.stored_rows import ledger_damage
 from dappled.flight.tables import TRANSITIONS
 from tests.flight.makers import shot, tag
+from tests.standing import STRAY, failure
 
 
 def ledger_at(path: Path) -> Ledger:
@@ -32,13 +33,13 @@ def frame(index: int) -> Frame:
 def test_everything_comes_back_as_it_was_noted(tmp_path: Path) -> None:
     path = tmp_path / "flight.sqlite"
     result = Result(4, "cd" * 32, 12, 13, "geometric", "predicted", 81.5, details={"rms": 0.25})
-    stray = Stray("frames/stray-000000.jpg", "A.JPG", 2, "ef" * 32, 6, "one too many")
+    stray = Stray("frames/stray-000000.jpg", "A.JPG", 2, "ef" * 32, 6, STRAY)
     with ledger_at(path) as ledger:
         ledger.add_shot(shot(4, sequence=None))
         ledger.add_shot(shot(5))
         ledger.fired(4, 10, 20)
         ledger.safe(frame(4))
-        ledger.failed(5, "no file came")
+        ledger.failed(5, failure("no file came"))
         ledger.add_tag(tag(frame(4)))
         ledger.add_result(result)
         ledger.add_result(replace(result, run="again"))
@@ -49,7 +50,7 @@ def test_everything_comes_back_as_it_was_noted(tmp_path: Path) -> None:
     with LedgerReader.open(path) as reader:
         assert reader.shots() == [
             ShotRow(shot(4, sequence=None), "safe", None, 10, 20),
-            ShotRow(shot(5), "failed", "no file came", None, None),
+            ShotRow(shot(5), "failed", failure("no file came"), None, None),
         ]
         assert reader.shot(6) is None
         assert reader.frames() == [frame(4)]
@@ -128,7 +129,7 @@ def test_two_frames_or_rows_for_one_shot_are_refused(tmp_path: Path) -> None:
 def test_a_late_file_makes_a_failed_shot_safe(tmp_path: Path) -> None:
     with ledger_at(tmp_path / "flight.sqlite") as ledger:
         ledger.add_shot(shot(1))
-        ledger.failed(1, "no file came")
+        ledger.failed(1, failure("no file came"))
         ledger.safe(frame(1))
         row = ledger.shot(1)
         assert row is not None
@@ -266,7 +267,7 @@ class LedgerAgainstModel(RuleBasedStateMachine):
             elif new == "safe":
                 self.ledger.safe(frame(index))
             else:
-                self.ledger.failed(index, "why")
+                self.ledger.failed(index, failure("why"))
 
         if index in self.model and new in TRANSITIONS[self.model[index]]:
             move()

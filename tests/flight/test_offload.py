@@ -42,6 +42,7 @@ from dappled.flight.checks.flight_check import check
 from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, held, mavlink_2, request, words_of
+from tests.standing import STRAY
 
 pytestmark = pytest.mark.usefixtures("on_ext4")
 
@@ -198,7 +199,7 @@ def test_a_frame_that_came_after_the_copy_is_copied_before_it_is_pruned(closed: 
     go(closed, tmp_path / "disk")
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger, held(b"late" * 99) as blob:
         recorder = recording.Recorder(layout.open_folder(closed), ledger)
-        stray = recorder.record_stray("LATE.CR2", blob, "it came late", arrived_utc_ns=1)
+        stray = recorder.record_stray("LATE.CR2", blob, STRAY, arrived_utc_ns=1)
     done = go(closed, tmp_path / "disk", prune=True)
     assert done.pruned == 3
     assert (done.destination / stray.name).read_bytes() == b"late" * 99
@@ -215,7 +216,7 @@ def test_a_frame_that_comes_between_copy_and_prune_stays(
     def meanwhile(path: Path) -> object:
         (closed / "frames" / "stray-000000.cr2").write_bytes(b"late")
         with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
-            ledger.add_stray(Stray("frames/stray-000000.cr2", "LATE.CR2", 4, "ab", 1, "it came late"))
+            ledger.add_stray(Stray("frames/stray-000000.cr2", "LATE.CR2", 4, "ab", 1, STRAY))
         return whole(path)
 
     monkeypatch.setattr(checks, "check", meanwhile)
@@ -342,7 +343,7 @@ def test_a_stray_outside_the_flight_is_not_removed(closed: Path, tmp_path: Path)
     victim = closed.parent / "victim.txt"
     victim.write_bytes(b"somebody else's file")
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
-        ledger.add_stray(Stray("../victim.txt", "A.CR2", 20, durable.hash_file(victim), 1, "a stray"))
+        ledger.add_stray(Stray("../victim.txt", "A.CR2", 20, durable.hash_file(victim), 1, STRAY))
     with pytest.raises(OutsideError, match=r"names '../victim.txt', which does not stay inside"):
         go(closed, tmp_path / "disk", prune=True)
     assert not (tmp_path / "disk").exists()
@@ -353,7 +354,7 @@ def test_a_stray_outside_the_flight_is_not_removed(closed: Path, tmp_path: Path)
 def test_only_frames_are_removed_whatever_the_ledger_calls_a_stray(closed: Path, tmp_path: Path) -> None:
     journal = closed / "shots.jsonl"
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
-        stray = Stray("shots.jsonl", "A.CR2", journal.stat().st_size, durable.hash_file(journal), 1, "a stray")
+        stray = Stray("shots.jsonl", "A.CR2", journal.stat().st_size, durable.hash_file(journal), 1, STRAY)
         ledger.add_stray(stray)
     assert go(closed, tmp_path / "disk", prune=True).pruned == 2
     assert journal.exists()

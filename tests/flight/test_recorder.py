@@ -19,6 +19,7 @@ from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, 
 from dappled.flight.checks.flight_check import check
 from dappled.flight.recording import StrayFileError
 from tests.flight.makers import deliver, held, request
+from tests.standing import words
 
 DATA = b"raw bytes" * 1000
 
@@ -68,7 +69,7 @@ def test_the_same_file_twice_is_one_frame(flight: Recording) -> None:
 def test_a_second_file_for_a_shot_is_kept_as_a_stray(flight: Recording) -> None:
     request(flight, 0)
     first = deliver(flight, 0, DATA)
-    with pytest.raises(StrayFileError, match=r"IMG_0001.JPG is a second file for shot 0") as told:
+    with pytest.raises(StrayFileError, match=r"IMG_0001.JPG: it is a second file for shot 0") as told:
         deliver(flight, 0, b"jpeg", "IMG_0001.JPG")
     assert told.value.stray.name == "frames/stray-000000.jpg"
     with pytest.raises(StrayFileError):
@@ -116,7 +117,7 @@ def test_a_disk_fault_fails_the_shot_and_leaves_no_file(
     assert files(flight) == []
     row = flight.ledger.shot(0)
     assert row is not None
-    assert (row.state, row.reason) == ("failed", str(told.value))
+    assert (row.state, words(row.reason)) == ("failed", str(told.value))
     assert deliver(flight, 0, DATA).name == "frames/000000.cr2"  # the disk is well again and the file comes once more
 
 

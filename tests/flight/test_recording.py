@@ -89,8 +89,8 @@ def test_closing_fails_what_is_open(flight: Recording) -> None:
     flight.journal.note(shot(1))
     assert flight.close() == [
         "shot 1 was noted in the journal only; it is in the ledger now",
-        "shot 0 was fired, and is lost: the recording ended before its file came",
-        "shot 1 was wished, and is lost: the recording ended before its file came",
+        "shot 0: it was fired, and is lost: the recording ended before its file came",
+        "shot 1: it was wished, and is lost: the recording ended before its file came",
     ]
     assert check(flight.folder.path).problems == ()
 
@@ -119,9 +119,9 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
         "the last line of",
         "shot 3 was noted in the journal only",
         "frames/000001.cr2 was complete but had no row; it is adopted as the frame of shot 1",
-        "frames/000007.cr2 belongs to no shot",
-        "shot 2 was fired, and is lost",
-        "shot 3 was wished, and is lost",
+        "file frames/000007.cr2: it belongs to no shot",
+        "shot 2: it was fired, and is lost",
+        "shot 3: it was wished, and is lost",
         "18 bytes at the end are not telemetry",
         "it was not closed; it is now",
     ):

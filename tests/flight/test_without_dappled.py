@@ -19,6 +19,7 @@ from dappled.flight import LedgerReader, Tag, recording
 from dappled.flight.tables import SCHEMA
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import deliver, flip, pose, request, tag
+from tests.standing import failure
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "flight-data.md"
 
@@ -32,7 +33,7 @@ def flight(flights: Path) -> Path:
     known = tag(deliver(begun, 0, b"raw 0"))
     begun.ledger.add_tag(replace(known, utc_ns=START_UTC_NS, pose=replace(pose(), position_sigma_m=0.8)))
     deliver(begun, 1, b"raw 1")
-    begun.ledger.failed(2, "the camera was gone")
+    begun.ledger.failed(2, failure("the camera was gone"))
     begun.close()
     return begun.folder.path
 
@@ -51,7 +52,7 @@ def test_the_reader_in_the_document_reads_a_flight(flight: Path) -> None:
         "     0 frames/000000.cr2 intact 2026-11-21T10:15:03+00:00 41.6311134 -91.5414669 215.1 m ± 0.80 m"
     )
     assert second == "     1 frames/000001.cr2 intact"
-    assert third == "     2 failed: the camera was gone"
+    assert third == "     2 failed: shot.failed {'reason': 'the camera was gone'}"
     flip(flight / "frames" / "000001.cr2", 2)
     assert read(flight)[1].endswith("CHANGED")
 

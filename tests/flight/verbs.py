@@ -27,6 +27,7 @@ from dappled.flight.checks.flight_check import check
 from dappled.products.geotags import geotags
 from dappled.products.mounting import Mounting
 from tests.flight.makers import deliver, mavlink_2, request, shot, tag, words_of
+from tests.standing import failure
 
 START_UTC_NS = 1_795_256_103_000_000_000
 FRAME_BYTES = 20_000
@@ -141,7 +142,7 @@ def _to_pick_up(place: Path) -> None:
         if index < 2:
             flight.ledger.add_tag(tag(deliver(flight, index, bytes([index + 1]) * FRAME_BYTES)))
         else:
-            flight.ledger.follows(index, "its file stays at the camera")
+            flight.ledger.follows(index, failure("its file stays at the camera"))
     flight.close()
     (place / "card").mkdir()
     for index in (2, 3):

@@ -24,7 +24,7 @@ from dappled.findings import Code, named
 from dappled.flight import LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.body.eos450d import thumbnail
-from tests.standing import codes
+from tests.standing import codes, words
 from tests.system.flying import Flying, flying, settings_of, told
 from tests.waiting import eventually
 
@@ -51,7 +51,7 @@ def daemon_before(here: Path, *bodies: SimulatedBody, **camera: Any) -> Iterator
     ports = ",".join(body.port for body in bodies)
     camera = {"port": ports, "file_timeout_s": 20, **camera}
     with flying(settings_of(here, camera=camera)) as daemon, never_still(daemon):
-        assert daemon.shoot().problem == ""
+        assert daemon.shoot().problem is None
         yield daemon
 
 
@@ -122,7 +122,7 @@ def back_in_service(daemon: Flying, body: SimulatedBody) -> None:
     """The body is ready again, and its next shot is its own."""
     eventually(lambda: daemon.camera == "ready", f"ready again: {daemon.problems}")
     pending = daemon.shoot()
-    assert pending.problem == ""
+    assert pending.problem is None
     assert pending.doubt is None
     is_frame(daemon, pending.shot.index, body.releases)
 
@@ -146,7 +146,7 @@ def test_unplugged_in_mid_exposure(here: Path) -> None:
         body.fault("unplug")
         eventually(lambda: daemon.camera == "absent", "the camera is absent")
         body.fault("clear")
-        assert ended(daemon, index).problem == ""  # its file lay on the card
+        assert ended(daemon, index).problem is None  # its file lay on the card
         is_frame(daemon, index, 2)
         back_in_service(daemon, body)
 
@@ -158,7 +158,7 @@ def test_unplugged_in_mid_download(here: Path) -> None:
         index = wished(daemon)
         eventually(lambda: daemon.camera == "absent", "the camera is absent")
         body.fault("clear")
-        assert ended(daemon, index).problem == ""
+        assert ended(daemon, index).problem is None
         is_frame(daemon, index, 2)
         back_in_service(daemon, body)
 
@@ -168,7 +168,7 @@ def test_unplugged_for_good(here: Path) -> None:
     with a_body() as body, daemon_before(here, body, file_timeout_s=2) as daemon:
         body.fault("unplug-transfer")
         index = wished(daemon)
-        assert "no file came" in ended(daemon, index).problem
+        assert "no file came" in words(ended(daemon, index).problem)
         body.fault("clear")
         is_frame(daemon, index, 2)  # it comes after all
         back_in_service(daemon, body)
@@ -192,7 +192,7 @@ def test_busy_for_10_s(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("busy 10")
         index = wished(daemon)
-        assert "busy" in ended(daemon, index).problem
+        assert "busy" in words(ended(daemon, index).problem)
         eventually(lambda: daemon.camera == "ready", "the camera takes shots")
         again = wished(daemon)
         assert ended(daemon, again).problem in ("", ended(daemon, index).problem)
@@ -205,7 +205,7 @@ def test_event_lost_though_the_file_is_on_the_card(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("no-event")
         index = wished(daemon)
-        assert ended(daemon, index).problem == ""
+        assert ended(daemon, index).problem is None
         is_frame(daemon, index, 2)
         back_in_service(daemon, body)
 
@@ -232,7 +232,7 @@ def test_the_body_comes_back_with_another_address(here: Path) -> None:
         index = wished(daemon)
         fired(daemon, index)
         body.ask("move")
-        assert ended(daemon, index).problem == ""
+        assert ended(daemon, index).problem is None
         is_frame(daemon, index, 2)
         back_in_service(daemon, body)
 
@@ -244,7 +244,7 @@ def test_crash_of_the_camera_process(here: Path) -> None:
         index = wished(daemon)
         fired(daemon, index)
         os.kill(process, signal.SIGKILL)
-        assert "process" in ended(daemon, index).problem
+        assert "process" in words(ended(daemon, index).problem)
         is_frame(daemon, index, 2)  # the next process brings it
         back_in_service(daemon, body)
 
@@ -253,7 +253,7 @@ def test_card_full(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("full")
         index = wished(daemon)
-        assert "card" in ended(daemon, index).problem
+        assert "card" in words(ended(daemon, index).problem)
         body.fault("clear")
         back_in_service(daemon, body)
 
@@ -282,10 +282,10 @@ def test_autofocus_fails(here: Path) -> None:
     with a_body() as body, daemon_before(here, body) as daemon:
         body.fault("no-focus")
         index = wished(daemon)
-        assert "focus" in ended(daemon, index).problem
+        assert "focus" in words(ended(daemon, index).problem)
         eventually(lambda: daemon.camera == "ready", "ready again")
         index = wished(daemon)
-        assert ended(daemon, index).problem == ""
+        assert ended(daemon, index).problem is None
         is_frame(daemon, index, 3)
 
 
@@ -347,7 +347,7 @@ def test_a_body_that_is_not_as_planned(here: Path) -> None:
                 eventually(partial(says, daemon, words), turned)
             body.ask("turn room 3")
             body.ask("turn battery 0")
-            assert daemon.shoot().problem == ""
+            assert daemon.shoot().problem is None
             low = {"body.card_filling", "body.battery_low"}
             eventually(lambda: low <= set(codes(daemon.service.health())), "what runs out")
         assert body.releases == 2

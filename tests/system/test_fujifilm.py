@@ -22,7 +22,7 @@ from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from dappled.mocks.simulation import free_port
 from dappled.testing import content, until_shot_ends, until_state
 from tests.simulated.finepix import FinePix
-from tests.standing import problems
+from tests.standing import problems, words
 from tests.system.flying import Flying, flying, settings_of
 from tests.waiting import eventually
 
@@ -199,7 +199,7 @@ def test_fired_by_the_autopilot_s_relay_and_the_ground_station_is_told(here: Pat
             link = daemon.service.health
             eventually(lambda: "nothing was heard" not in str(problems(link())), "the autopilot is heard")
             pending = daemon.shoot()
-            while "autopilot" in pending.problem:  # its heartbeat was not there yet
+            while "autopilot" in words(pending.problem):  # its heartbeat was not there yet
                 pending = daemon.shoot()
             assert pending.follows
             index = pending.shot.index

@@ -174,7 +174,7 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
                 assert peer.one("PARAM_EXT_ACK").param_result == mavlink.PARAM_ACK_ACCEPTED
                 pending = daemon.shoot()
                 assert (pending.decoded is not None) == decoded
-                assert pending.problem == ""
+                assert pending.problem is None
             eventually(lambda: "decoding: off" in "\n".join(told(daemon.service.folder)), "the event")
             folder = daemon.service.folder
     assert "not decoded: decoding was switched off" in told(folder)

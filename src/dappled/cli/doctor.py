@@ -184,7 +184,8 @@ def _shoot(
         for _ in output.each(range(count), "shot"):
             pending = daemon.shoot()
             if pending.frame is None:
-                why = pending.problem or pending.follows
+                ended = pending.problem or pending.follows
+                why = None if ended is None else text(ended)
                 judged = [finding(Code.SHOT_WITHOUT_FRAME, Subject("test shot"), why=why)]
                 break
             latencies.append(test_shot.latency(pending))

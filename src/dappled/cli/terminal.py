@@ -26,7 +26,7 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.stream import wire
 from dappled.drivers.camera import StateChanged
 from dappled.errors import counted
-from dappled.findings import told
+from dappled.findings import text, told
 from dappled.shown import say
 from dappled.workers import Loop, Worker
 
@@ -88,10 +88,11 @@ class FrameLines:
 
     def finished(self, one: PendingShot) -> None:
         """Print the line of a shot that has ended."""
-        fields = {"frame": one.shot.index, "state": "safe" if one.frame else "failed", "problem": one.problem}
+        fields: dict[str, Any] = {"frame": one.shot.index, "state": "safe" if one.frame else "failed"}
+        if one.problem:
+            fields["problem"] = text(one.problem)
         level = logging.WARNING if one.problem else logging.INFO
-        text = json.dumps(frame_values(one)) if self._as_json else frame_line(one)
-        self._lines.put(_Line(text, level, {name: value for name, value in fields.items() if value != ""}))
+        self._lines.put(_Line(json.dumps(frame_values(one)) if self._as_json else frame_line(one), level, fields))
 
     def close(self) -> None:
         """Print the waiting lines, for a second at most."""
@@ -239,9 +240,9 @@ def frame_line(pending: PendingShot) -> str:
     if times:
         words.append(f"ms: {times}")
     if pending.frame is None and pending.follows:
-        words.append(pending.follows)
+        words.append(text(pending.follows))
     if pending.problem:
-        words.append(f"PROBLEM: {pending.problem}")
+        words.append(f"PROBLEM: {text(pending.problem)}")
     return "  ".join(words)
 
 
@@ -257,6 +258,6 @@ def frame_values(pending: PendingShot) -> dict[str, Any]:
         "carriers_from": pending.decoded.carriers_from if pending.decoded else None,
         "slices_sha256": pending.decoded.sha256 if pending.decoded else None,
         "ms": {**pending.ms, "decoder": dict(pending.decoded.ms) if pending.decoded else {}},
-        "follows": pending.follows or None,
-        "problem": pending.problem or None,
+        "follows": codec.plain(pending.follows),
+        "problem": codec.plain(pending.problem),
     }

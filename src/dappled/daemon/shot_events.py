@@ -18,6 +18,7 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
+from dappled.findings import text
 from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
@@ -61,13 +62,14 @@ class ShotEvents(Observer):
         captured = captured_shot(pending, self._utc.utc_ns)
         if self._component.announce(captured):
             self._note_reported(captured.index)
-        if not captured.ok:
-            self._component.say(f"image {pending.shot.index} failed: {pending.problem}", mavlink.MAV_SEVERITY_ERROR)
+        if not captured.ok and pending.problem is not None:
+            words = f"image {pending.shot.index} failed: {text(pending.problem)}"
+            self._component.say(words, mavlink.MAV_SEVERITY_ERROR)
         zoomed = None if pending.tag is None else self._camera.zoomed(pending.tag.focal_length_mm)
         if zoomed is not None:
             before_mm, now_mm = zoomed
-            text = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
-            self._component.say(text)
+            words = f"image {pending.shot.index} was zoomed from {before_mm:g} to {now_mm:g} mm: is it calibrated?"
+            self._component.say(words)
         if pending.tag is not None:
             self.of_body.append(pending.tag)
         if pending.body_c is not None:

@@ -11,13 +11,15 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
-from dappled import codec
+from dappled import codec, findings
 from dappled.clock import Clock
 from dappled.codec import CodecError, canonical
 from dappled.decode.geometry import Pose
+from dappled.findings import Finding
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column, digest
 from dappled.flight.errors import FlightError, ledger_error
@@ -181,7 +183,8 @@ class LedgerReader(Database):
         return frozenset(row[0] for row in rows)
 
     def strays(self) -> list[Stray]:
-        return [Stray(*row) for row in self._rows("SELECT * FROM strays ORDER BY name")]
+        rows = self._rows("SELECT * FROM strays ORDER BY name")
+        return [replace(Stray(*row), reason=findings.of_json_text(row[5])) for row in rows]
 
     def poses(self) -> dict[int, Pose]:
         return {index: self._load(Pose, text) for index, text in self._rows("SELECT idx, record FROM poses")}
@@ -314,11 +317,10 @@ class Ledger(LedgerReader):
                 (called_monotonic_ns, returned_monotonic_ns, index),
             )
 
-    def failed(self, index: int, reason: str) -> None:
-        """Note that the shot gives no frame. `reason` is a sentence."""
+    def failed(self, index: int, why: Finding) -> None:
+        """Note that the shot gives no frame."""
         with self._transaction():
-            self._advance(index, "failed", reason)
-            self._event("failed", reason, index)
+            self._end(index, "failed", why)
 
     def safe(self, frame: Frame) -> None:
         """Acknowledge a frame whose bytes and name are durable."""
@@ -330,11 +332,10 @@ class Ledger(LedgerReader):
             if before == "failed":
                 self._event("late", f"the file {frame.camera_name} came after the shot had been given up", frame.index)
 
-    def follows(self, index: int, reason: str) -> None:
+    def follows(self, index: int, why: Finding) -> None:
         """Note that the shot was fired and its file is still on the camera: it counts as failed until picked up."""
         with self._transaction():
-            self._advance(index, "failed", reason)
-            self._event("follows", reason, index)
+            self._end(index, "follows", why)
 
     def add_companion(self, companion: Frame) -> None:
         """Add a file beside a frame; it is durable under its name."""
@@ -346,9 +347,10 @@ class Ledger(LedgerReader):
     def add_stray(self, stray: Stray) -> None:
         """Add a file that belongs to no shot, or is a second one; it is durable under its name."""
         with self._transaction():
-            values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, stray.reason)
+            why = "" if stray.reason is None else findings.json_text(stray.reason)
+            values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, why)
             self._insert("strays", (stray.name,), *values)
-            self._event("stray", stray.reason, None)
+            self._event("stray", why, None)
 
     def add_tag(self, tag: Tag) -> None:
         """Add a frame's tag and, with a digest of its own, the pose in it."""
@@ -403,6 +405,11 @@ class Ledger(LedgerReader):
         marks = ", ".join("?" * len(values))
         self._db.execute(f"{verb} INTO {table} VALUES ({marks})", values)
         self._written[table, key] = None
+
+    def _end(self, index: int, kind: str, why: Finding) -> None:
+        text = findings.json_text(why)
+        self._advance(index, "failed", text)
+        self._event(kind, text, index)
 
     def _advance(self, index: int, new: ShotState, reason: str | None = None) -> ShotState:
         row = self.shot(index)
@@ -470,4 +477,5 @@ def _shot_row(row: Sequence[Any]) -> ShotRow:
     """A row of `shots`."""
     index, source, kind, sequence, utc_ns, monotonic_ns, state, reason, called, returned = row
     shot = Shot(index, Cause(source, kind, sequence), utc_ns, monotonic_ns)
-    return ShotRow(shot, cast(ShotState, state), reason, called, returned)
+    why = None if reason is None else findings.of_json_text(reason)
+    return ShotRow(shot, cast(ShotState, state), why, called, returned)

@@ -17,8 +17,9 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeVar
 
-from dappled import durable
+from dappled import durable, findings
 from dappled.clock import Clock
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, provenance, recovery, seals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
@@ -47,7 +48,7 @@ class StrayFileError(FlightError):
     """The file was made safe, but it is not the frame of a shot: it is kept among the frames as `stray`."""
 
     def __init__(self, stray: Stray) -> None:
-        super().__init__(stray.reason)
+        super().__init__(stray.reason and findings.named(stray.reason))
         self.stray = stray
 
 
@@ -77,8 +78,8 @@ class Recorder:
         """
         row = self._ledger.shot(index)
         if row is None:
-            reason = f"{camera_name} came for shot {index}, which was never requested: kept as a stray"
-            raise StrayFileError(self.record_stray(camera_name, blob, reason, arrived_utc_ns=arrived_utc_ns))
+            why = finding(Code.FILE_UNASKED, Subject("file", camera_name), shot=index)
+            raise StrayFileError(self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns))
         first = self._ledger.frame(index)
         if first is not None:
             return self._again(first, camera_name, blob, arrived_utc_ns)
@@ -103,8 +104,8 @@ class Recorder:
         self._ledger.add_companion(companion)
         return companion
 
-    def record_stray(self, camera_name: str, blob: FileBytes, reason: str, *, arrived_utc_ns: int) -> Stray:
-        """Make a file safe that belongs to no shot. `reason` is a sentence. Raises FlightError."""
+    def record_stray(self, camera_name: str, blob: FileBytes, why: Finding, *, arrived_utc_ns: int) -> Stray:
+        """Make a file safe that belongs to no shot: `why`. Raises FlightError."""
         taken = {PurePosixPath(stray.name).stem for stray in self._ledger.strays()}
         try:  # one may have lost its row to a full disk
             taken |= {PurePosixPath(one).stem for one in self._with_reserve(partial(os.listdir, self._folder.frames))}
@@ -113,7 +114,7 @@ class Recorder:
         number = next(n for n in range(len(taken) + 1) if f"stray-{n:06d}" not in taken)
         name = f"frames/stray-{number:06d}.{layout.extension(camera_name)}"
         sha256 = self._write(name, camera_name, blob)
-        stray = Stray(name, camera_name, blob.size, sha256, arrived_utc_ns, reason)
+        stray = Stray(name, camera_name, blob.size, sha256, arrived_utc_ns, why)
         self._ledger.add_stray(stray)
         return stray
 
@@ -121,8 +122,8 @@ class Recorder:
         if blob.size == first.size and durable.hash_descriptor(blob.fd, blob.size) == first.sha256:
             self._ledger.add_event("double", f"{camera_name} came again with the same bytes", first.index)
             return first
-        reason = f"{camera_name} is a second file for shot {first.index}, whose frame is {first.name}: kept as a stray"
-        raise StrayFileError(self.record_stray(camera_name, blob, reason, arrived_utc_ns=arrived_utc_ns))
+        why = finding(Code.FILE_SECOND, Subject("file", camera_name), shot=first.index, frame=first.name)
+        raise StrayFileError(self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns))
 
     def _write(self, name: str, camera_name: str, blob: FileBytes) -> str:
         path = self._folder.path / name
@@ -170,7 +171,7 @@ class Recorder:
 
     def _note_failure(self, index: int, error: FlightError) -> None:
         try:
-            self._ledger.failed(index, str(error))
+            self._ledger.failed(index, finding(Code.SHOT_UNRECORDED, Subject("shot", index), reason=str(error)))
         except FlightError as second:
             raise FlightError(f"{error}; and this could not be noted either: {second}") from error
 

@@ -113,12 +113,12 @@ class Tag:
 class ShotRow:
     """A shot and its state. The fired times are those before and after the trigger call; None where there was none.
 
-    `reason` is a sentence, for a failed shot.
+    `reason` is why it failed, or what its file waits for; None for every other state.
     """
 
     shot: Shot
     state: ShotState
-    reason: str | None
+    reason: Finding | None
     fired_called_monotonic_ns: int | None
     fired_returned_monotonic_ns: int | None
 
@@ -169,7 +169,7 @@ class Stray:
     size: int
     sha256: str
     arrived_utc_ns: int
-    reason: str
+    reason: Finding | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from pathlib import Path
 from dappled import durable, refusals
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.findings import text, told
+from dappled.findings import Code, Subject, finding, named, text, told
 from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
@@ -26,7 +26,6 @@ from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import ledger_damage
 
 _JPEG = (".jpg", ".jpeg")
-LOST = "the recording ended before its file came"
 
 
 def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) -> list[str]:
@@ -78,8 +77,9 @@ def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:
         report += _adopt(folder, ledger)
         for row in ledger.shots():
             if row.state in ("wished", "fired"):
-                ledger.failed(row.shot.index, f"shot {row.shot.index} is lost: {LOST}")
-                report.append(f"shot {row.shot.index} was {row.state}, and is lost: {LOST}")
+                lost = finding(Code.SHOT_LOST, Subject("shot", row.shot.index), state=row.state)
+                ledger.failed(row.shot.index, lost)
+                report.append(named(lost))
         if "closed_utc_ns" not in ledger.facts():
             ledger.set_fact(CUT_SHORT, {"shots_s": logs.DURABLE_S, "refusals_s": refusals.INTERVAL_S})
             close_ledger(folder, ledger, clock.utc_ns(), None, report)
@@ -171,9 +171,9 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
             ledger.add_companion(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
             report.append(f"{name} was complete but had no row; it is adopted beside the frame of shot {number}")
         else:
-            reason = f"{name} belongs to no shot that waits for a file; it is kept as a stray"
-            ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, reason))
-            report.append(reason)
+            why = finding(Code.FILE_UNCLAIMED, Subject("file", name))
+            ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, why))
+            report.append(named(why))
     return report
 
 

@@ -16,6 +16,7 @@ from dappled.clock import RecordedClock
 from dappled.flight import Recording, Result, layout, recording, seal_key, seals
 from dappled.flight.ledger import Ledger
 from tests.flight.makers import deliver, flip, request, tag
+from tests.standing import failure
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
 
@@ -27,7 +28,7 @@ def fly(flights: Path) -> Recording:
         request(begun, index)
     begun.ledger.add_tag(tag(deliver(begun, 0, bytes(2_000_000))))
     begun.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
-    begun.ledger.failed(1, "no file came")
+    begun.ledger.failed(1, failure("no file came"))
     return begun
 
 

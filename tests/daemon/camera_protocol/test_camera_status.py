@@ -14,6 +14,7 @@ from dappled.daemon.pipeline.capture import PendingShot
 from dappled.drivers.camera import Identity
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import Cause, ImageIndex, Shot
+from tests.standing import failure
 
 SHOT = Shot(7, Cause("test", "console", 1), 1_000, 1_000)
 
@@ -54,7 +55,7 @@ def test_a_lens_that_was_zoomed_is_seen_and_an_unknown_focal_length_changes_noth
 
 
 def test_a_shot_that_failed_was_not_captured() -> None:
-    captured = camera_status.captured_shot(PendingShot(SHOT, problem="no file came"), lambda utc_ns: utc_ns)
+    captured = camera_status.captured_shot(PendingShot(SHOT, problem=failure("no file came")), lambda utc_ns: utc_ns)
     assert (captured.index, captured.ok, captured.pose) == (7, False, None)
 
 

@@ -9,6 +9,7 @@ from dappled.clock import RecordedClock
 from dappled.daemon.health.logbook import Logbook, of_shot
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.flight import Cause, Frame, Shot
+from tests.standing import failure
 
 SHOT = Shot(7, Cause("console", "console", 1), 0, 0)
 FRAME = Frame(7, "frames/000007.dng", "IMG.DNG", 5_100_000, "0" * 64, 0)
@@ -46,8 +47,11 @@ def test_warnings_of_the_loggers_are_kept_and_lesser_ones_not() -> None:
 def test_a_shot_in_words() -> None:
     pending = PendingShot(SHOT, frame=FRAME)
     assert of_shot(pending) == ("frame 7 is safe, 5.1 MB", "info")
-    assert of_shot(replace(pending, problem="not decoded: no carriers")) == (
+    assert of_shot(replace(pending, problem=failure("not decoded: no carriers"))) == (
         "frame 7: not decoded: no carriers",
         "warning",
     )
-    assert of_shot(PendingShot(SHOT, problem="the mirror is stuck")) == ("shot 7: the mirror is stuck", "warning")
+    assert of_shot(PendingShot(SHOT, problem=failure("the mirror is stuck"))) == (
+        "shot 7: the mirror is stuck",
+        "warning",
+    )

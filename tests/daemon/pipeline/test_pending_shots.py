@@ -13,6 +13,7 @@ from dappled.daemon.pipeline.capture import GIVEN_UP, Observer, PendingShot, Pen
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.flight import Cause, FlightError, Frame, Shot, Tag
 from tests.daemon.fakes import CallingObserver, FakeCamera, arrival, fired, rig
+from tests.standing import failure
 from tests.waiting import eventually
 
 
@@ -64,7 +65,7 @@ def test_an_end_that_comes_from_many_threads_at_once_is_told_once() -> None:
 def test_only_the_last_failures_are_still_known_for_theirs() -> None:
     ends, all_of_them, _ = begun(CallingObserver(), GIVEN_UP + 1)
     for pending in all_of_them:
-        ends.fail(pending, "the mirror is stuck")
+        ends.fail(pending, failure("the mirror is stuck"))
     assert ends.shots.of_file(0) is None
     assert ends.shots.of_file(1) is all_of_them[1]
 
@@ -74,7 +75,7 @@ def test_files_that_follow_are_known_within_a_bound(monkeypatch: pytest.MonkeyPa
     ended: list[int] = []
     ends, all_of_them, events = begun(CallingObserver(finished=lambda pending: ended.append(pending.shot.index)), 3)
     for pending in all_of_them:
-        ends.follow(pending, "on the card")
+        ends.follow(pending, failure("on the card"))
         ends.finish(pending)
     assert [ends.shots.of_file(index) is not None for index in range(3)] == [False, True, True]
     again = ends.safe(all_of_them[2], frame(2), "IMG.DNG")

@@ -33,6 +33,7 @@ from dappled.findings import FRAME, Code, Finding, Subject, finding, text, told
 from dappled.flight import FlightError, Recording, ShotState, TimeSource, flight_report, layout
 from dappled.flight.checks import flight_check
 from tests.daemon.fakes import FakeCamera, Rig, arrival, failed, fired, good, rig
+from tests.standing import words
 from tests.waiting import eventually
 
 
@@ -44,7 +45,7 @@ def test_a_shot_goes_all_the_way(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         assert one.request(1).index == 0
         pending = one.ended(0)
-        assert pending.problem == ""
+        assert pending.problem is None
         assert pending.frame is not None
         assert pending.tag is not None
         assert pending.decoded is not None
@@ -80,7 +81,7 @@ def test_a_driver_that_raises_fails_the_shot_and_the_next_works(tmp_path: Path) 
 
     with rig(tmp_path, script) as one:
         assert one.request(1).outcome == "shot"
-        assert "no film" in one.ended(0).problem
+        assert "no film" in words(one.ended(0).problem)
         one.request(2)
         assert one.ended(1).frame is not None
         assert one.settled == [(0, False), (1, True)]
@@ -109,7 +110,7 @@ def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -
         one.request(1)
         eventually(one.flight.ledger.strays, "the stray")
         one.decoder.gate.set()
-        assert one.ended(0).problem == ""
+        assert one.ended(0).problem is None
         assert one.settled == [(0, True)]
     assert flight_check.check(one.flight.folder.path).intact
 
@@ -117,7 +118,7 @@ def test_a_second_file_of_a_shot_is_a_stray_and_undoes_nothing(tmp_path: Path) -
 def test_a_failure_after_the_file_undoes_nothing(tmp_path: Path) -> None:
     with rig(tmp_path, lambda shot: [*good(shot), failed(shot)]) as one:
         one.request(1)
-        assert one.ended(0).problem == ""
+        assert one.ended(0).problem is None
         eventually(lambda: one.camera.released, "released")
     assert (states(one.flight.folder.path), one.settled) == ({0: "safe"}, [(0, True)])
 
@@ -126,7 +127,7 @@ def test_a_file_after_the_failure_is_a_frame_after_all(tmp_path: Path) -> None:
     with rig(tmp_path) as one:
         one.camera.script = lambda shot: [fired(shot), failed(shot)]
         one.request(1)
-        assert one.ended(0).problem == "the mirror is stuck"
+        assert words(one.ended(0).problem) == "the mirror is stuck"
         one.camera.say(arrival(0))
         eventually(lambda: one.flight.ledger.result(0), "it is decoded too")
         assert one.settled == [(0, False), (0, True)]
@@ -176,7 +177,7 @@ def test_an_empty_file_fails_the_shot(tmp_path: Path) -> None:
         one.request(1)
         empty = arrival(0, b"x")
         one.camera.say(type(empty)(0, empty.name, type(empty.blob)(empty.blob.fd, 0), empty.monotonic_ns))
-        assert "empty" in one.ended(0).problem
+        assert "empty" in words(one.ended(0).problem)
         assert one.settled == [(0, False)]
 
 
@@ -184,7 +185,7 @@ def test_a_shot_that_brings_nothing_fails_when_the_flight_ends(tmp_path: Path) -
     with rig(tmp_path, lambda _: [], stop_s=0.1) as one:
         one.request(1)
     assert one.settled == [(0, False)]
-    assert "the flight ended" in one.ended(0).problem
+    assert "the flight ended" in words(one.ended(0).problem)
     assert states(one.flight.folder.path) == {0: "failed"}
 
 
@@ -214,7 +215,7 @@ def test_a_watcher_that_raises_stops_nobody(tmp_path: Path) -> None:
         eventually(lambda: one.flight.ledger.result(0), "decoded all the same")
         one.shots = shots
         one.request(2)
-        assert one.ended(1).problem == ""
+        assert one.ended(1).problem is None
 
 
 def test_a_full_decode_queue_leaves_frames_in_the_record(tmp_path: Path) -> None:
@@ -225,9 +226,9 @@ def test_a_full_decode_queue_leaves_frames_in_the_record(tmp_path: Path) -> None
         eventually(lambda: one.decoder and one.decoder.seen, "the first is being decoded")
         for number in (2, 3, 4):
             one.request(number)
-        assert "the queue was full" in one.ended(3).problem
+        assert "the queue was full" in words(one.ended(3).problem)
         one.decoder.gate.set()
-        assert one.ended(1).problem == ""
+        assert one.ended(1).problem is None
     assert set(states(one.flight.folder.path).values()) == {"safe"}
     assert len(one.shots) == 4
 
@@ -237,11 +238,11 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
         assert one.decoder is not None
         one.decoder.problem = "no carriers"
         one.request(1)
-        assert one.ended(0).problem == "not decoded: no carriers"
+        assert words(one.ended(0).problem) == "not decoded: no carriers"
         one.decoder.problem = ""
         one.request(2)
-        assert one.ended(1).problem == ""
-        assert "not decoded: no carriers" in one.events()
+        assert one.ended(1).problem is None
+        assert "not decoded: frame 0: not decoded: no carriers" in one.events()
 
 
 def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> None:
@@ -250,7 +251,7 @@ def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> Non
         share: Any = np.float32(0.9)  # JSON has no such number
         one.decoder.picture = PictureFacts(share, 0.0, 0.2, ((0.5, 1.0, 2.0),) * 2)
         one.request(1)
-        assert one.ended(0).problem == ""
+        assert one.ended(0).problem is None
         found = one.flight.ledger.result(0)
         assert found is not None
         assert found.verdict is not None
@@ -278,7 +279,7 @@ def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path:
             one.pending.decoding = decoding
             one.request(number)
             pending = one.ended(number)
-            assert ((pending.decoded is not None), pending.problem) == (decoding, "")
+            assert ((pending.decoded is not None), pending.problem) == (decoding, None)
         assert [text for text in one.events() if text.startswith("not decoded")] == [
             "not decoded: decoding was switched off"
         ]
@@ -287,7 +288,7 @@ def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path:
 def test_a_flight_that_decodes_nothing_tells_it_of_no_frame(tmp_path: Path) -> None:
     with rig(tmp_path, decode=False) as one:
         one.request(1)
-        assert one.ended(0).problem == ""
+        assert one.ended(0).problem is None
         assert not any(text.startswith("not decoded") for text in one.events())
 
 
@@ -305,7 +306,7 @@ def test_a_ledger_that_refuses_once_costs_one_shot_at_most(
             one.request(1)
             one.ended(0)
         one.request(2)
-        assert one.ended(1).problem == ""
+        assert one.ended(1).problem is None
         assert one.ended(1).decoded is not None
     assert len(one.shots) == 2
     assert states(one.flight.folder.path)[1] == "safe"
@@ -402,7 +403,8 @@ def test_a_shot_whose_file_follows_is_told_where_it_was_and_has_failed_until_the
         assert one.tagged == [index]
         assert one.settled == [(index, False)]
         assert one.flight.ledger.following() == {index}
-        assert f"follows: {pending.follows}" in one.events()
+        assert pending.follows is not None
+        assert f"follows: {told(pending.follows)}" in one.events()
         one.camera.say(arrival(index))
         eventually(lambda: one.flight.ledger.tag(index), "the tag of the file that came after all")
         assert one.flight.ledger.following() == set()

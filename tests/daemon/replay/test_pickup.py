@@ -22,6 +22,7 @@ from dappled.flight import Cause, LedgerReader, Shot, recording
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import request, shot
 from tests.simulated.finepix import picture
+from tests.standing import failure
 
 
 def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
@@ -30,8 +31,8 @@ def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
     request(flight, 0)
     flight.journal.note(shot(1))
     flight.ledger.add_shot(shot(1))
-    flight.ledger.follows(0, "its file stays at the camera")
-    flight.ledger.failed(1, "the camera was absent")
+    flight.ledger.follows(0, failure("its file stays at the camera"))
+    flight.ledger.failed(1, failure("the camera was absent"))
     flight.close()
     card = tmp_path / "card"
     card.mkdir()
@@ -56,7 +57,7 @@ class Landed:
             utc_ns = round((T0_S + at_s) * 1e9)
             flight.ledger.add_shot(Shot(index, Cause("test", "test"), utc_ns, utc_ns - T0_S * 10**9))
             flight.ledger.fired(index, round(at_s * 1e9), round(at_s * 1e9))
-            flight.ledger.follows(index, "its file stays at the camera")
+            flight.ledger.follows(index, failure("its file stays at the camera"))
         flight.close()
         self.path = flight.folder.path
 

@@ -29,6 +29,7 @@ from tests.drivers.mavlink.true_logs import (
     written,
 )
 from tests.flight.makers import deliver
+from tests.standing import failure
 
 TIMES_S = {number: 0.5 + 0.5 * number for number in range(1, 10)}  # 1.0 s to 5.0 s
 LINK_US = 20_000
@@ -93,7 +94,7 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
             flight.ledger.add_shot(shot)
             flight.ledger.fired(index, at_ns, at_ns)
             if index in failed:
-                flight.ledger.failed(index, "no file came")
+                flight.ledger.failed(index, failure("no file came"))
             else:
                 deliver(flight, index, b"%d" % index, f"IMG_{index}.RAF")
         flight.close()

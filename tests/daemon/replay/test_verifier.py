@@ -13,6 +13,7 @@ from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
 from dappled.flight import Cause, Frame, Result, Shot, ShotRow, Tag, TimeSource, digest
 from tests.daemon.fakes import no_pose
+from tests.standing import failure
 
 SHOT = Shot(0, Cause("test", "console", 1), 10, 20)
 DATA = b"raw bytes"
@@ -86,7 +87,7 @@ def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path
 
 def test_what_did_not_come_is_a_difference(tmp_path: Path) -> None:
     verifier, _ = replay(tmp_path)
-    verifier.failed(0, "can't be read")
+    verifier.failed(0, failure("can't be read"))
     text = "\n".join(verifier.verdict())
     for word in ("frame 0: can't be read", "made no pose", "made no tag", "made no slices"):
         assert word in text

@@ -16,6 +16,7 @@ from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
 from dappled.flight.tables import KEYS
 from tests.flight.makers import deliver, held, mavlink_2, request, tag, words_of
+from tests.standing import STRAY, failure
 
 SEED = 20261122
 EDITS = 50
@@ -39,9 +40,9 @@ def fly(flight: Recording, frames: int = 4) -> FlightFolder:
         flight.recorder.record_companion(0, "IMG_0001.JPG", blob, arrived_utc_ns=6)
         flight.recorder.record_companion(1, "IMG_0002.JPG", blob, arrived_utc_ns=6)
         for number in range(2):
-            flight.recorder.record_stray(f"A{number}.JPG", blob, f"stray “{number}”", arrived_utc_ns=7)
-    flight.ledger.failed(frames, "no file came")
-    flight.ledger.follows(frames + 1, "its file stays on the camera")
+            flight.recorder.record_stray(f"A{number}.JPG", blob, STRAY, arrived_utc_ns=7)
+    flight.ledger.failed(frames, failure("no file came"))
+    flight.ledger.follows(frames + 1, failure("its file stays on the camera"))
     flight.ledger.set_fact("vehicles", [[0, 1]])
     flight.learn_utc(1_000, 10, "the autopilot")
     for number in range(40):
@@ -171,7 +172,7 @@ def test_rows_of_a_transaction_that_failed_leave_no_link(tmp_path: Path) -> None
         with pytest.raises(Exception, match="contradicts"):
             ledger.add_companion(Frame(9, "frames/000009.jpg", "A.JPG", 1, "ab", 5))
         assert ledger.last_link() == before
-        ledger.add_stray(Stray("frames/stray-000000.jpg", "A.JPG", 1, "ab", 5, "why"))
+        ledger.add_stray(Stray("frames/stray-000000.jpg", "A.JPG", 1, "ab", 5, STRAY))
         assert ledger.last_link() != before
 
 

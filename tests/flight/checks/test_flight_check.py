@@ -15,6 +15,7 @@ from dappled.flight import FlightError, FlightFolder, Ledger, LedgerReader, Reco
 from dappled.flight.checks.flight_check import check
 from dappled.flight.records import LOST
 from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag, words_of
+from tests.standing import failure
 
 
 @pytest.fixture
@@ -26,7 +27,7 @@ def recorded(flight: Recording) -> FlightFolder:
         frame = deliver(flight, index, bytes(1000))
         flight.ledger.add_tag(tag(frame))
     flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
-    flight.ledger.failed(2, "no file came")
+    flight.ledger.failed(2, failure("no file came"))
     for number in range(20):
         flight.telemetry.append(number, mavlink_2(b"payload"))
     (flight.folder.path / "inputs/masks").mkdir(parents=True)

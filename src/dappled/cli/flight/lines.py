@@ -39,7 +39,7 @@ def of_flight(found: FlightContents) -> Iterator[str]:
         if run != LIVE:
             yield f"   run  {run}: {counted(count, 'frame')} decoded again"
     for stray in found.strays:
-        yield f" stray  {stray.name}  {stray.reason}"
+        yield f" stray  {stray.name}  {'' if stray.reason is None else findings.named(stray.reason)}".rstrip()
 
 
 def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
@@ -51,7 +51,7 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
         line.row.state,
     ]
     if line.row.reason:
-        words.append(line.row.reason)
+        words.append(findings.text(line.row.reason))
     if line.frame:
         words.append(f"{line.frame.name} {line.frame.size / 1e6:.1f} MB")
     pose = line.tag.pose if line.tag else None

@@ -12,6 +12,7 @@ from dappled import codec
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.errors import sentence
+from dappled.findings import text
 
 LineLevel = Literal["info", "warning"]
 
@@ -62,9 +63,9 @@ def of_shot(pending: PendingShot) -> tuple[str, LineLevel]:
     """The line that says how a shot ended, and its level."""
     who = f"frame {pending.shot.index}" if pending.frame else f"shot {pending.shot.index}"
     if pending.problem:
-        return f"{who}: {pending.problem}", "warning"
+        return f"{who}: {text(pending.problem)}", "warning"
     if pending.frame is None and pending.follows:
-        return f"{who}: {pending.follows}", "info"
+        return f"{who}: {text(pending.follows)}", "info"
     words = [f"{who} is safe"]
     if pending.frame:
         words[0] += f", {pending.frame.size / 1e6:.1f} MB"

@@ -65,9 +65,9 @@ class PendingShot:
     body_c: float | None = None
     decoded: DecodedFrame | None = None
     verdict: Verdict | None = None
-    problem: str = ""
+    problem: Finding | None = None
     doubt: Finding | None = None
-    follows: str = ""
+    follows: Finding | None = None
     where: tuple[ExposureTime, Pose] | None = None
     ms: dict[str, float] = field(default_factory=dict)
     over: bool = False
@@ -211,17 +211,17 @@ class ShotEnds:
     def __init__(self, shots: PendingShots, writer: FlightWriter, observer: Observer) -> None:
         self.shots, self.writer, self.observer = shots, writer, observer
 
-    def fail(self, pending: PendingShot, reason: str) -> None:
+    def fail(self, pending: PendingShot, why: Finding) -> None:
         """A shot ends without a frame; see `GIVEN_UP`."""
-        pending.problem = reason
+        pending.problem = why
         self.shots.keep_failed(pending)
         self.tell(self.observer.settled, pending.shot.index, False)
         self.tell(self.observer.tagged, pending)
         self.finish(pending)
 
-    def follow(self, pending: PendingShot, reason: str) -> None:
+    def follow(self, pending: PendingShot, why: Finding) -> None:
         """A shot's file stays at the camera for now."""
-        pending.follows = reason
+        pending.follows = why
         self.shots.keep_following(pending)
         self.tell(self.observer.settled, pending.shot.index, False)
 
@@ -238,19 +238,23 @@ class ShotEnds:
         if followed:
             self.note("followed", f"its file has arrived: {name}", frame.index)
         elif failed:
-            self.note("late", f"its file arrived after the shot had failed: {pending.problem}", frame.index)
-            pending.problem = ""
+            why = "" if pending.problem is None else f": {findings.text(pending.problem)}"
+            self.note("late", f"its file arrived after the shot had failed{why}", frame.index)
+            pending.problem = None
             self.shots.add(pending)
         return pending
 
     def drop(self, pending: PendingShot, what: str) -> None:
         """A safe frame found a full queue, or was still in it at the flight's end."""
-        self.leave(pending, what, "the queue was full, or the flight ended; the frame is in the record")
+        self._leave(pending, what, finding(Code.FRAME_DROPPED, _frame(pending), what=what))
 
     def leave(self, pending: PendingShot, what: str, why: str) -> None:
         """A safe frame is not processed further."""
-        pending.problem = f"{what}: {why}"
-        self.note(what, why, pending.shot.index)
+        self._leave(pending, what, finding(Code.FRAME_LEFT, _frame(pending), what=what, why=why))
+
+    def _leave(self, pending: PendingShot, what: str, why: Finding) -> None:
+        pending.problem = why
+        self.note(what, findings.json_text(why), pending.shot.index)
         self.finish(pending)
 
     def finish(self, pending: PendingShot) -> None:
@@ -268,6 +272,10 @@ class ShotEnds:
             receiver(*facts)
         except Exception as error:  # noqa: BLE001  # no observer may stop the pipeline
             report(log, "pipeline", error)
+
+
+def _frame(pending: PendingShot) -> Subject:
+    return Subject("frame", pending.shot.index)
 
 
 class NextStage(Protocol):
@@ -321,7 +329,7 @@ class Capture:
         while self._clock.monotonic_ns() < until_ns and self._take(0.0):
             pass
         for index in self._shots.open():
-            self._handle(ShotFailed(index, "the flight ended before its file came", self._clock.monotonic_ns()))
+            self._ends.tell(self._shot_failed, index, finding(Code.SHOT_CUT_OFF, Subject("shot", index)))
 
     def _take(self, timeout_s: float) -> bool:
         """Pull one event and act on it; False where none came in time."""
@@ -343,7 +351,8 @@ class Capture:
             elif isinstance(event, Fired):
                 self._fired(event)
             elif isinstance(event, ShotFailed):
-                self._shot_failed(event.shot, event.reason)
+                about = Subject("shot", event.shot)
+                self._shot_failed(event.shot, finding(Code.SHOT_FAILED, about, reason=event.reason))
             elif isinstance(event, Arrival):
                 self._arrived(event)
             elif isinstance(event, Companion):
@@ -385,17 +394,17 @@ class Capture:
             pending.ms["wish to trigger"] = (event.called_monotonic_ns - pending.shot.wished_monotonic_ns) / 1e6
             pending.ms["trigger call"] = (event.returned_monotonic_ns - event.called_monotonic_ns) / 1e6
 
-    def _shot_failed(self, index: int, reason: str) -> None:
+    def _shot_failed(self, index: int, why: Finding) -> None:
         pending = self._shots.in_hand(index)
         if pending is not None and pending.frame is not None:
-            self._ends.note("contradiction", f"its file is safe, but then the driver reported: {reason}", index)
+            self._ends.note("contradiction", findings.json_text(why), index)
             return
         try:
             self._enter(index)
-            self._writer.failed(index, reason)
+            self._writer.failed(index, why)
         finally:
             if pending is not None:
-                self._ends.fail(pending, reason)
+                self._ends.fail(pending, why)
 
     def _arrived(self, arrival: Arrival) -> None:
         began = self._clock.monotonic_ns()
@@ -406,7 +415,8 @@ class Capture:
         except Exception as error:
             # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
             if pending is not None and pending.frame is None and not pending.over:
-                self._ends.fail(pending, sentence(error))
+                about = Subject("shot", pending.shot.index)
+                self._ends.fail(pending, finding(Code.SHOT_UNRECORDED, about, reason=sentence(error)))
             raise
         finally:
             arrival.blob.close()
@@ -432,11 +442,12 @@ class Capture:
 
     def _deferred(self, event: Deferred) -> None:
         """The end of a shot whose file comes later: where it was exposed can be reported now."""
+        why = finding(Code.SHOT_FOLLOWS, Subject("shot", event.shot), reason=event.reason)
         try:
             self._enter(event.shot)
-            self._writer.follows(event.shot, event.reason)
+            self._writer.follows(event.shot, why)
         finally:
             pending = self._shots.in_hand(event.shot)
             if pending is not None and pending.frame is None:
-                self._ends.follow(pending, event.reason)
+                self._ends.follow(pending, why)
                 self._following.take(pending)

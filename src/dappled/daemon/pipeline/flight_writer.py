@@ -11,6 +11,7 @@ from dappled.clock import Clock
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import DECISION, LawDecision
 from dappled.errors import DappledError, report
+from dappled.findings import Code, Finding, Subject, finding, named
 from dappled.flight import Frame, Recording, Result, Shot, Tag
 
 log = logging.getLogger(__name__)
@@ -33,13 +34,13 @@ class FlightWriter(Protocol):
     def fired(self, event: Fired) -> None:
         """The trigger call was made."""
 
-    def failed(self, index: int, reason: str) -> None:
+    def failed(self, index: int, why: Finding) -> None:
         """A shot will bring no frame."""
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
         """Make a file safe; when this returns it is."""
 
-    def follows(self, index: int, reason: str) -> None:
+    def follows(self, index: int, why: Finding) -> None:
         """A shot was fired, and its file stays at the camera for now."""
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
@@ -85,9 +86,9 @@ class LedgerWriter:
         """The trigger call was made."""
         self._recording.ledger.fired(event.shot, event.called_monotonic_ns, event.returned_monotonic_ns)
 
-    def failed(self, index: int, reason: str) -> None:
+    def failed(self, index: int, why: Finding) -> None:
         """A shot will bring no frame."""
-        self._recording.ledger.failed(index, reason)
+        self._recording.ledger.failed(index, why)
         self._index(index)
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
@@ -95,17 +96,17 @@ class LedgerWriter:
         arrived_utc_ns = self._clock.utc_ns()
         recorder = self._recording.recorder
         if index is None:
-            reason = f"{name} arrived without a shot: kept as a stray"
-            stray = recorder.record_stray(name, blob, reason, arrived_utc_ns=arrived_utc_ns)
-            raise DappledError(f"{reason} in {stray.name}")
+            why = finding(Code.FILE_NO_SHOT, Subject("file", name))
+            stray = recorder.record_stray(name, blob, why, arrived_utc_ns=arrived_utc_ns)
+            raise DappledError(f"{named(why)} in {stray.name}")
         frame = recorder.record(index, name, blob, arrived_utc_ns=arrived_utc_ns)
         self._sizes.append(frame.size)
         self._index(index)
         return frame
 
-    def follows(self, index: int, reason: str) -> None:
+    def follows(self, index: int, why: Finding) -> None:
         """A shot was fired, and its file stays at the camera for now."""
-        self._recording.ledger.follows(index, reason)
+        self._recording.ledger.follows(index, why)
         self._index(index)
 
     def companion(self, index: int, name: str, blob: Blob) -> None:

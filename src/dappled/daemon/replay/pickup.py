@@ -30,7 +30,7 @@ from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, json_text
+from dappled.findings import Code, Finding, Level, Subject, finding, json_text, text
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
 from dappled.flight.records import DOUBT, NOTICED
@@ -281,7 +281,8 @@ def _chosen(
                 f"--pair {index}={name}: shot {index} {'has its frame' if row else 'is not in the flight'}"
             )
         if row.fired_called_monotonic_ns is None:
-            raise ChoiceError(f"--pair {index}={name}: shot {index} never fired, according to the flight: {row.reason}")
+            why = "" if row.reason is None else f": {text(row.reason)}"
+            raise ChoiceError(f"--pair {index}={name}: shot {index} never fired, according to the flight{why}")
         fitting = [group for group in fresh if name in (group.main.name, group.main.base)]
         frames = [frame.index for full, frame in known.items() if name in (full, full.rpartition("/")[2])]
         if frames and not fitting:

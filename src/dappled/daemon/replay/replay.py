@@ -27,7 +27,7 @@ from dappled.drivers.replay import RecordedShot
 from dappled.drivers.utc_choice import Date, UtcBounds
 from dappled.drivers.wired.matching import seconds
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.findings import Code, Finding, Level, Subject, finding, text
 from dappled.flight import (
     LIVE,
     Cause,
@@ -446,7 +446,9 @@ def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: Findin
     called, returned = row.fired_called_monotonic_ns, row.fired_returned_monotonic_ns
     fired = None if called is None or returned is None else (called, returned)
     if frame is None:
-        return RecordedShot(row.shot.index, None, "", fired, reason=row.reason or "no frame was recorded")
+        return RecordedShot(
+            row.shot.index, None, "", fired, reason=text(row.reason) if row.reason else "no frame was recorded"
+        )
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
     facts = {} if doubt is None else {"doubt": codec.plain(doubt)}
     return RecordedShot(row.shot.index, folder.file(frame.name), frame.camera_name, fired, arrived_ns, facts=facts)

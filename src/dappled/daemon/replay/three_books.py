@@ -29,7 +29,7 @@ from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.drivers.mavlink.log_packets import LoggedTrigger, TriggerLog
 from dappled.drivers.utc_choice import LOGS_FROM_NS, UtcBounds
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Subject, finding
+from dappled.findings import Code, Finding, Subject, finding, text
 from dappled.flight import LedgerReader, ShotRow, Stray, Tag, layout, log_reading
 from dappled.flight.logs import MAVLINK_2
 
@@ -397,7 +397,8 @@ class _Comparison:
             if index not in made and index not in uncovered:
                 yield from self._of_shot(index)
         for stray in self.flight.strays:
-            reason = f"{stray.name} belongs to no trigger: {stray.reason}"
+            why = "" if stray.reason is None else f": {text(stray.reason)}"
+            reason = f"{stray.name} belongs to no trigger{why}"
             yield Imbalance("phantom", None, (), self.flight.utc_ns(stray.arrived_utc_ns), None, reason)
 
     def _of_trigger(self, place: int, one: _Trigger) -> Iterator[Imbalance]:
@@ -413,7 +414,7 @@ class _Comparison:
                 yield Imbalance("lost", number, (), *at, "no request reached the camera", instead)
         elif self.pairs.shots[place] not in self.flight.files:
             row = self.flight.rows[self.pairs.shots[place]]
-            reason = row.reason or f"the shot is {row.state}"
+            reason = text(row.reason) if row.reason else f"the shot is {row.state}"
             yield Imbalance("without a file", number, (row.shot.index,), *at, reason, instead)
         elif not self.outside:
             index = self.pairs.shots[place]

@@ -13,6 +13,7 @@ from dappled.decode.lightfield.light_field import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
+from dappled.findings import Finding, text
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
 MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platform does to slices, with room
@@ -86,10 +87,10 @@ class ReplayVerifier:
     def fired(self, event: Fired) -> None:
         """The trigger call was made."""
 
-    def failed(self, index: int, reason: str) -> None:
+    def failed(self, index: int, why: Finding) -> None:
         """A shot will bring no frame."""
         if self._expected[index].frame is not None:
-            self.differences.append(f"frame {index}: {reason}")
+            self.differences.append(f"frame {index}: {text(why)}")
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
         """Make a file safe; when this returns it is. The file is where it was; its bytes are hashed again."""
@@ -101,7 +102,7 @@ class ReplayVerifier:
             self.differences.append(f"frame {index}: {frame.name} is not the file that was recorded")
         return frame
 
-    def follows(self, index: int, reason: str) -> None:
+    def follows(self, index: int, why: Finding) -> None:
         """A shot's file stays at the camera: it has come by now, or the shot is replayed as failed."""
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
