@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.architecture.walk import ROOT, SOURCE
+from tests.architecture.walk import ROOT, SOURCE, parsed
 
 TESTS = ROOT / "tests"
 PYTHONS = ("_replace", "_asdict", "_fields", "_make", "_exit")  # public, for all that they begin with
@@ -61,7 +61,7 @@ def others(test: Path, text: str) -> list[str]:
 
     return [
         f"{test}:{line} {name}"
-        for line, name in reached(ast.parse(text))
+        for line, name in reached(parsed(text))
         if homes().get(name) and not any(map(own, homes()[name]))
     ]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import vulture
 
-from tests.architecture.walk import GROWTH, ROOT, SOURCE
+from tests.architecture.walk import GROWTH, ROOT, SOURCE, parsed
 
 MODULES = sorted(SOURCE.rglob("*.py"))
 FOLDERS = sorted({module.parent for module in MODULES})
@@ -98,7 +98,7 @@ def test_modules_are_of_a_size_to_be_read() -> None:
 def test_a_class_or_type_name_means_one_thing() -> None:
     found = defaultdict(list)
     for module in MODULES:
-        for node in ast.parse(module.read_text(encoding="utf-8")).body:
+        for node in parsed(module.read_text(encoding="utf-8")).body:
             for title in _types_made(node):
                 found[title].append(name(module))
     assert not {title: places for title, places in found.items() if len(places) > 1}
@@ -118,7 +118,7 @@ def _types_made(node: ast.stmt) -> list[str]:
 
 @pytest.mark.parametrize("line", ["class One: ...", "One = NDArray[np.float32]", "One = int | None", "One = Any"])
 def test_a_type_is_seen(line: str) -> None:
-    assert _types_made(ast.parse(line).body[0]) == ["One"]
+    assert _types_made(parsed(line).body[0]) == ["One"]
 
 
 def test_other_rooms_import_a_face_where_there_is_one() -> None:
@@ -163,7 +163,7 @@ def test_no_field_is_there_for_tests_only(unused_in_src: dict[str, set[str]]) ->
     tested = {
         node.attr
         for text in texts
-        for node in ast.walk(ast.parse(text))
+        for node in ast.walk(parsed(text))
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
     }
     assert (unread & tested) - set(UNREAD) == set()
@@ -188,7 +188,7 @@ def test_waits_of_a_flight_go_through_its_clock() -> None:
 
 def _past_the_clock(module: Path) -> list[str]:
     """Calls that read the machine's time, or wait for something with its time."""
-    tree, found = ast.parse(module.read_text(encoding="utf-8")), list[str]()
+    tree, found = parsed(module.read_text(encoding="utf-8")), list[str]()
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
     for node in (one for one in ast.walk(tree) if isinstance(one, ast.Call)):
         *of, called = ast.unparse(node.func).split(".")
@@ -202,9 +202,7 @@ def _past_the_clock(module: Path) -> list[str]:
 
 def _calls(module: Path) -> set[str]:
     """The last words of what a module calls: {"Thread(", "start(", …}."""
-    called = [
-        node.func for node in ast.walk(ast.parse(module.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)
-    ]
+    called = [node.func for node in ast.walk(parsed(module.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
     return {f"{ast.unparse(each).rpartition('.')[2]}(" for each in called}
 
 
@@ -236,7 +234,7 @@ def _imports(module: Path) -> list[tuple[tuple[str, ...], str]]:
     """(module below dappled as a tuple, name) of each `from dappled… import name`."""
     return [
         (tuple(node.module.split(".")[1:]), alias.name)
-        for node in ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        for node in ast.walk(parsed(module.read_text(encoding="utf-8")))
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "dappled"
         for alias in node.names
     ]
@@ -248,7 +246,7 @@ def _room(parts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _face(folder: Path) -> tuple[str, ...]:
-    for node in ast.parse((folder / "__init__.py").read_text(encoding="utf-8")).body:
+    for node in parsed((folder / "__init__.py").read_text(encoding="utf-8")).body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return tuple(ast.literal_eval(node.value))
     return ()
@@ -262,7 +260,7 @@ FACES = {
 
 def _patches(source: str) -> list[str]:
     """What in a program may change the product: its assignments to attributes, and its calls of setattr and patch."""
-    return [ast.unparse(node) for node in ast.walk(ast.parse(source)) if _is_patch(node)]
+    return [ast.unparse(node) for node in ast.walk(parsed(source)) if _is_patch(node)]
 
 
 def _is_patch(node: ast.AST) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ast
 
-from tests.architecture.walk import SOURCE
+from tests.architecture.walk import SOURCE, parsed
 
 OWN = {"shown.py"}
 ANSWERS = {"drivers/reader_process.py"}  # JSON to the process that started it
@@ -12,7 +12,7 @@ ANSWERS = {"drivers/reader_process.py"}  # JSON to the process that started it
 
 def printing(source: str) -> list[str]:
     """The calls that print, or write to a standard stream."""
-    called = [node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call)]
+    called = [node.func for node in ast.walk(parsed(source)) if isinstance(node, ast.Call)]
     names = [ast.unparse(one) for one in called]
     return [one for one in names if one == "print" or one.removeprefix("sys.") in ("stdout.write", "stderr.write")]
 

@@ -19,6 +19,7 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -33,6 +34,12 @@ _BETWEEN_FRAMES_NS = 300_000_000  # two frames of one camera are further apart
 _JOB = "Darkroom.decode"
 _FRAME_THREADS = frozenset({"capture", "tag", "decode", "publisher"})
 _SETTINGS = '[record]\ndirectory = "flights"\n[publish]\nslices = "ipc://{sockets}/slices"\n'
+
+
+@cache
+def parsed(source: str) -> ast.Module:
+    """One tree for all who look at a module; not to be changed."""
+    return ast.parse(source)
 
 
 class WalkError(Exception):
@@ -209,7 +216,7 @@ def _docstring(module: str) -> str:
     place = SOURCE / module.replace(".", "/")
     package = place / "__init__.py"
     file = package if package.exists() else place.with_suffix(".py")
-    return (ast.get_docstring(ast.parse(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+    return (ast.get_docstring(parsed(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
 
 
 def main() -> int:
