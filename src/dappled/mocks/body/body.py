@@ -23,7 +23,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import SystemClock
-from dappled.config import profiles
 from dappled.drivers.python_command import python_module
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
@@ -240,10 +239,11 @@ def _delayed(delay_s: float, make: Callable[[int], bytes], extension: str) -> Ex
 
 
 def _simulated(options: BodyOptions) -> Pictures:
-    # Imported here: it loads the whole renderer, which a body that shows patterns doesn't need.
+    # Imported here: they load NumPy and the whole renderer, which a body that shows patterns doesn't need.
     start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
     epoch_utc_s = time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9
     if options.mask:
+        from dappled.config import profiles  # noqa: PLC0415  # reason above
         from dappled.mocks.scene.masked_camera import eos450d_camera  # noqa: PLC0415  # reason above
 
         camera = eos450d_camera(
