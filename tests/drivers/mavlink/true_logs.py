@@ -6,6 +6,7 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 from dappled.daemon.navigation import ExposureTime
@@ -82,6 +83,14 @@ def angles(true: TruePose) -> tuple[float, float, float]:
 def written(folder: Path, *, fix: int = 6, wrong_ms: tuple[int, ...] = (), drift: float = 0.0) -> tuple[Path, Path]:
     """The same flight as ArduPilot's .bin and as .tlog. In .bin the receiver's first messages are wrong by `wrong_ms`
     each, and UTC runs faster by `drift` than the autopilot's clock."""
+    paths = folder / "00000012.bin", folder / "flight.tlog"
+    for path, data in zip(paths, _logs(fix, wrong_ms, drift), strict=True):
+        path.write_bytes(data)
+    return paths
+
+
+@cache
+def _logs(fix: int, wrong_ms: tuple[int, ...], drift: float) -> tuple[bytes, bytes]:
     path = FlightPath(5)
     log, packets = [formats()], []
     packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
@@ -128,9 +137,7 @@ def written(folder: Path, *, fix: int = 6, wrong_ms: tuple[int, ...] = (), drift
         ]  # fmt: skip
         stamp_us = UTC_US + round(t_s * 1e6)
         packets += [struct.pack(">Q", stamp_us) + pack(message, packer, version_1=False) for message in messages]
-    (folder / "00000012.bin").write_bytes(b"".join(log))
-    (folder / "flight.tlog").write_bytes(b"".join(packets))
-    return folder / "00000012.bin", folder / "flight.tlog"
+    return b"".join(log), b"".join(packets)
 
 
 ULOG_TYPES = {
