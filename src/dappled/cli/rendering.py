@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from dappled import codec, findings
 from dappled.cli.verb import Doubtable, Report, Verb
 from dappled.findings import Level
 from dappled.shown import say
+from dappled.workers import Loop
 
 if TYPE_CHECKING:
     from tqdm import tqdm
 
 Item = TypeVar("Item")
 DONE, FAILED, INTERRUPTED = 0, 1, 130
-_AFTER_S = 1.0  # of work, a bar is drawn
+_AFTER_S = 1.0  # of work, a bar is drawn, and as often again
+_STOP_S = 1.0
 
 
 class TerminalOutput:
@@ -27,6 +31,8 @@ class TerminalOutput:
     def __init__(self, path: str, *, as_json: bool) -> None:
         self._path, self._as_json = path, as_json
         self._bar: tqdm[Any] | None = None
+        self._ticks = Loop("bar", lambda: None)
+        self._drawing = threading.Lock()  # or a bar is drawn between lines
         self._what = ""
 
     def row(self, values: Mapping[str, Any], *lines: str) -> None:
@@ -54,22 +60,26 @@ class TerminalOutput:
         if not sys.stderr.isatty():
             yield lambda _: None
             return
-        with self._begun(total, unit, what) as bar:
+        self.close()
+        bar = self._begun(total, unit, what)
+        try:
             yield bar.update
-        self._bar = None
+        finally:
+            self.close()
 
     def show(self, what: str, done: int, total: int) -> None:
-        """So many frames of a stretch of work are done."""
+        """So many steps of a stretch of work are done."""
         if not sys.stderr.isatty():
             return
         if self._bar is None or what != self._what:
             self.close()
-            self._bar, self._what = self._begun(total, "frame", what), what
+            self._bar, self._what = self._begun(total, "step", what), what
         self._bar.update(done - self._bar.n)
 
     def close(self) -> None:
         """Take the bar off the terminal."""
         if self._bar is not None:
+            self._ticks.stop(_STOP_S)  # before the bar goes: it would be drawn again
             self._bar.close()
             self._bar = None
 
@@ -86,13 +96,23 @@ class TerminalOutput:
             unit_scale=scaled,
             file=sys.__stderr__,
         )
+        self._ticks = Loop("bar", partial(self._tick, self._bar, over := threading.Event()), over)
+        self._ticks.start()
         return self._bar
 
+    def _tick(self, bar: tqdm[Any], over: threading.Event) -> None:
+        """Draw the bar each second, also while the first of its units takes minutes."""
+        while not over.wait(_AFTER_S):
+            with self._drawing:
+                bar.delay = 0  # it is drawn, and so taken off at the end
+                bar.refresh()
+
     def _print(self, lines: Sequence[str], *, error: bool = False) -> None:
-        if self._bar is not None:
-            self._bar.clear()
-        for line in lines:
-            say(line, error=error)
+        with self._drawing:
+            if self._bar is not None:
+                self._bar.clear()
+            for line in lines:
+                say(line, error=error)
 
 
 def told(verb: Verb, report: Report, output: TerminalOutput) -> int:
