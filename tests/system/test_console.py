@@ -27,6 +27,7 @@ from PIL import Image
 
 from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
+from dappled.findings import Code, Finding, Subject, remedy, text
 from dappled.products import opened as opening
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFlight
@@ -361,6 +362,7 @@ def test_photographs_by_distance_are_shown_and_stopped(chromium: Browser, tmp_pa
         page = watched.page
         until(page, "/^[1-9]\\d* taken, one each 9.0 m$/.test(document.querySelector('#progress').textContent)")
         assert page.is_disabled("#interval-go")
+        page.screenshot(path=SCREENSHOTS / "series-phone.png")
         page.click("#interval-stop")
         until(page, "document.querySelector('#outcome').textContent === 'the interval is stopped'")
         until(page, "document.querySelector('#progress').textContent === ''")
@@ -407,22 +409,28 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
     page.screenshot(path=SCREENSHOTS / f"first-screen-{width}x{height}.png")
     assert page.evaluate("window.scrollY") == 0
     assert page.evaluate("document.documentElement.scrollWidth") <= width
-    boxes = {name: page.locator(f"#{name}").bounding_box() for name in ("verdict", "shoot", "instruments", "gl")}
+    names = ("verdict", "shoot", "interval-stop", "instruments", "gl")
+    boxes = {name: page.locator(f"#{name}").bounding_box() for name in names}
     floor = boxes["shoot"]["y"] if width < 700 and boxes["shoot"] else height  # the button lies over the page there
     for name, box in boxes.items():
         assert box is not None, name
         below = box["y"] + box["height"]
-        assert (below <= height) if name == "shoot" else (below <= floor), (name, box)
+        assert (below <= height) if name in ("shoot", "interval-stop") else (below <= floor), (name, box)
     assert boxes["gl"] is not None
+    assert boxes["interval-stop"] is not None
+    assert boxes["interval-stop"]["height"] >= (64 if width < 700 else 56)
     assert boxes["gl"]["height"] >= 0.4 * min(width, height), "the picture is there to be looked at"
     told = page.inner_text("#instruments")
     assert "unknown" not in told, told
     assert re.search(r"ISO\s*\d+", told), told
     assert re.search(r"shutter\s*1/\d+ s", told), told
     assert re.search(r"stop\s*f/[\d.]+", told), told
-    assert re.search(r"battery\s*\d+ ?%", told), told
+    assert re.search(r"battery\s*\d+ ?%\s*(now|\d+ (s|min))", told), told
+    assert re.search(r"link\s*(\d of \d )?heard\s*now", told), told
+    assert re.search(r"photo\s*#\d+\s*(now|\d+ (s|min))", told), told
+    assert re.search(r"space\s*[\d.]+\sGB\s*now", told), told
     assert re.search(r"GNSS\s*RTK fixed, \d+ sat", told), told
-    assert re.search(r"vehicle's battery\s*9\d %, 2[45]\.\d V", told), told
+    assert re.search(r"vehicle's battery\s*\d+ %, 2\d\.\d V", told), told
     assert re.search(r"frames left\s*[1-9]", told), told
     assert re.search(r"[\d.]+\s% clipped", told), told
     small = page.evaluate(
@@ -433,16 +441,26 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
             .map(([name, box]) => `${name} ${box.width} ${box.height}`)"""
     )
     assert small == [], "a thumb misses these"
-    before, after = page.evaluate(
-        """(long) => {
-            const names = innerWidth < 700 ? ['shoot'] : ['shoot', 'interval-stop'];
-            const at = () => names.map((name) => document.getElementById(name).getBoundingClientRect().y);
+    forbidden = Finding(Code.USB_FORBIDDEN, Subject("usb"), {"body": "Canon EOS 450D", "node": "/dev/bus/usb/001/004"})
+    before, after, cut = page.evaluate(
+        """([long, why, todo]) => {
+            const box = (name) => document.getElementById(name).getBoundingClientRect();
+            const at = () => ['shoot', 'interval-stop'].map((name) => box(name).y);
             const before = at();
-            for (const name of ['verdict-text', 'outcome']) document.getElementById(name).textContent = long;
-            return [before, at()];
+            const put = (name, text) => { document.getElementById(name).textContent = text; };
+            put('verdict-text', why);
+            put('verdict-todo', todo);
+            const cut = box('verdict-todo').bottom - box('verdict').bottom;
+            for (const name of ['verdict-text', 'outcome']) put(name, long);
+            return [before, at(), cut];
         }""",
-        "decoding: 3 frames in a row can't be decoded: the carriers are nowhere near those of the calibration; " * 3,
+        [
+            "decoding: 3 frames in a row can't be decoded: the carriers are nowhere near the calibration's; " * 3,
+            text(forbidden),
+            remedy(forbidden),
+        ],
     )
+    assert cut <= 0, "what to do is not cut off"
     page.screenshot(path=SCREENSHOTS / f"long-reason-{width}x{height}.png")
     assert after == before, "a reason of many words moves a button from under a finger"
     assert watched.wrong == []
@@ -521,6 +539,29 @@ def test_a_setting_is_set_and_what_the_body_says_is_shown(chromium: Browser, dae
     page.select_option("#set-LF_MASK", "mask-1")  # not sent before its button is pressed
     assert page.inner_text("[data-set=LF_MASK]") == "End the flight, set"
     assert watched.wrong == []
+
+
+def test_what_a_camera_that_is_away_said_last_is_grey_with_its_age(chromium: Browser, daemon: Daemon) -> None:
+    page = opened(chromium, daemon, PHONE, is_mobile=True, has_touch=True).page
+    with client(daemon) as one:
+        state = one.get("/api/state").raise_for_status().json()
+    battery = "[...document.querySelectorAll('#instruments div')].find((one) => one.innerText.startsWith('battery'))"
+    assert page.evaluate(f"{battery}.dataset.old === undefined")
+    absent = {"code": "camera.absent", "state": "no-go", "text": "the camera is absent", "todo": "connect it"}
+    state["health"]["camera"] = {"state": "absent", "reason": ""}
+    state["findings"], state["verdict"] = [{**absent, "age_s": 130.0}], "no-go"
+    told = f"retry: 500\ndata: {json.dumps(state)}\n\n"
+    page.route("**/api/events", lambda route: route.fulfill(body=told, content_type="text/event-stream"))
+    page.reload()
+    until(page, "document.querySelector('#verdict').dataset.state === 'no-go'")
+    assert page.inner_text("#verdict-text") == "the camera is absent"
+    assert page.inner_text("#verdict-todo") == "connect it"
+    assert page.inner_text("#verdict-age") == "for 2 min"
+    page.screenshot(path=SCREENSHOTS / "camera-away-phone.png")
+    for name in ("ISO", "battery"):
+        cell = battery.replace("battery", name)
+        assert page.evaluate(f"'old' in {cell}.dataset"), name
+        assert re.search(r"2 min$", page.evaluate(f"{cell}.innerText")), name
 
 
 def test_before_the_first_frame_what_is_not_known_is_unknown(chromium: Browser, tmp_path: Path, sockets: Path) -> None:

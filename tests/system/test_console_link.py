@@ -134,6 +134,10 @@ def top_of_page(page: Page) -> float:
     return float(page.evaluate("document.querySelector('main').getBoundingClientRect().top"))
 
 
+def said_now(page: Page) -> str:
+    return str(page.inner_text("#outcome"))
+
+
 def said(what: str) -> str:
     return f"document.querySelector('#outcome').textContent.includes({what!r})"
 
@@ -169,6 +173,55 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
     if size == "phone":
         shoot(page)
         until(page, f"Number(document.querySelector('#counters dd').textContent) === {before + 1}")
+
+
+@pytest.mark.parametrize("size", ["phone", pytest.param("laptop", marks=pytest.mark.long)])
+def test_a_running_series_is_on_the_first_screen_and_stopped_over_a_bad_link(
+    chromium: Browser, daemon: Daemon, link: Link, size: str
+) -> None:
+    page = page_of(chromium, link.url, size)
+    _, height = SIZES[size]
+    begin_series(page)
+    until(page, r"/^\d+ taken, next /.test(document.querySelector('#progress').textContent)")
+    page.evaluate("scrollTo(0, 0)")
+    picture(page, size, "series")
+    for name in ("progress", "interval-stop"):
+        box = page.locator(f"#{name}").bounding_box()
+        assert box is not None
+        assert 0 <= box["y"] < box["y"] + box["height"] <= height, name
+    link.cut()
+    page.click("#interval-stop")
+    until(page, said("not confirmed; it may still be shooting"))
+    assert page.inner_text("#interval-stop") == "Stopping…"
+    picture(page, size, "stopping")
+    link.mend()
+    until(page, said("the interval is stopped"))
+    until_flown(page)
+    until(page, "document.querySelector('#progress').textContent === ''")
+    until(page, "document.querySelector('#interval-stop').textContent === 'Stop'")
+    picture(page, size, "stopped")
+    assert said_now(page) == "the interval is stopped"
+    another = page_of(chromium, daemon.url, "laptop")
+    begin_series(another)  # what was said of the last one is over
+    until(page, "document.querySelector('#outcome').textContent === ''")
+    until(page, "!document.querySelector('#interval-stop').disabled")
+    page.click("#interval-stop")
+    until(page, said("the interval is stopped"))
+
+
+def begin_series(page: Page) -> None:
+    """Press Start for a series without an end, until one is begun."""
+    page.fill("#interval-s", "0.5")
+    page.fill("#interval-count", "0")
+    for _ in range(100):
+        until(page, "!document.querySelector('#interval-go').disabled")
+        page.evaluate("document.querySelector('#outcome').textContent = ''")
+        page.click("#interval-go")
+        until(page, "!['', 'sending…'].includes(document.querySelector('#outcome').textContent)")
+        if said_now(page).startswith("shot "):
+            break
+        page.wait_for_timeout(100)  # refused: what others asked for is under way
+    until(page, "!document.querySelector('#interval-stop').disabled")
 
 
 @pytest.mark.long
@@ -271,6 +324,7 @@ def test_what_is_lost_without_mask_and_link_is_a_caution_with_names(
         page = page_of(chromium, one.url, "phone", "caution")
         assert page.inner_text("#verdict-word") == "Caution"
         assert state_of(page, Code.DECODE_NO_MASK) == "caution"
+        assert page.inner_text("#verdict-text")
         at_all_sizes(page, "caution")
 
 

@@ -71,6 +71,7 @@ def record(
 def test_well(tmp_path: Path) -> None:
     found = record(tmp_path)
     assert found["findings"] == []
+    assert [link["age_s"] for link in found["link"]["each"]] == [1.0]
     jsonschema.validate({**ENVELOPE, **found}, schema("health"))
 
 
@@ -174,7 +175,9 @@ def test_a_link_on_which_no_ground_station_is_yet_is_no_problem(tmp_path: Path) 
 def test_photographs_by_distance_are_an_interval_in_metres(tmp_path: Path) -> None:
     none = record(tmp_path)
     assert none["interval"] is None
-    by_overlap = SpacingStatistics(Spacing(overlap=0.7), 8.5, 12, 3, 1, None, LATE)
+    by_overlap = SpacingStatistics(Spacing(overlap=0.7), 8.5, 12, 3, 1, None, LATE, 90 * S)
     found = record(tmp_path, series=by_overlap)
-    assert found["interval"] == {"taken": 12, "refused": 3, "count": None, "next_s": None, "distance_m": 8.5}
+    counts = {"taken": 12, "refused": 3, "began_ms": 90_000}
+    assert found["interval"] == {**counts, "count": None, "next_s": None, "distance_m": 8.5}
+    jsonschema.validate({**ENVELOPE, **found}, schema("health"))
     assert codes(found) == ["series.late"]

@@ -228,7 +228,7 @@ def _link(settings: Settings, vehicle: VehicleState, time: ServiceTime) -> tuple
         "positions": telemetry.positions,
         "impossible": telemetry.impossible,
         "jumps": telemetry.jumps,
-        "each": [_counters(link) for link in links],
+        "each": [_counters(link, time.monotonic_ns) for link in links],
     }
     return facts, found if settings.mavlink.url else [finding(Code.LINK_NONE, Subject("service")), *found]
 
@@ -252,18 +252,21 @@ def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[Fi
 def _interval(shutter: ShutterStatistics, series: SpacingStatistics | None) -> dict[str, Any] | None:
     """How far an interval has got, or photographs by distance; None while neither runs."""
     if shutter.interval_s is None and series is not None:
-        counts = {"taken": series.taken, "refused": series.refused}
+        counts = {"taken": series.taken, "refused": series.refused, "began_ms": series.began_ns // 10**6}
         return {**counts, "count": None, "next_s": None, "distance_m": series.spacing_m}
     if shutter.interval_s is None:
         return None
     counts = {"taken": shutter.interval_taken, "refused": shutter.interval_refused}
+    counts["began_ms"] = shutter.interval_began_ns // 10**6
     return {**counts, "count": shutter.interval_count, "next_s": shutter.interval_next_s}
 
 
-def _counters(link: LinkStatistics) -> dict[str, Any]:
-    """The counters of a link."""
+def _counters(link: LinkStatistics, now_ns: int) -> dict[str, Any]:
+    """The counters of a link, and how long ago something was heard on it; None: never."""
+    heard_ns = link.last_heard_monotonic_ns
     return {
         "url": link.url,
+        "age_s": None if heard_ns is None else (now_ns - heard_ns) / 1e9,
         "in": link.packets_in,
         "out": link.packets_out,
         "bad": link.packets_bad,

@@ -55,7 +55,8 @@ class ShutterStatistics:
     """Counters of this flight. shots = pending + succeeded + failed.
 
     `interval_s` is None while no interval runs; else `interval_taken` of `interval_count` (None: for ever) are taken,
-    `interval_refused` were refused instead, and the next is due in `interval_next_s`.
+    `interval_refused` were refused instead, the next is due in `interval_next_s`, and it began at `interval_began_ns`
+    (monotonic).
     """
 
     shots: int
@@ -69,6 +70,7 @@ class ShutterStatistics:
     interval_refused: int = 0
     interval_count: int | None = None
     interval_next_s: float | None = None
+    interval_began_ns: int = 0
 
 
 @dataclass(slots=True)
@@ -258,6 +260,7 @@ class Shutter:
                 0 if interval is None else interval.refused,
                 None if interval is None or interval.left is None else interval.taken + interval.left,
                 None if interval is None else max(0, interval.due_ns - self._clock.monotonic_ns()) / 1e9,
+                0 if interval is None else interval.began_ns,
             )
 
     def _end_interval(self, source: str | None) -> None:

@@ -79,7 +79,7 @@ class SurveyFacts(Protocol):
 @dataclass(frozen=True, slots=True)
 class SpacingStatistics:
     """The photographs so far, `late` ones among them, those that were `refused` instead, and how far apart they are to
-    be now (None: nobody knows). `trouble` says why none is taken, or that they come late."""
+    be now (None: nobody knows). `trouble` says why none is taken, or that they come late. `began_ns` is monotonic."""
 
     wanted: Spacing
     spacing_m: float | None
@@ -88,6 +88,7 @@ class SpacingStatistics:
     late: int
     height: Height | None
     trouble: Finding | None
+    began_ns: int
 
 
 @dataclass(slots=True)
@@ -188,7 +189,14 @@ class DistanceTrigger:
                 spacing_m = way.spacing_m or 0.0
                 trouble = finding(Code.SERIES_LATE, _SERIES, apart_m=way.apart_m, spacing_m=spacing_m)
             return SpacingStatistics(
-                way.wanted, way.spacing_m, way.asked - way.refused, way.refused, way.late, way.height, trouble
+                way.wanted,
+                way.spacing_m,
+                way.asked - way.refused,
+                way.refused,
+                way.late,
+                way.height,
+                trouble,
+                way.began_ns,
             )
 
     def serve(self) -> float:

@@ -15,6 +15,7 @@ let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
 let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
 let isRecording = false;   // of `dappled open`: there is no daemon
 let interval = null, lastFindings = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
+let stoppedMs = null;   // by the daemon's clock: what began until then was ended by Stop here, and the page says so
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
 const handlers = {
@@ -49,11 +50,11 @@ function showState({ health, findings, verdict, area = null, frames_left: frames
   showVerdict(verdict, findings);
   showFindings(findings);
   showCounters(health);
-  interval = health.interval ?? null;
+  takeInterval(health.interval ?? null);
   showInterval();
   map.setVehicle(health.vehicle);
   if (area) map.setHoles(area.version);
-  showInstruments(health, framesLeft, area);
+  showInstruments(health, findings, framesLeft, area);
   settings.show(health.settings ?? []);
   const place = health.vehicle;
   $("map-text").textContent = place
@@ -72,6 +73,16 @@ function showFindings(findings, stale = false) {
 const told = (one) => (one.todo ? `${one.text}: ${one.todo}` : one.text);
 const ageWords = (seconds) => (seconds < 60 ? `${Math.round(seconds)} s` : `${Math.round(seconds / 60)} min`);
 
+// A record of before the daemon's answer to Stop may still say that the series runs; a later one takes the answer away.
+function takeInterval(now) {
+  const isOver = now && stoppedMs !== null && now.began_ms <= stoppedMs;
+  if (now && !isOver && stoppedMs !== null) {
+    stoppedMs = null;
+    if ($("outcome").dataset.state === "stopped") tell("");
+  }
+  interval = isOver ? null : now;
+}
+
 function showInterval() {
   const live = interval && !ended;
   $("interval").dataset.running = live ? "yes" : "";
@@ -87,28 +98,56 @@ function showInterval() {
 const VERDICTS = { go: "Go", caution: "Caution", "no-go": "No-go" };
 
 function showVerdict(verdict, findings) {
+  const [worst, ...others] = verdict === "go" ? [] : findings.filter((one) => one.state !== "go");
   $("verdict").dataset.state = verdict;
   $("verdict-word").textContent = VERDICTS[verdict];
-  $("verdict-text").textContent = verdict === "go" ? "all is well" : told(findings[0]);
+  $("verdict-text").textContent = worst ? worst.text : "all is well";
+  $("verdict-todo").textContent = worst ? worst.todo : "";
+  $("verdict-age").textContent = worst ? `for ${ageWords(worst.age_s)}${others.length ? `, and ${others.length} more below` : ""}` : "";
 }
 
 // What a photographer looks at, of the body as it is now; what is not known is "unknown", and never 0.
-function showInstruments(health, framesLeft, area) {
+// `at` is when a value was true (the page's clock). While the camera is away its last words are old: grey, with their age.
+function showInstruments(health, findings, framesLeft, area) {
   const body = Object.fromEntries((health.settings ?? []).map((one) => [one.name, one.value]));
-  const cell = (name, value, known = true) => element("div", { "data-known": String(known) }, element("dt", {}, name), element("dd", {}, known ? value : "unknown"));
-  const of = (name, setting, text = (value) => value) => cell(name, body[setting] ? text(body[setting]) : "", Boolean(body[setting]));
-  const fix = health.gnss, power = health.vehicle_battery;
+  const cell = (name, value, known = true, at = null, isOld = false) => element("div", { "data-known": String(known), "data-old": isOld ? "" : null }, element("dt", {}, name), element("dd", {}, known ? value : "unknown", ...(known && at !== null ? [" ", element("small", { "data-at": at })] : [])));
+  const away = findings.find((one) => /^camera\.(absent|starting|faulted)$/.test(one.code)), isAway = !["ready", "busy"].includes(health.camera.state);
+  const bodyAt = isAway ? heardAt - 1000 * (away?.age_s ?? 0) : photoAt();   // its settings are read after each frame
+  const of = (name, setting, text = (value) => value, at = isAway ? bodyAt : null) => cell(name, body[setting] ? text(body[setting]) : "", Boolean(body[setting]), at, isAway);
+  const fix = health.gnss, power = health.vehicle_battery, free = health.disk.free_bytes, newest = [...frames.keys()].at(-1);
+  const heardS = health.link.each.map((one) => one.age_s).filter((age) => age !== null);
   $("instruments").replaceChildren(
     of("ISO", "CAM_ISO"),
     of("shutter", "CAM_SHUTTERSPD", (value) => (/^[\d/.]+$/.test(value) ? `${value} s` : value)),
     of("stop", "CAM_APERTURE", (value) => (/^[\d.]+$/.test(value) ? `f/${value}` : value)),
-    of("battery", "CAM_BATTERY"),
-    cell("vehicle's battery", power ? powerWords(power) : "", Boolean(power) && (power.voltage_v ?? power.remaining_percent) !== null),
+    of("battery", "CAM_BATTERY", (value) => value, bodyAt),
+    cell("vehicle's battery", power ? powerWords(power) : "", Boolean(power) && (power.voltage_v ?? power.remaining_percent) !== null, heardAt),
     cell("GNSS", fix ? fixWords(fix) : "", Boolean(fix)),
+    cell("link", linkWords(health.link), true, heardS.length ? heardAt - 1000 * Math.min(...heardS) : null),
+    cell("photo", newest === undefined ? "none yet" : `#${newest}`, true, photoAt()),
+    cell("space", free === null ? "" : `${fixed(free / 1e9, 1, "GB")}`, free !== null, heardAt),
     cell("frames left", framesLeft === null ? "" : framesLeft.toLocaleString("en").replaceAll(",", "\u202f"), framesLeft !== null),
     ...(area ? [cell("area seen", areaWords(area), area.share !== null)] : []),
     histogramCell(),
   );
+  showAges();
+}
+
+// When the newest photograph was taken; null where the clocks can't say so.
+function photoAt() {
+  const taken = [...frames.values()].at(-1)?.tag.utc_ns ?? null;
+  return taken === null || utcAt === null || taken > utcAt ? null : heardAt - (utcAt - taken) / 1e6;
+}
+
+function showAges() {
+  for (const one of document.querySelectorAll("#instruments [data-at]")) {
+    const age = (performance.now() - Number(one.dataset.at)) / 1000, words = age < 2 ? "now" : ageWords(age);
+    if (one.textContent !== words) one.textContent = words;
+  }
+}
+
+function linkWords({ urls, silent }) {
+  return !urls ? "none" : silent === urls ? "silent" : silent ? `${urls - silent} of ${urls} heard` : "heard";
 }
 
 const FIXES = ["no GNSS", "no fix", "2D", "3D", "DGPS", "RTK float", "RTK fixed", "static", "PPP"];
@@ -243,17 +282,21 @@ function tick() {
     $("verdict").dataset.state = "ended";
     $("verdict-word").textContent = "Ended";
     $("verdict-text").textContent = recorded(ended);
+    for (const id of ["verdict-age", "verdict-todo"]) $(id).textContent = "";
   } else if (lost) {
     $("verdict").dataset.state = "lost";
     $("verdict-word").textContent = "No contact";
     $("verdict-text").textContent = `last heard ${Math.round(age / 1000)} s ago`;
+    for (const id of ["verdict-age", "verdict-todo"]) $(id).textContent = "";
   }
   showInterval();
+  showAges();
   const able = token !== null && !stale && !sending && !unconfirmed;
   $("shoot").disabled = !able;
   $("interval-go").disabled = !able || Boolean(interval);
   settings.enable(able);
   $("interval-stop").disabled = Boolean(ended) || stopping || !(interval || lost);
+  $("interval-stop").textContent = stopping ? "Stopping…" : "Stop";
 }
 
 const recordingWords = () => (!connected ? "no answer: has dappled open ended?" : ended ? `recording  ·  ${recorded(ended)}` : "recording");
@@ -304,10 +347,19 @@ async function fire(path, body) {
 // A request without an answer. It outlives a reload of the page: the question is still open then.
 function keep(request) {
   unconfirmed = request;
+  stored("unconfirmed", request && { sequence: request.sequence, token: request.token, elapsed_ms: request.elapsed_ms, kind: request.kind });
+}
+
+// Keep a value for the page's next life, or forget it (null).
+function stored(name, value) {
   try {
-    if (request) sessionStorage.setItem("unconfirmed", JSON.stringify({ sequence: request.sequence, token: request.token, elapsed_ms: request.elapsed_ms, kind: request.kind }));
-    else sessionStorage.removeItem("unconfirmed");
+    if (value) sessionStorage.setItem(name, JSON.stringify(value));
+    else sessionStorage.removeItem(name);
   } catch { /* without storage a reload forgets it */ }
+}
+
+function recalled(name) {
+  try { return JSON.parse(sessionStorage.getItem(name)); } catch { return null; }
 }
 
 const UNCONFIRMED = {
@@ -351,28 +403,34 @@ $("interval").addEventListener("submit", (event) => {
   if (!(seconds >= 0) || !Number.isInteger(count) || count < 0) { tell("give seconds from 0 and a whole number of frames", "bad"); return; }
   fire("/api/interval", { interval_s: seconds, count });
 });
-// To stop is safe at any time: it is sent until the daemon has confirmed it.
+$("interval-stop").addEventListener("click", () => stop({ token: token ?? "", elapsed_ms: Math.round(performance.now() - tokenAt) }));
+
+// To stop is safe at any time: it is sent until the daemon itself has answered, also after a reload of the page.
 // It carries when it was pressed, so that one that comes late does not end an interval that was begun since.
-$("interval-stop").addEventListener("click", async () => {
-  const pressed = { token: token ?? "", elapsed_ms: Math.round(performance.now() - tokenAt) };
+async function stop(pressed) {
   stopping = true;
+  stored("stop", pressed);
   tell("stopping…", "busy");
   tick();
-  for (;;) {
-    try {
-      const answer = await post("/api/interval/stop", pressed);
-      tellAnswer(answer);
-      if (answer.ok) interval = null;
+  for (let isFirst = true; ; isFirst = false) {
+    const answer = await post("/api/interval/stop", pressed).catch(() => ({}));
+    if ("ok" in answer) {   // the daemon's; others are of what lies between
+      if (answer.ok) {
+        interval = null;
+        stoppedMs = Number(pressed.token.split("-").at(-1)) + pressed.elapsed_ms + 1;
+      }
+      tell(answer.ok ? (isFirst ? answer.text : "the interval is stopped") : answer.error, answer.ok ? "stopped" : "bad");
       break;
-    } catch {
-      if (ended) break;
-      tell("not confirmed; it may still be shooting: sent again until it is", "bad");
-      await new Promise((done) => setTimeout(done, AGAIN_MS));
     }
+    if (ended) { tell("the flight has ended, and what ran with it"); break; }
+    tell(`not confirmed${answer.error ? ` (${answer.error})` : ""}; it may still be shooting: sent again until it is`, "bad");
+    await new Promise((done) => setTimeout(done, AGAIN_MS));
   }
+  stored("stop", null);
   stopping = false;
   tick();
-});
+}
+
 $("follow").addEventListener("change", () => { if ($("follow").checked && frames.size) choose([...frames.keys()].at(-1)); });
 $("map-in").addEventListener("click", () => map.zoom(1.5));
 $("map-out").addEventListener("click", () => map.zoom(1 / 1.5));
@@ -408,7 +466,9 @@ async function connect() {
 }
 
 setInterval(tick, 250);
-try { unconfirmed = JSON.parse(sessionStorage.getItem("unconfirmed")); } catch { unconfirmed = null; }
+unconfirmed = recalled("unconfirmed");
 if (unconfirmed) settle();
+const unanswered = recalled("stop");
+if (unanswered) stop(unanswered);
 tick();
 connect();
