@@ -29,6 +29,7 @@ from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
+from dappled.mocks.body.usbip import UsbIpResponder
 
 _START_S = 300.0  # a process that emulates another processor takes minutes
 _ANSWER_S = 5.0
@@ -51,7 +52,7 @@ class BodyOptions:
     000001.json). `delay_s`: how long a pattern or
     file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
     body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has. `real`: as
-    `reference_camera` has it.
+    `reference_camera` has it. `usbip`: an address of this machine at which it answers over USB/IP, not PTP/IP.
     """
 
     picture: str = "simulated"
@@ -70,6 +71,7 @@ class BodyOptions:
     pairs: bool = False
     addresses: int = 1
     real: bool = False
+    usbip: str = ""
     faults: tuple[str, ...] = ()
 
     def arguments(self) -> list[str]:
@@ -89,6 +91,7 @@ class BodyOptions:
             "--card-bytes": self.card_bytes,
             "--clock-offset": self.clock_offset_s,
             "--addresses": self.addresses,
+            "--usbip": self.usbip or None,
         }
         given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
         given += ["--pairs"] * self.pairs + ["--real"] * self.real
@@ -284,7 +287,7 @@ def _simulated(options: BodyOptions) -> Pictures:
     return Pictures(expose, exposure_s)
 
 
-def _obey(line: str, eos: Eos450d, responder: Responder, faults: BodyFaults) -> str:
+def _obey(line: str, eos: Eos450d, responder: Responder | UsbIpResponder, faults: BodyFaults) -> str:
     if line == "releases":
         return f"ok {eos.releases}"
     if line == "contact":
@@ -323,6 +326,7 @@ def _options(arguments: Sequence[str] | None) -> BodyOptions:
     parser.add_argument("--clock-offset", dest="clock_offset_s", type=float, default=0.0, help="s the body is wrong by")
     parser.add_argument("--pairs", action="store_true", help="raw and JPEG of each picture")
     parser.add_argument("--addresses", type=int, default=1, help="ports that it can be moved between")
+    parser.add_argument("--usbip", default="", help="answer over USB/IP at this address")
     parser.add_argument("--real", action="store_true", help="a round stop, a print error, detail beyond a slice's band")
     parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
     found = vars(parser.parse_args(arguments))
@@ -352,7 +356,11 @@ def serve(options: BodyOptions, lines: Iterable[str]) -> None:
         f_number=options.f_number,
         exposure_s=source.exposure_s,
     )
-    responder = Responder(eos, faults, addresses=options.addresses)
+    responder = (
+        UsbIpResponder(eos, faults, (options.usbip, 0))
+        if options.usbip
+        else Responder(eos, faults, addresses=options.addresses)
+    )
     _say(f"port {' '.join(map(str, responder.ports))}")
     for line in lines:
         _say(_obey(line.strip(), eos, responder, faults))

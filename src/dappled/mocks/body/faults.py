@@ -8,19 +8,25 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from dappled.clock import Clock
 
-LASTING = ("busy", "silence", "refuse", "unplug", "slow", "full")
+LASTING = ("busy", "silence", "refuse", "unplug", "slow", "crawl", "full")
 """busy: a release is answered DeviceBusy. silence: nothing is answered. refuse: no new connection is accepted, as if
 another program held the body. unplug: the links are cut, and no new one is accepted. slow: an object's data come
-at 2 MB/s. full: the card takes no more."""
+at 2 MB/s; crawl: at 0.5 MB/s. full: the card takes no more."""
 
-COUNTED = ("error", "no-event", "short", "drop-transfer", "unplug-transfer", "no-focus")
+COUNTED = ("error", "no-event", "short", "drop-transfer", "unplug-transfer", "stall", "babble", "no-focus")
 """error: a release is answered GeneralError. no-event: a new object isn't announced. short: an object's data end one
 kilobyte early. drop-transfer: the link is cut in the middle of an object's data; unplug-transfer: it is, and stays so
-until "clear". no-focus: a release is answered OK, and no picture is taken."""
+until "clear". On USB only, in the middle of an object's data: stall: the endpoint is halted; babble: more comes than
+was asked for. no-focus: a release is answered OK, and no picture is taken."""
+
+
+_SILENCE_STEP_S = 0.02
+_RATES = {"slow": 40_000, "crawl": 10_000}  # bytes at a time, 50 times a second
+_BIG_BYTES = 65536
 
 
 class BodyFaults:
@@ -67,3 +73,23 @@ class BodyFaults:
             if left:
                 self._left[name] = left - 1
             return left > 0
+
+    def strikes(self, size: int) -> str:
+        """The fault that strikes in the middle of so many bytes of data, "" where none does: the word of a fault that
+        comes into force then, or "stall" or "babble". Uses one up."""
+        ends = ("unplug-transfer", "drop-transfer", "stall", "babble")
+        return next((name.removesuffix("-transfer") for name in ends if size > _BIG_BYTES and self.take(name)), "")
+
+    def pieces(self, data: memoryview, ended: threading.Event) -> Iterator[memoryview]:
+        """The data as fast as a body sends them."""
+        while data and (rates := [rate for name, rate in _RATES.items() if self.lasts(name)]):
+            yield data[: min(rates)]
+            data = data[min(rates) :]
+            ended.wait(_SILENCE_STEP_S)
+        if data:
+            yield data
+
+    def wait_out_silence(self, ended: threading.Event) -> None:
+        """Return when the body may answer again."""
+        while self.lasts("silence") and not ended.wait(_SILENCE_STEP_S):
+            pass

@@ -18,9 +18,6 @@ from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptp import PtpPacket, PtpResponse
 from dappled.workers import Loop
 
-_SILENCE_STEP_S = 0.02
-_SLOW_BYTES = 40_000  # at a time, 50 times a second
-
 
 class Transactions(Protocol):
     """What a responder needs of a body."""
@@ -117,7 +114,7 @@ class Responder:
             link.sendall(ptp.packet(PtpPacket.INIT_FAIL, b"\2\0\0\0"))  # 2: busy
             return
         try:
-            self._wait_out_silence()
+            self._faults.wait_out_silence(self._closed)
             link.sendall(ptp.init_command_ack(1, self._guid, MODEL))
             while not self._closed.is_set():
                 self._transact(link)
@@ -145,37 +142,25 @@ class Responder:
             return  # a cancel, or data without a request
         request = ptp.parse_request(payload)
         data = _read_data(link) if request.code in ptp.WITH_DATA_OUT else b""
-        self._wait_out_silence()
+        self._faults.wait_out_silence(self._closed)
         answer = self._body.answer(request, data)
         if answer.data is not None:
             size = len(answer.data)
             link.sendall(ptp.start_data(request.transaction, size) + ptp.end_data_header(request.transaction, size))
-            big = size > 65536
-            unplugs = big and self._faults.take("unplug-transfer")
-            if unplugs or (big and self._faults.take("drop-transfer")):
+            if struck := self._faults.strikes(size):
                 link.sendall(answer.data[: size // 2])
-                self._faults.command("unplug" if unplugs else "drop")
+                self._faults.command("unplug" if struck == "unplug" else "drop")
                 return
-            self._send(link, memoryview(answer.data))
+            for piece in self._faults.pieces(memoryview(answer.data), self._closed):
+                link.sendall(piece)
         link.sendall(ptp.response(answer.code, request.transaction, answer.parameters))
-
-    def _send(self, link: socket.socket, data: memoryview) -> None:
-        while data and self._faults.lasts("slow"):
-            link.sendall(data[:_SLOW_BYTES])
-            data = data[_SLOW_BYTES:]
-            self._closed.wait(_SILENCE_STEP_S)
-        link.sendall(data)
-
-    def _wait_out_silence(self) -> None:
-        while self._faults.lasts("silence") and not self._closed.wait(_SILENCE_STEP_S):
-            pass
 
 
 def _read(link: socket.socket) -> tuple[int, bytes]:
-    kind, size = ptp.header(_exactly(link, 8))
+    kind, size = ptp.header(exactly(link, 8))
     if size > 1 << 20:
         raise ptp.MalformedPacketError(f"a packet of {size} bytes is more than an initiator ever sends here")
-    return kind, _exactly(link, size)
+    return kind, exactly(link, size)
 
 
 def _read_data(link: socket.socket) -> bytes:
@@ -188,7 +173,8 @@ def _read_data(link: socket.socket) -> bytes:
             return b"".join(pieces)
 
 
-def _exactly(link: socket.socket, size: int) -> bytes:
+def exactly(link: socket.socket, size: int) -> bytes:
+    """Read so many bytes. Raises OSError."""
     pieces = bytearray()
     while len(pieces) < size:
         piece = link.recv(size - len(pieces))
