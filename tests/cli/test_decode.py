@@ -67,7 +67,7 @@ def test_a_frame_near_the_ideal_aperture_still_shows_where_its_lattice_is(
         r"carriers seen, measured, by the law geometric \(odds against chance: geometric 10\^\d\d : 1", out
     )
     rows = light_files.load(tmp_path / "open.npz").carriers
-    off = rows[:, :2] @ reference_camera(6, scale=0.25).lattice.matrix() - rows[:, 2:]
+    off = rows[:, :2] @ reference_camera(6, scale=0.25, scene="bench").lattice.matrix() - rows[:, 2:]
     assert np.abs(off * (694, 922)).max() < 0.1
 
 

@@ -28,7 +28,7 @@ def _zoom(seed: int, length_mm: float, law: str = "geometric") -> MaskedCamera:
     """The reference camera's mask behind a lens of another focal length; the aperture grows with it."""
     camera = reference_camera(seed, scale=0.25, scene="white")
     optics = replace(camera.optics, focal_length_mm=length_mm, aperture_mm=length_mm / 7.4627, law=law)
-    return replace(camera, optics=optics, installation=reference_camera(seed).installed)
+    return replace(camera, optics=optics, installation=camera.installed)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,8 +68,10 @@ class Landscape:
     detail_texel_m: float = DETAIL_TEXEL_M
 
 
+@lru_cache(maxsize=2)  # 60 MB each
 def build(seed: int, finest_period_m: float, *, sharp: bool = False) -> Landscape:
-    """The landscape of a seed. The fine texture has nothing finer than `finest_period_m` (metres a cycle).
+    """The landscape of a seed; who asks for the same one shares it, and cannot write to its maps. The fine texture has
+    nothing finer than `finest_period_m` (metres a cycle).
 
     Its amplitude falls as frequency^-0.85; where `sharp`, as frequency^-1.2, on a finer map.
     """
@@ -96,7 +99,7 @@ def build(seed: int, finest_period_m: float, *, sharp: bool = False) -> Landscap
     lit = canvas.albedo * _sunlight(canvas.relief)
     mean = float(lit.mean())
     period_m, texel_m, slope = SHARP_DETAIL if sharp else (DETAIL_PERIOD_M, DETAIL_TEXEL_M, 0.85)
-    return Landscape(
+    made = Landscape(
         albedo=np.minimum(lit, HEADROOM / 1.15 * mean).astype(np.float32),
         relief=canvas.relief,
         roughness=canvas.rough,
@@ -105,6 +108,9 @@ def build(seed: int, finest_period_m: float, *, sharp: bool = False) -> Landscap
         mean_radiance=mean,
         detail_texel_m=texel_m,
     )
+    for one in (made.albedo, made.relief, made.roughness, made.detail):
+        one.flags.writeable = False
+    return made
 
 
 def noise(rng: np.random.Generator, n: int, texel_m: float, *, slope: float, finest_m: float) -> Singles:
