@@ -39,6 +39,7 @@ def _told(capsys: pytest.CaptureFixture[str], folder: Path, *words: str, mask: s
     return code, out, err
 
 
+@pytest.mark.slow
 def test_a_frame_says_what_was_seen(stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = _told(capsys, stopped.parent, str(stopped), "-o", str(tmp_path / "a.npz"))
     assert code == 0

@@ -69,7 +69,7 @@ def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, mo
     ("more", "words"),
     [
         (["--target", "2"], "give --target one distance per frame"),
-        (["--target", "6", "2"], "in the order of the frames"),
+        pytest.param(["--target", "6", "2"], "in the order of the frames", marks=pytest.mark.slow),
     ],
 )
 def test_wrong_targets_are_told(

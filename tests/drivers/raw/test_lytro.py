@@ -87,7 +87,7 @@ def test_bare_pixels_are_known_by_their_size_or_by_what_lies_beside_them(tmp_pat
         reading.read(path)
 
 
-@pytest.mark.parametrize("kind", [FIRST, ILLUM])
+@pytest.mark.parametrize("kind", [FIRST, pytest.param(ILLUM, marks=pytest.mark.slow)])  # of 41 megapixels
 def test_both_cameras_bare_files(kind: Kind, tmp_path: Path) -> None:
     values = _values(kind.bits, kind.shape)
     path = tmp_path / "frame.raw"
