@@ -23,10 +23,10 @@ EDITS = 50
 WORDS = ("of the chain", "chain lacks", "since dappled wrote it", "other than dappled")
 
 
-@pytest.fixture
-def recorded(flight: Recording) -> FlightFolder:
+@pytest.fixture(scope="module")
+def made(begun: Recording) -> FlightFolder:
     """A closed flight with rows in every table."""
-    return fly(flight)
+    return fly(begun)
 
 
 def fly(flight: Recording, frames: int = 4) -> FlightFolder:

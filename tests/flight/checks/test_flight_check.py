@@ -18,25 +18,25 @@ from tests.flight.makers import deliver, flip, mavlink_2, request, shot, tag, wo
 from tests.standing import failure
 
 
-@pytest.fixture
-def recorded(flight: Recording) -> FlightFolder:
+@pytest.fixture(scope="module")
+def made(begun: Recording) -> FlightFolder:
     """A closed flight: shots 0 and 1 safe, tagged and (0) decoded, shot 2 failed."""
     for index in range(3):
-        request(flight, index)
+        request(begun, index)
     for index in range(2):
-        frame = deliver(flight, index, bytes(1000))
-        flight.ledger.add_tag(tag(frame))
-    flight.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
-    flight.ledger.failed(2, failure("no file came"))
+        frame = deliver(begun, index, bytes(1000))
+        begun.ledger.add_tag(tag(frame))
+    begun.ledger.add_result(Result(0, "ab", 12, 13, "geometric", "predicted"))
+    begun.ledger.failed(2, failure("no file came"))
     for number in range(20):
-        flight.telemetry.append(number, mavlink_2(b"payload"))
-    (flight.folder.path / "inputs/masks").mkdir(parents=True)
+        begun.telemetry.append(number, mavlink_2(b"payload"))
+    (begun.folder.path / "inputs/masks").mkdir(parents=True)
     for name in ("white.npy", "masks/mask-1.toml"):
-        (flight.folder.path / "inputs" / name).write_bytes(b"what frames were decoded with")
-    flight.note_inputs("inputs")
-    flight.add_facts({"identity": {"model": "450D"}})
-    flight.close()
-    return flight.folder
+        (begun.folder.path / "inputs" / name).write_bytes(b"what frames were decoded with")
+    begun.note_inputs("inputs")
+    begun.add_facts({"identity": {"model": "450D"}})
+    begun.close()
+    return begun.folder
 
 
 def alter(folder: FlightFolder, sql: str) -> None:
