@@ -81,19 +81,20 @@ def test_uneven_triggers_are_certain_at_any_delay(lost: int, delay_s: float, see
     assert (found.pairs, found.triggers) == (true, {lost: ()})
 
 
-def test_where_requests_are_as_uneven_as_triggers_the_lost_one_is_in_doubt() -> None:
-    """0 to 0.5 s late at 0.4 s: of a hundred flights few are certain, and right; most others name it."""
+@pytest.mark.parametrize("flights", [25, pytest.param(100, marks=pytest.mark.slow)])
+def test_where_requests_are_as_uneven_as_triggers_the_lost_one_is_in_doubt(flights: int) -> None:
+    """0 to 0.5 s late at 0.4 s: few flights are certain, and right; most others name it."""
     certain = wrong = covered = 0
-    for seed in range(100):
+    for seed in range(flights):
         lost = random.Random(seed).randrange(5, 25)  # noqa: S311  a simulation
         found, _ = flown({lost}, interval_s=0.4, delay_s=0.0, jitter_s=0.5, seed=seed)
         named = {*found.triggers, *itertools.chain(*found.triggers.values())}
         certain += len(named) == 1
         wrong += len(named) == 1 and named != {lost}
         covered += lost in named
-    assert certain < 40
-    assert wrong <= 2
-    assert covered >= 70
+    assert certain < 0.4 * flights
+    assert wrong <= 0.02 * flights
+    assert covered >= 0.7 * flights
 
 
 def test_a_request_that_is_late_shifts_no_others() -> None:
