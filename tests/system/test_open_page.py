@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -59,6 +60,10 @@ def test_a_recording_is_looked_at_and_nothing_on_its_page_waits_for_a_daemon(
     watched = opened(chromium, recording, size, log_in=False, is_mobile=phone, has_touch=phone)
     page = watched.page
     page.wait_for_selector("#gl:not([hidden])")
+    asked = page.evaluate("performance.getEntriesByType('resource').map((one) => one.name)")
+    looked_at = {found[1] for name in asked if (found := re.search(r"/api/frames/(\d+)/(?!thumb|map)", name))}
+    newest = page.get_attribute("#strip > :first-child", "data-frame")
+    assert looked_at == {newest}, "only the frame that is shown is decoded for the page"
     until(page, "document.querySelectorAll('#strip img').length >= 3")
     until(page, "/^recording/.test(document.querySelector('#contact').textContent)")
     SCREENSHOTS.mkdir(parents=True, exist_ok=True)

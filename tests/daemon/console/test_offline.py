@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,43 @@ def test_all_frames_get_their_small_pictures_and_a_bad_one_stops_none(
     assert [one.thumb is not None for one in served.feed.frames.values()] == [True, False]
     assert "frame 1: " in caplog.text
     assert "is damaged" in caplog.text
+
+
+class Gated(FakeDecoder):
+    """Notes the order of frames; the first waits until the others have been asked for."""
+
+    def __init__(self) -> None:
+        self.order: list[int] = []
+        self.begun, self.gate = threading.Event(), threading.Event()
+
+    def decode(self, path: str, focal_length_mm: float | None, f_number: float | None, *, index: int) -> Any:
+        self.order.append(index)
+        self.begun.set()
+        assert self.gate.wait(60)
+        return FakeDecoded()
+
+
+def test_the_frame_that_is_asked_for_is_decoded_before_those_that_nobody_waits_for(tmp_path: Path) -> None:
+    begun = recording.begin(tmp_path, RecordedClock(START_NS))
+    for index in range(8):
+        request(begun, index)
+        begun.ledger.add_tag(tag(deliver(begun, index, b"raw", f"IMG_{index}.CR2")))
+    begun.close()
+    decoder = Gated()
+    folder = begun.folder.path
+    served = Served(FlightFrames(layout.open_folder(folder), flight_report.show(folder), decoder))
+
+    async def looked_at() -> None:
+        beside = asyncio.create_task(served.feed.run())
+        await asyncio.to_thread(decoder.begun.wait, 60)
+        asked = [asyncio.create_task(served.feed.slices(index)) for index in (0, 1, 2, 0)]
+        await asyncio.sleep(0)  # they have asked
+        decoder.gate.set()
+        await asyncio.gather(beside, *asked)
+
+    asyncio.run(looked_at())
+    served.asked()
+    assert decoder.order == [7, 0, 2, 1, 6, 5, 4, 3]
 
 
 def test_a_flight_without_a_mask_says_so(flight: Path) -> None:

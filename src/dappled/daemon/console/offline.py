@@ -5,8 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
+import threading
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -58,8 +59,8 @@ class RecordedStudio(Studio):
 
 
 class RecordedFeed(Feed):
-    """Keeps all frames of a recording from the start. Slices are decoded when a page asks for them, and one after the
-    other in between, the last frame first, so that every frame has its small picture."""
+    """Keeps all frames of a recording from the start. Slices are decoded when a page asks for them, what was asked for
+    last first, and one after the other in between, the last frame first, so that every frame has its small picture."""
 
     recording = True
 
@@ -67,7 +68,9 @@ class RecordedFeed(Feed):
         super().__init__("", "", hub, studio)
         self._source = source
         self._decoder = ThreadPoolExecutor(1, "decoder")
-        self._asked_for: dict[int, asyncio.Future[Message]] = {}
+        self._asked_for: dict[int, Future[Message]] = {}
+        self._order: list[int] = []  # those of them that wait for the decoder: the next one is the last here
+        self._ordering = threading.Lock()
         self._begin(dict(source.start))
         for one in source.frames():
             self._frame(dict(one.header))
@@ -80,27 +83,50 @@ class RecordedFeed(Feed):
         """Decode all frames; those that can't be are named in the log."""
         for index in sorted(self.frames, reverse=True):
             try:
-                await self.slices(index)
+                await self._decoded(index, soon=False)
             except FeedError as error:
                 log.warning("frame %d: %s", index, error)
 
     async def slices(self, frame: int) -> Message:
         """The slices of a frame: as kept, or asked for again."""
+        return await self._decoded(frame, soon=True)
+
+    async def _decoded(self, frame: int, *, soon: bool) -> Message:
         if (kept := self._stacks.get(frame)) is not None:
             return kept
         if frame not in self.frames:
             raise FeedError(f"there is no frame {frame} here")
-        if (waiting := self._asked_for.get(frame)) is None:
-            loop = asyncio.get_running_loop()
-            waiting = self._asked_for[frame] = loop.run_in_executor(self._decoder, self._source.slices, frame)
-            waiting.add_done_callback(lambda _: self._asked_for.pop(frame, None))
+        waiting = self._ask_decoder(frame, soon=soon)
         try:
-            message = await asyncio.shield(waiting)
+            message = await asyncio.shield(asyncio.wrap_future(waiting))
         except DappledError as error:
             raise FeedError(sentence(error)) from None
+        finally:
+            if waiting.done():
+                self._asked_for.pop(frame, None)
         if frame not in self._stacks:
             self._slices(message)
         return message
+
+    def _ask_decoder(self, frame: int, *, soon: bool) -> Future[Message]:
+        """The frame's place among those that wait: the next one, or (not `soon`) the last one."""
+        with self._ordering:
+            if (waiting := self._asked_for.get(frame)) is None:
+                waiting = self._asked_for[frame] = Future()
+                self._order.insert(len(self._order) if soon else 0, frame)
+                self._decoder.submit(self._decode_next)
+            elif soon and frame in self._order:
+                self._order.append(self._order.pop(self._order.index(frame)))
+        return waiting
+
+    def _decode_next(self) -> None:
+        with self._ordering:
+            frame = self._order.pop()
+            waiting = self._asked_for[frame]
+        try:
+            waiting.set_result(self._source.slices(frame))
+        except Exception as error:  # noqa: BLE001  who waits for it raises it
+            waiting.set_exception(error)
 
     def close(self) -> None:
         """End the decoding thread, with the frame that it is at."""

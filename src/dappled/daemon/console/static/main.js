@@ -6,7 +6,7 @@ import { Settings } from "./settings.js";
 import { Stage } from "./stage.js";
 
 const $ = (id) => document.getElementById(id);
-const STALE_MS = 3500, DEADLINE_MS = 2000, AGAIN_MS = 1000;
+const STALE_MS = 3500, DEADLINE_MS = 2000, AGAIN_MS = 1000, BURST_MS = 50;
 const stage = new Stage();
 const map = new FieldMap($("map"));
 const settings = new Settings($("settings"), (name, value) => fire("/api/setting", { name, value }), (text, state) => tell(text, state));
@@ -15,6 +15,7 @@ let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
 let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
 let isRecording = false;   // of `dappled open`: there is no daemon
 let interval = null, lastFindings = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
+let following = null;   // a new page is told all frames at once: only the last of them is looked at
 let stoppedMs = null;   // by the daemon's clock: what began until then was ended by Stop here, and the page says so
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
@@ -200,8 +201,11 @@ function showFrame(event) {
   map.setFrame(index, frame.corners, frame.thumb);
   showThumb(index, frame);
   const newest = [...frames].filter(([, one]) => one.thumb).at(-1) ?? [...frames].at(-1);
-  if (chosen === index || ($("follow").checked && newest[0] === index)) choose(index);
-  else if (chosen === null) choose(newest[0]);
+  if (chosen === index) choose(index);
+  else if (chosen === null || ($("follow").checked && newest[0] === index)) {
+    clearTimeout(following);
+    following = setTimeout(choose, BURST_MS, newest[0]);
+  }
 }
 
 function showThumb(index, frame) {
@@ -223,6 +227,7 @@ function showThumb(index, frame) {
 }
 
 function choose(index) {
+  clearTimeout(following);
   chosen = index;
   const frame = frames.get(index);
   for (const one of $("strip").children) one.setAttribute("aria-selected", String(Number(one.dataset.frame) === index));
