@@ -11,7 +11,7 @@ from dappled.findings import Code, Finding, Subject, above_note, finding, text, 
 
 def problems(health: Mapping[str, Any]) -> list[str]:
     """As a pilot is told them."""
-    return [told(one) for one in above_note(in_record(health))]
+    return [str(told(one)) for one in above_note(in_record(health))]
 
 
 def codes(health: Mapping[str, Any]) -> list[str]:
@@ -21,7 +21,7 @@ def codes(health: Mapping[str, Any]) -> list[str]:
 
 def words(problem: Finding | None) -> str:
     """Of a shot's problem; "" without one."""
-    return "" if problem is None else text(problem)
+    return "" if problem is None else str(text(problem))
 
 
 def failure(reason: str) -> Finding:

@@ -46,18 +46,18 @@ def test_the_worst_comes_first_then_the_newest() -> None:
 
 def test_words_take_the_facts() -> None:
     one = finding(Code.FRAME_CLOCK_DISAGREES, Subject("frame", 4), off_s=-8.0)
-    assert findings.text(one) == "by the body's clock it was taken -8 s away from its shot"
-    assert findings.told(one) == f"frame 4: {findings.text(one)}: compare the picture with its neighbours"
+    assert str(findings.text(one)) == "by the body's clock it was taken -8 s away from its shot"
+    assert str(findings.told(one)) == f"frame 4: {findings.text(one)}: compare the picture with its neighbours"
 
 
 def test_a_small_share_of_a_picture_is_not_told_as_none() -> None:
-    assert findings.text(finding(Code.PICTURE_SOFT, Subject("picture"), share=0.0017)).startswith("0.17% of it")
+    assert str(findings.text(finding(Code.PICTURE_SOFT, Subject("picture"), share=0.0017))).startswith("0.17% of it")
 
 
 def test_facts_from_a_damaged_file_are_shown_as_they_are() -> None:
     one = Finding(Code.CAMERA_ABSENT, Subject("camera"), {"reason": ""})
-    assert findings.text(one) == "the camera is absent"
-    assert "None" in findings.text(Finding(Code.POSITION_JUMPED, Subject("vehicle")))
+    assert str(findings.text(one)) == "the camera is absent"
+    assert "None" in str(findings.text(Finding(Code.POSITION_JUMPED, Subject("vehicle"))))
     assert findings.of_json_text('{"code": "camera.absent"}') is None
     assert findings.of_json_text("the camera is absent") is None
     assert findings.of_json_text(findings.json_text(one)) == one
@@ -79,3 +79,11 @@ def test_a_subject_that_is_no_name_is_refused() -> None:
     assert findings.of_json_text(json.dumps(row)) is not None
     row["subject"]["which"] = [1]
     assert findings.of_json_text(json.dumps(row)) is None
+
+
+def test_no_code_can_read_what_is_rendered_for_people() -> None:
+    said = findings.told(finding(Code.FRAME_CLIPPED, Subject("frame", 4), share=0.5))
+    assert str(said) == f"{said}" != ""
+    readers = ("split", "partition", "startswith", "find", "__contains__", "__iter__", "__getitem__", "__len__")
+    assert not [name for name in readers if hasattr(said, name)]
+    assert "__eq__" not in vars(type(said))  # mypy then refuses to compare it with a text

@@ -20,6 +20,23 @@ from typing import Any, Self, TypeAlias
 from dappled import codec
 
 Value: TypeAlias = str | int | float | bool | None
+
+
+class Text:
+    """Words for people. Nothing can compare, search or split them; a face prints them by `str`."""
+
+    __slots__ = ("_words",)
+
+    def __init__(self, words: str) -> None:
+        self._words = words
+
+    def __str__(self) -> str:
+        return self._words
+
+    def __bool__(self) -> bool:
+        return bool(self._words)
+
+
 # What a result was made with, beside its own frames: its findings are told with its name.
 _BESIDE = frozenset({"bare frames", "calibration", "white frame"})
 _NO_FACTS: Mapping[str, Value] = MappingProxyType({})
@@ -302,14 +319,36 @@ class Code(StrEnum):
     POSITION_UNSURE = "position.unsure"
     POSITION_WEAK_FIX = "position.weak_fix"
     POSITION_WITHOUT_FIX = "position.without_fix"
+    SEAL_ANOTHER_FLIGHT = "seal.another_flight"
+    SEAL_BY_OWNER = "seal.by_owner"
+    SEAL_CHANGED = "seal.changed"
+    SEAL_CONTRADICTS_CHAIN = "seal.contradicts_chain"
+    SEAL_DIGESTS_DIFFER = "seal.digests_differ"
+    SEAL_FILE_ADDED = "seal.file_added"
+    SEAL_FILE_CHANGED = "seal.file_changed"
+    SEAL_FILE_MISSING = "seal.file_missing"
+    SEAL_FILE_UNREADABLE = "seal.file_unreadable"
+    SEAL_INPUT_ADDED = "seal.input_added"
+    SEAL_LEDGER_CHANGED = "seal.ledger_changed"
+    SEAL_LINE_CHANGED = "seal.line_changed"
+    SEAL_LINE_TORN = "seal.line_torn"
+    SEAL_LINE_UNLINKED = "seal.line_unlinked"
+    SEAL_LOST = "seal.lost"
+    SEAL_MORE_THAN_LINKS = "seal.more_than_links"
     SEAL_NONE = "seal.none"
     SEAL_NOT_SIGNED = "seal.not_signed"
-    SEAL_NOTED = "seal.noted"
     SEAL_OTHER_KEY = "seal.other_key"
+    SEAL_REWRITTEN = "seal.rewritten"
+    SEAL_SIGNATURE_WRONG = "seal.signature_wrong"
     SEAL_SIGNED = "seal.signed"
+    SEAL_SIGNED_IN_PART = "seal.signed_in_part"
     SEAL_SIGNED_UNTIL = "seal.signed_until"
+    SEAL_TWICE = "seal.twice"
+    SEAL_UNCOVERED = "seal.uncovered"
+    SEAL_UNKNOWN = "seal.unknown"
+    SEAL_UNSEALED = "seal.unsealed"
     SEAL_UNVERIFIED = "seal.unverified"
-    SEAL_WRONG = "seal.wrong"
+    SEAL_UNWRITTEN = "seal.unwritten"
     SERIES_LATE = "series.late"
     SERIES_NO_FIELD = "series.no_field"
     SERIES_NO_HEIGHT = "series.no_height"
@@ -489,28 +528,29 @@ def _filled(sentence: str, facts: Mapping[str, Value]) -> str:
     return _Sentences().vformat(sentence, (), facts)
 
 
-def text(one: Finding) -> str:
+def text(one: Finding) -> Text:
     """What was found, as a clause without its subject and without a full stop."""
-    return _filled(WORDS[one.code].sentence, one.facts)
+    return Text(_filled(WORDS[one.code].sentence, one.facts))
 
 
-def remedy(one: Finding) -> str:
+def remedy(one: Finding) -> Text:
     """What to do; "" where nothing is to be done."""
-    return _filled(WORDS[one.code].remedy, one.facts)
+    return Text(_filled(WORDS[one.code].remedy, one.facts))
 
 
-def named(one: Finding, under: Subject | None = None) -> str:
+def named(one: Finding, under: Subject | None = None) -> Text:
     """What was found, of what, where there are several such things or the result isn't about it.
 
     What stands `under` its subject's name needs it not again.
     """
     plain_one = one.subject.which == "" and one.subject.kind not in _BESIDE
-    return text(one) if plain_one or one.subject == under else f"{one.subject}: {text(one)}"
+    return text(one) if plain_one or one.subject == under else Text(f"{one.subject}: {text(one)}")
 
 
-def told(one: Finding, under: Subject | None = None) -> str:
+def told(one: Finding, under: Subject | None = None) -> Text:
     """What was found, of what, and what to do."""
-    return named(one, under) + (f": {todo}" if (todo := remedy(one)) else "")
+    todo = remedy(one)
+    return Text(f"{named(one, under)}: {todo}" if todo else str(named(one, under)))
 
 
 def of_subject(found: Iterable[Finding], subject: Subject) -> list[Finding]:

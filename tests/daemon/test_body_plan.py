@@ -49,7 +49,7 @@ class Body:
 
 
 def said(found: Finding | None) -> str:
-    return "" if found is None else text(found)
+    return "" if found is None else str(text(found))
 
 
 class Rig:
@@ -71,7 +71,7 @@ class Rig:
 
     def check(self) -> list[str]:
         """What stands between the body and go."""
-        return [told(one) for one in above_note(self.report().findings())]
+        return [str(told(one)) for one in above_note(self.report().findings())]
 
 
 def test_a_setting_that_was_wrong_is_not_over_because_the_camera_was_unplugged() -> None:
@@ -207,7 +207,7 @@ def test_what_a_person_sets_in_flight_is_the_plan_from_then_on() -> None:
     rig.body.refused = ("iso",)
     rig.plan.change("iso", "Auto")
     rig.read(refused="iso was not set to Auto: busy")
-    assert not any("Auto" in told(one) for one in rig.report().wrong)
+    assert not any("Auto" in str(told(one)) for one in rig.report().wrong)
 
 
 def test_each_frame_is_compared_with_the_plan() -> None:

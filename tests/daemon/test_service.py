@@ -386,7 +386,7 @@ def test_one_that_fails_is_tried_again_and_told_once(error: Exception, caplog: p
     assert len(tries) == 3
     assert len(caplog.records) == 1
     assert task.failing is not None
-    assert str(error) in findings_told(task.failing)
+    assert str(error) in str(findings_told(task.failing))
     broken = False
     task.turn(do, 10 * S)
     task.turn(do, 10 * S)

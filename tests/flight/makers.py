@@ -112,4 +112,4 @@ def flip(path: Path, at: int) -> None:
 
 def words_of(found: Iterable[Finding]) -> tuple[str, ...]:
     """What a check found, as a person reads it."""
-    return tuple(map(text, found))
+    return tuple(str(text(one)) for one in found)

@@ -323,7 +323,7 @@ def test_a_body_that_is_not_as_planned(here: Path) -> None:
     """Set by the computer where the body lets it, else no-go; a dial turned in flight is told before the next shot."""
 
     def says(daemon: Flying, words: str) -> bool:
-        found = [named(one) for one in in_record(daemon.service.health()) if one.code == Code.BODY_SETTING_WRONG]
+        found = [str(named(one)) for one in in_record(daemon.service.health()) if one.code == Code.BODY_SETTING_WRONG]
         return any(words in one for one in found) if words else not found
 
     with a_body() as body:

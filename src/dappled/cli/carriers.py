@@ -342,5 +342,5 @@ def _summary(table: Table) -> str:
             f"{start}; no carriers in this frame: it was taken without this mask, or near the mask's ideal "
             f"aperture, where flat areas show none; a decode uses the {whose} prediction"
         )
-    why = "too few or weak" if table.doubt is None else told(table.doubt, FRAME)
+    why = "too few or weak" if table.doubt is None else str(told(table.doubt, FRAME))
     return f"{start}; {table.seen} of {there} carriers seen, {why}: a decode uses the {whose} prediction"

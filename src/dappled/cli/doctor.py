@@ -185,7 +185,7 @@ def _shoot(
             pending = daemon.shoot()
             if pending.frame is None:
                 ended = pending.problem or pending.follows
-                why = None if ended is None else text(ended)
+                why = None if ended is None else str(text(ended))
                 judged = [finding(Code.SHOT_WITHOUT_FRAME, Subject("test shot"), why=why)]
                 break
             latencies.append(test_shot.latency(pending))

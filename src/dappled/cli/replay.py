@@ -133,7 +133,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
     def run(self, output: Output) -> Report:
         """Run a recorded flight."""
         settings = configuration.load(self.config)
-        problems = [text(one) for one in flight_check.check(self.flight).problems] if self.verify else []
+        problems = [str(text(one)) for one in flight_check.check(self.flight).problems] if self.verify else []
         facts = layout.read_facts(layout.open_folder(self.flight)) if self._is_flight else {}
         recipe = self._recipe(facts, settings)
         recording = self._recording()

@@ -90,7 +90,7 @@ class FrameLines:
         """Print the line of a shot that has ended."""
         fields: dict[str, Any] = {"frame": one.shot.index, "state": "safe" if one.frame else "failed"}
         if one.problem:
-            fields["problem"] = text(one.problem)
+            fields["problem"] = str(text(one.problem))
         level = logging.WARNING if one.problem else logging.INFO
         self._lines.put(_Line(json.dumps(frame_values(one)) if self._as_json else frame_line(one), level, fields))
 
@@ -240,7 +240,7 @@ def frame_line(pending: PendingShot) -> str:
     if times:
         words.append(f"ms: {times}")
     if pending.frame is None and pending.follows:
-        words.append(text(pending.follows))
+        words.append(str(text(pending.follows)))
     if pending.problem:
         words.append(f"PROBLEM: {text(pending.problem)}")
     return "  ".join(words)

@@ -372,7 +372,7 @@ class Service:
         """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
         while self._events.of_body:
             if drift := self._body.take(self._events.of_body.popleft()):
-                self._logbook.add(findings.text(drift), "warning")
+                self._logbook.add(str(findings.text(drift)), "warning")
 
     def _follow_vehicle(self) -> None:
         self.navigation.belongs_to(self.component.vehicle)

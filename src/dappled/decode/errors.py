@@ -17,7 +17,7 @@ class NoCarriers(DecodeError):  # noqa: N818  # a finding, not a fault, as below
     """
 
     def __init__(self, finding: Finding, *, expected: bool, focal_length_mm: float, f_number: float) -> None:
-        super().__init__(told(finding, FRAME))
+        super().__init__(str(told(finding, FRAME)))
         self.finding = finding
         self.expected = expected
         self.focal_length_mm = focal_length_mm

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dappled.clock import Clock
-from dappled.findings import text
+from dappled.findings import json_text, text
 from dappled.flight import layout, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import CheckReport
@@ -40,7 +40,8 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
         if found.vouched == "signed":
             return found
         with seals.opened_again(folder, clock, seals.BY_OWNER, key), Ledger(folder.ledger, clock) as ledger:
-            known = {event.text for event in ledger.events() if event.kind == seals.CHANGED}
-            if told := [said for one in found.notes if (said := text(one)) not in known]:
-                ledger.add_event(seals.CHANGED, f"noted before key {key.name} signed it: {'; '.join(told)}")
+            known = [event.finding for event in ledger.events() if event.kind == seals.CHANGED]
+            for one in found.notes:
+                if one not in known:
+                    ledger.add_event(seals.CHANGED, json_text(one))
     return flight_check.check(folder.path, key)

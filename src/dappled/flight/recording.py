@@ -48,7 +48,7 @@ class StrayFileError(FlightError):
     """The file was made safe, but it is not the frame of a shot: it is kept among the frames as `stray`."""
 
     def __init__(self, stray: Stray) -> None:
-        super().__init__(stray.reason and findings.named(stray.reason))
+        super().__init__(str(stray.reason and findings.named(stray.reason)))
         self.stray = stray
 
 

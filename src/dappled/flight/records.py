@@ -191,4 +191,4 @@ class LedgerEvent:
     def words(self) -> str:
         """It as a person reads it."""
         found = self.finding
-        return self.text if found is None else findings.told(found)
+        return self.text if found is None else str(findings.told(found))

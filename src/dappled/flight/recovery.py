@@ -79,7 +79,7 @@ def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:
             if row.state in ("wished", "fired"):
                 lost = finding(Code.SHOT_LOST, Subject("shot", row.shot.index), state=row.state)
                 ledger.failed(row.shot.index, lost)
-                report.append(named(lost))
+                report.append(str(named(lost)))
         if "closed_utc_ns" not in ledger.facts():
             ledger.set_fact(CUT_SHORT, {"shots_s": logs.DURABLE_S, "refusals_s": refusals.INTERVAL_S})
             close_ledger(folder, ledger, clock.utc_ns(), None, report)
@@ -98,7 +98,7 @@ def close_ledger(
 ) -> None:
     """Store in the ledger the telemetry's summary (read from the file when not given) and the flight's end."""
     if telemetry is None and folder.telemetry.exists():
-        telemetry = log_reading.summarise(folder.telemetry, lambda gap: report.append(told(gap)))
+        telemetry = log_reading.summarise(folder.telemetry, lambda gap: report.append(str(told(gap))))
     if telemetry is not None:
         ledger.set_fact("telemetry_packets", telemetry.packets)
         ledger.set_fact("telemetry_bytes", telemetry.size)
@@ -124,7 +124,7 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
 
 def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
     journal = log_reading.read_journal(folder.journal)
-    report = [text(one) for one in journal.problems]
+    report = [str(text(one)) for one in journal.problems]
     for shot in journal.shots:
         if ledger.shot(shot.index) is None:
             ledger.add_shot(shot)
@@ -173,7 +173,7 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
         else:
             why = finding(Code.FILE_UNCLAIMED, Subject("file", name))
             ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, why))
-            report.append(named(why))
+            report.append(str(named(why)))
     return report
 
 

@@ -14,11 +14,12 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled import codec, durable, file_lock
+from dappled import codec, durable, file_lock, findings
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.codec import canonical
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, pruning
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -26,6 +27,7 @@ from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
 from dappled.shown import printable
 
+SEAL = Subject("seal")
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
 BY_OWNER = "signed by its owner"  # why a seal was made that `flight seal` adds
 CHANGED = "changed in between"  # an event: what later work found that was not as the seal before it covers it
@@ -66,10 +68,10 @@ class Seal:
 
 @dataclass(frozen=True, slots=True)
 class SealFile:
-    """The seals of a flight, by number, and what is wrong with their file, in sentences."""
+    """The seals of a flight, by number, and what is wrong with their file."""
 
     seals: Mapping[int, Seal]
-    problems: tuple[str, ...]
+    problems: tuple[Finding, ...]
 
     @property
     def last(self) -> Seal | None:
@@ -147,9 +149,9 @@ def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | No
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event("opened again", why)
         if last is not None and changed:
-            names = ", ".join(changed[:_NAMED]) + (f" and {len(changed) - _NAMED} more" if changed[_NAMED:] else "")
-            text = f"changed, added or removed by something else after seal {last.seal}: {names}"
-            ledger.add_event(CHANGED, printable(text))
+            names, more = printable(", ".join(changed[:_NAMED])), max(0, len(changed) - _NAMED)
+            found = finding(Code.SEAL_CHANGED, SEAL, seal=last.seal, names=names, more=f"{more} more" if more else "")
+            ledger.add_event(CHANGED, findings.json_text(found))
     try:
         yield
     finally:
@@ -248,21 +250,21 @@ def parse(content: bytes, name: str) -> SealFile:
     lines = content.split(b"\n")
     tail = lines.pop()
     seals: dict[int, Seal] = {}
-    problems: list[str] = []
+    problems: list[Finding] = []
     previous = ""
     for number, line in enumerate(lines, 1):
         found = _parse(line)
         if found is None:
-            problems.append(f"line {number} of {name} was changed: it is no seal")
+            problems.append(finding(Code.SEAL_LINE_CHANGED, SEAL, line=number, file=name))
         elif found.previous != previous:
-            problems.append(f"line {number} of {name} does not follow from the line before it")
+            problems.append(finding(Code.SEAL_LINE_UNLINKED, SEAL, line=number, file=name))
         elif found.seal in seals:
-            problems.append(f"line {number} of {name} is seal {found.seal} again")
+            problems.append(finding(Code.SEAL_TWICE, SEAL, line=number, file=name, seal=found.seal))
         if found is not None:
             seals.setdefault(found.seal, found)
         previous = hashlib.sha256(line).hexdigest()
     if tail:
-        problems.append(f"the last line of {name} is torn ({len(tail)} bytes)")
+        problems.append(finding(Code.SEAL_LINE_TORN, SEAL, file=name, bytes=len(tail)))
     return SealFile(seals, tuple(problems))
 
 

@@ -109,7 +109,7 @@ def test_a_contact_that_is_reported_more_than_five_seconds_late_is_no_shot_and_i
     fly(rig, booted_s + 2.0 + late_s, 8.0)
     assert len(rig.fired) == shots
     assert named(rig) == [(2, 2)] * (shots == 1)
-    assert all("late" in text(one) for one in rig.lost_triggers)
+    assert all("late" in str(text(one)) for one in rig.lost_triggers)
 
 
 @pytest.mark.parametrize("personality", ["ardupilot", "px4"])

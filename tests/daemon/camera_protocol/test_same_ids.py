@@ -34,7 +34,7 @@ def test_another_component_with_our_ids_is_named_while_it_is_heard() -> None:
         eventually(camera.component.findings, "the other camera")
         (found,) = camera.component.findings()
         assert found.code is Code.LINK_SAME_IDS
-        assert told(found) == (
+        assert str(told(found)) == (
             f"link 0: {address(twin)} of udpin:127.0.0.1:0 sends as 1/100 too, which is this camera: "
             "give one of them another mavlink.component_id"
         )

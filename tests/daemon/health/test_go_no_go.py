@@ -34,7 +34,7 @@ def battery(voltage_v: float | None, remaining_percent: int | None, *, low: bool
 
 
 def found(**changes: Any) -> list[str]:
-    return [told(one) for one in above_note(go_no_go.judge(copy.deepcopy(WELL) | changes))]
+    return [str(told(one)) for one in above_note(go_no_go.judge(copy.deepcopy(WELL) | changes))]
 
 
 def test_all_is_well() -> None:

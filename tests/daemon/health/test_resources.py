@@ -36,7 +36,7 @@ def test_descriptors_are_counted() -> None:
 def test_a_shortage_is_a_sentence(left: ResourcesLeft, words: str) -> None:
     found = shortage(left)
     assert found is not None
-    assert words in text(found)
+    assert words in str(text(found))
 
 
 def test_unknown_is_not_zero(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,15 +24,15 @@ def test_a_finding_is_told_once_though_its_numbers_change_and_its_end_too() -> N
     alarms = Alarms()
     warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
     assert alarms.lines(health()) == []
-    assert alarms.lines(health(disk(409))) == [(told(disk(409)), warning)]
+    assert alarms.lines(health(disk(409))) == [(str(told(disk(409))), warning)]
     troubled = [alarms.troubled]
-    assert alarms.lines(health(CAMERA, disk(408))) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
+    assert alarms.lines(health(CAMERA, disk(408))) == [(str(told(CAMERA)), mavlink.MAV_SEVERITY_ERROR)]
     troubled += [alarms.troubled]
     assert alarms.lines(health(disk(407))) == [("over: the camera is absent", info)]
     assert alarms.lines(health(disk(406))) == []
     assert alarms.lines(health()) == [("all is well again", info)]
     assert [*troubled, alarms.troubled] == [False, True, False]
-    assert alarms.lines(health(disk(409))) == [(told(disk(409)), warning)]
+    assert alarms.lines(health(disk(409))) == [(str(told(disk(409))), warning)]
 
 
 def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
@@ -69,7 +69,7 @@ def test_what_becomes_a_stop_is_told_again_and_is_not_over_as_a_caution() -> Non
 def test_what_lasts_is_told_again_when_it_is_asked_for() -> None:
     alarms = Alarms()
     alarms.lines(health(CAMERA))
-    assert alarms.lines(health(CAMERA), again=True) == [(told(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
+    assert alarms.lines(health(CAMERA), again=True) == [(str(told(CAMERA)), mavlink.MAV_SEVERITY_ERROR)]
     assert alarms.lines(health(), again=True) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
     assert alarms.lines(health(), again=True) == []
 

@@ -246,7 +246,7 @@ def test_a_jump_over_a_gap_in_the_telemetry_is_seen() -> None:
 def test_a_jump_is_told_until_a_minute_of_positions_came_without_one() -> None:
     back = stepped(30.0, up_m=-40.0, until_s=AT_S + 5)
     (told,) = telemetry_of(changed=back, seconds=AT_S + 60).doubts()
-    assert text(told).startswith("the autopilot's position jumped by 50.0 m against its velocity")
+    assert str(text(told)).startswith("the autopilot's position jumped by 50.0 m against its velocity")
     assert telemetry_of(changed=back, seconds=AT_S + 66).doubts() == ()
     (other,) = telemetry_of(changed=stepped(7.0)).doubts()
     assert other.kind == told.kind

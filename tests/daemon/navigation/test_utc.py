@@ -129,7 +129,7 @@ def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns
     learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     learner.look(None)  # the autopilot was silent for a moment
     told = learner.doubt()
-    assert (told is None) if said is None else (told is not None and said in findings.told(told))
+    assert (told is None) if said is None else (told is not None and said in str(findings.told(told)))
     assert learner.utc_ns(5) == 5
     assert notes.noted == []
     unsure = UtcLearner(notes, known=False)

@@ -256,7 +256,7 @@ def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> Non
         assert found is not None
         assert found.verdict is not None
         assert found.verdict.state == "unknown"
-        assert "could not be judged" in text(found.verdict.reasons[0])
+        assert "could not be judged" in str(text(found.verdict.reasons[0]))
 
 
 def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path) -> None:
@@ -474,7 +474,7 @@ def judged(one: Rig) -> list[str]:
         KeepingState(one.flight.folder.path, one.pipeline.statistics(), PublisherStatistics({}, {}, 0, 0, 0)),
         decoding=DecodingState(True, one.pipeline.decode_failures),
     )
-    return [told(one) for one in in_record(record) if one.code.startswith(("decode.", "carriers."))]
+    return [str(told(one)) for one in in_record(record) if one.code.startswith(("decode.", "carriers."))]
 
 
 def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_path: Path) -> None:
@@ -490,11 +490,11 @@ def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_pa
         assert pending.tag is not None
         assert pending.decoded is not None
         assert wire.slices_header(pending.tag, pending.decoded)["doubts"] == [codec.plain(DOUBT)]
-        assert any(text(DOUBT) in words for words in judged(one))
+        assert any(str(text(DOUBT)) in words for words in judged(one))
         one.decoder.doubts = ()
         one.request(2)
         one.ended(1)
-        assert not any(text(DOUBT) in words for words in judged(one))
+        assert not any(str(text(DOUBT)) in words for words in judged(one))
 
 
 def test_a_law_that_a_full_disk_refuses_is_written_down_with_the_next_frame(

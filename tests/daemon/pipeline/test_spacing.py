@@ -182,7 +182,7 @@ def test_what_is_unknown_takes_no_photograph_by_overlap_and_is_said(change: dict
     for _ in range(100):
         rig.fly(0.1)
         found = rig.trigger.statistics()
-        told.append("" if found is None or found.trouble is None else text(found.trouble))
+        told.append("" if found is None or found.trouble is None else str(text(found.trouble)))
     assert any(says in text for text in told)
     if "hz" not in change:
         assert len(rig.shots_m) == count

@@ -115,7 +115,7 @@ def judged(pose: Pose, *, exposure_s: float | None = 1e-3, rates: tuple[float, f
 def test_a_finding_has_its_bound_and_its_sentence(facts: FrameFacts, state: str, word: str) -> None:
     found = verdict(facts, BOUNDS)
     assert found.state == state
-    assert word in " ".join(map(text, found.reasons))
+    assert word in " ".join(str(text(one)) for one in found.reasons)
     assert (state == "good") == (not found.reasons)
 
 
@@ -161,7 +161,7 @@ def test_what_motion_needs_and_lacks_is_named_and_the_frame_is_not_good(  # type
 ) -> None:
     found = judged(pose, exposure_s=exposure_s, rates=rates)
     assert found.state == "unknown"
-    assert word in text(found.reasons[0])
+    assert word in str(text(found.reasons[0]))
 
 
 def test_blur_is_speed_over_height_times_focal_length() -> None:
@@ -178,7 +178,7 @@ def test_the_height_above_the_ground_goes_before_that_above_the_take_off_place()
         found = judged(over_a_hill, exposure_s=0.01)
         assert found.facts.blur_view_px == pytest.approx(4.0)
         assert found.state == "bad"
-        assert f"over flat ground 25.0 m below (by {source})" in text(found.reasons[0])
+        assert f"over flat ground 25.0 m below (by {source})" in str(text(found.reasons[0]))
 
 
 def test_a_frame_that_is_not_as_planned_is_only_usable() -> None:
@@ -187,12 +187,12 @@ def test_a_frame_that_is_not_as_planned_is_only_usable() -> None:
     for _ in range(5):
         found = judge.judge(tag(flown()), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
     assert found.state == "usable"
-    assert [text(one) for one in found.reasons] == ["taken with focal length 50 mm, not 35 mm as planned"]
+    assert [str(text(one)) for one in found.reasons] == ["taken with focal length 50 mm, not 35 mm as planned"]
     late = judge.judge(tag(flown(), 1 / 60), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
-    assert any("shutter speed 1/60 s, not 1/1000 as planned" in text(one) for one in late.reasons)
+    assert any("shutter speed 1/60 s, not 1/1000 as planned" in str(text(one)) for one in late.reasons)
     unread = judge.judge(tag(flown(), None), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
     assert unread.state == "unknown"
-    assert any("shutter speed unknown, not 1/1000 as planned" in text(one) for one in unread.reasons)
+    assert any("shutter speed unknown, not 1/1000 as planned" in str(text(one)) for one in unread.reasons)
 
 
 def test_the_turn_that_keeps_the_axis_on_the_ground_is_nose_down_behind_and_has_a_sign() -> None:
@@ -228,7 +228,7 @@ def test_the_fastest_place_is_fastest_in_pixels_of_views_that_are_not_square() -
 def test_an_uncertain_time_leaves_the_blur_unknown(known: dict[str, Any], word: str) -> None:
     found = Judge(NADIR, on_gimbal=False).judge(tag(flown(), **known), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
     assert found.state == "unknown"
-    assert word in " ".join(map(text, found.reasons))
+    assert word in " ".join(str(text(one)) for one in found.reasons)
 
 
 def test_no_gimbal_rates_no_motion() -> None:
@@ -247,7 +247,7 @@ def test_three_bad_ones_in_a_row_are_a_problem_and_a_good_one_ends_it() -> None:
         assert judge.counts.bad_in_a_row == count
     judge.count(4, Verdict("bad", (finding(Code.FRAME_DARK, FRAME, share=0.0),)))
     (found,) = judge.counts.findings()  # one sentence, whatever follows
-    assert text(found).startswith("4 bad frames in a row, the first: 10.0% of its pixels are clipped")
+    assert str(text(found)).startswith("4 bad frames in a row, the first: 10.0% of its pixels are clipped")
     judge.count(5, Verdict("good"))
     assert list(judge.counts.findings()) == []
     assert judge.counts.by_state == {"bad": 4, "unknown": 3, "good": 1}
@@ -263,7 +263,7 @@ def test_files_that_come_late_raise_no_alarm_of_long_ago_and_end_none() -> None:
     judge.count(21, bad)
     judge.count(22, bad)
     (found,) = judge.counts.findings()
-    assert text(found).startswith("3 bad frames in a row, the first: 10.0% of its pixels are clipped")
+    assert str(text(found)).startswith("3 bad frames in a row, the first: 10.0% of its pixels are clipped")
     assert judge.counts.by_state == {"bad": 7, "good": 1}
 
 
@@ -283,7 +283,7 @@ def test_a_flight_that_was_never_sharp_is_unknown_by_an_absolute_measure(diamete
         seen = replace(SEEN, detail=detail(soft(grounds[number % 3], diameter)))
         found = judge.judge(tag(flown()), (0, 0, 0), seen, carriers=(24, 24), doubts=())
         assert found.state == state
-        assert said in " ".join(map(text, found.reasons))
+        assert said in " ".join(str(text(one)) for one in found.reasons)
 
 
 def test_a_lens_that_is_turned_in_flight_is_told_at_once_until_ten_frames_show_that_it_stays() -> None:
@@ -292,7 +292,7 @@ def test_a_lens_that_is_turned_in_flight_is_told_at_once_until_ten_frames_show_t
     told = []
     for frame, lens in enumerate(taken):
         judge.count(frame + 10, good, lens)
-        told.append([text(one) for one in judge.counts.findings()])
+        told.append([str(text(one)) for one in judge.counts.findings()])
     first = ["the f-number changed from 5.6 to 8 at frame 13"]
     both = ["the focal length changed from 20 to 50 mm, the f-number changed from 8 to 5.6 at frame 15"]
     assert told == [[], [], [], first, first, both]
@@ -301,7 +301,7 @@ def test_a_lens_that_is_turned_in_flight_is_told_at_once_until_ten_frames_show_t
         judge.count(frame, good)  # a file that doesn't tell its lens shows nothing
     for frame in range(40, 49):
         judge.count(frame, good, (50.0, 5.6))
-    assert [text(one) for one in judge.counts.findings()] == both
+    assert [str(text(one)) for one in judge.counts.findings()] == both
     judge.count(49, good, (50.0, 5.6))
     assert list(judge.counts.findings()) == []
 
@@ -349,7 +349,7 @@ def test_noise_and_shadow_do_not_hide_defocus() -> None:
     with_noise = replace(SEEN, detail=detail(noisy), noise=noise_of(noisy, 0.003))
     judge = Judge(NADIR, on_gimbal=False)
     unknown = judge.judge(tag(flown()), (0, 0, 0), replace(with_noise, noise=1.0), carriers=(24, 24), doubts=())
-    assert "more noise than fine detail" in " ".join(map(text, unknown.reasons))
+    assert "more noise than fine detail" in " ".join(str(text(one)) for one in unknown.reasons)
     shaded = clean.copy()
     shaded[:10] = 0.0005 + rng.normal(0, 0.002, (10, 128))
     (_, along), (_, dark) = detail(clean), detail(shaded)

@@ -62,7 +62,7 @@ def terminal() -> Iterator[tuple[int, str]]:
 
 
 def said(port: GnssPort) -> str:
-    return "" if (found := port.problem()) is None else text(found)
+    return "" if (found := port.problem()) is None else str(text(found))
 
 
 def reading(device: str, book: Book, edge: Edge = "falling") -> GnssPort:
@@ -113,7 +113,7 @@ def test_a_date_that_rolled_over_is_mended_by_this_machine_s_clock_or_told(
     else:
         problem = port.problem()
         assert problem is not None
-        assert said in told(problem)
+        assert said in str(told(problem))
     offs_us = [SATURDAY_S * 10**6 + 500 - found.time_usec for found in book.marks]
     week_us = 7 * 86400 * 10**6
     assert [round(off_us / week_us) for off_us in offs_us] == ([] if off_weeks is None else [off_weeks])

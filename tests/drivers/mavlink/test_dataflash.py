@@ -79,7 +79,7 @@ def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path
         if at_s == SPAN_S or form != "tlog":  # a link's log is not read on after its frames
             assert len(told) == (cut > 0)
         assert all(one.subject.which == str(log) and one.level is level for one in told)
-        assert all("cut short" in text(one) or "at the end" in text(one) for one in told)
+        assert all("cut short" in str(text(one)) or "at the end" in str(text(one)) for one in told)
 
 
 @pytest.mark.parametrize(

@@ -88,7 +88,7 @@ def test_one_bad_value_is_missing_at_its_time_and_counted(
     log, _ = written(tmp_path)
     told = found_in(changed(log, name, at, place, value))
     assert [(one.code, one.level) for one in told] == [(Code.LOG_VALUES_MISSING, Level.NOTE)]
-    assert text(told[0]).endswith(f"1 of {name}")
+    assert str(text(told[0])).endswith(f"1 of {name}")
     for here, there in zip(poses(log), honest(), strict=True):
         assert here.source == "interpolated"
         assert away_m(here, there) < 0.1
@@ -112,7 +112,7 @@ def test_bad_values_in_a_row_are_missing_ones(
     log, _ = written(tmp_path)
     told = found_in(changed(log, name, at, place, value, in_a_row=in_a_row))
     assert [(one.code, one.level) for one in told] == [(Code.LOG_VALUES_MISSING, Level.NOTE)]
-    assert text(told[0]).endswith(f"{in_a_row} of {name}")
+    assert str(text(told[0])).endswith(f"{in_a_row} of {name}")
     for here, there in zip(poses(log), honest(), strict=True):
         assert away_m(here, there) < 0.5
         assert here.attitude is not None

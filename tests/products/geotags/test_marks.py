@@ -199,7 +199,7 @@ def test_lost_and_extra_marks_are_named_and_lost_frames_keep_their_place(tmp_pat
     assert found.lost == (3,)
     (extra,) = found.extra
     assert (extra.code, extra.facts["at"]) == (Code.MARK_OF_NO_SHOT, "10:14:33.012 UTC")
-    assert [text(one) for one in found.doubts] == ["1 mark of 5 not fixed: 4 (frame 2, float)"]
+    assert [str(text(one)) for one in found.doubts] == ["1 mark of 5 not fixed: 4 (frame 2, float)"]
     placed, _ = geotags.read(flight, Mounting(), GEOID, found)
     assert placed[3].tag.pose.source == "interpolated"
 
@@ -279,7 +279,7 @@ def test_a_mark_far_from_the_others_is_left_out_and_named(tmp_path: Path) -> Non
 def test_a_contact_that_bounces_counts_once(tmp_path: Path) -> None:
     found = find(fly(tmp_path), [line(at_s) for at_s in sorted([*TIMES_S, TIMES_S[2] + 0.01])])
     assert sorted(found.marks) == list(range(6))
-    assert [told(one) for one in found.extra] == ["mark 4: it is 10 ms after mark 3: it was left out"]
+    assert [str(told(one)) for one in found.extra] == ["mark 4: it is 10 ms after mark 3: it was left out"]
 
 
 def test_the_marks_antenna_has_a_lever_arm_of_its_own(tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def test_a_body_that_is_too_slow_for_the_mission_is_told() -> None:
     def told() -> float:
         wait_s = serve()
         found = vehicle.trigger.statistics()
-        problems.add(None if found is None or found.trouble is None else findings.told(found.trouble))
+        problems.add(None if found is None or found.trouble is None else str(findings.told(found.trouble)))
         return wait_s
 
     vehicle.trigger.serve = told  # type: ignore[method-assign]

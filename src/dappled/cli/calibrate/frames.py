@@ -49,7 +49,9 @@ def view_of(darkroom: Darkroom, path: Path, given: Given = _NOTHING) -> Calibrat
         raise DappledError(f"{path} doesn't say its focal length and f-number: give --focal-length and --f-number")
     bent = not_linear(raw, exposure(raw), of=Subject("calibration frame", path.name))
     if bent and not given.anyway:
-        raise DappledError(f"{path}: {'; '.join(told(one, one.subject) for one in bent)}; --anyway calibrates with it")
+        raise DappledError(
+            f"{path}: {'; '.join(str(told(one, one.subject)) for one in bent)}; --anyway calibrates with it"
+        )
     camera = darkroom.camera(raw.camera_model or "")
     stops = camera.f_numbers
     with darkroom.naming(path):

@@ -51,7 +51,7 @@ def _of_shot(line: ShotLine, utc_correction_ns: int) -> str:
         line.row.state,
     ]
     if line.row.reason:
-        words.append(findings.text(line.row.reason))
+        words.append(str(findings.text(line.row.reason)))
     if line.frame:
         words.append(f"{line.frame.name} {line.frame.size / 1e6:.1f} MB")
     pose = line.tag.pose if line.tag else None
@@ -72,7 +72,7 @@ def of_check(found: CheckReport) -> Iterator[str]:
     yield from (f"note:  {findings.text(one)}" for one in found.notes)
     word, rest = "NOT INTACT", ""
     if found.intact:
-        words, signed = findings.told(found.verdict, found.verdict.subject), found.vouched == "signed"
+        words, signed = str(findings.told(found.verdict, found.verdict.subject)), found.vouched == "signed"
         word, rest = (f"intact, {words}", "") if signed else ("consistent", words)
     size = f"{found.size / 1e6:.1f} MB"
     packets = counted(found.telemetry_packets, "telemetry packet")

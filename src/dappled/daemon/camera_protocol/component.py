@@ -451,7 +451,7 @@ class Component:
         rivals = self._identity.rivals()
         if rivals is not None and rivals.facts != self._rivals:
             self._rivals = rivals.facts
-            self.say(told(rivals), mavlink.MAV_SEVERITY_NOTICE)
+            self.say(str(told(rivals)), mavlink.MAV_SEVERITY_NOTICE)
         self._tell_lost_triggers()
         if (counts := self._shutter.statistics()) != self._reported:
             self._reported = counts

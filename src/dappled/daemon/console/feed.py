@@ -39,8 +39,8 @@ Event = dict[str, Any]
 
 def _shown(one: Finding, row: Mapping[str, Any]) -> dict[str, Any]:
     """A finding as the page shows it."""
-    about = {"code": one.code.value, "state": go_no_go.state([one]), "text": named(one)}
-    return {**about, "todo": remedy(one), "age_s": row["age_s"]}
+    about = {"code": one.code.value, "state": go_no_go.state([one]), "text": str(named(one))}
+    return {**about, "todo": str(remedy(one)), "age_s": row["age_s"]}
 
 
 class FeedError(DappledError):
@@ -273,7 +273,7 @@ class Feed:
             if seen is not None and seen.verdict is None:
                 seen.verdict = {
                     "state": one["state"],
-                    "reasons": [told(why, FRAME) for why in codec.read(tuple[Finding, ...], one["reasons"])],
+                    "reasons": [str(told(why, FRAME)) for why in codec.read(tuple[Finding, ...], one["reasons"])],
                 }
                 self._count(one["frame"], seen)
                 self.hub.send(self.frame_event(one["frame"]))
@@ -343,7 +343,7 @@ def _facts(message: Message) -> dict[str, Any]:
     shape = header["arrays"][0]["shape"]
     return {
         "shape": shape,
-        "doubts": [told(one, FRAME) for one in codec.read(tuple[Finding, ...], header.get("doubts") or ())],
+        "doubts": [str(told(one, FRAME)) for one in codec.read(tuple[Finding, ...], header.get("doubts") or ())],
         **{
             name: header.get(name)
             for name in (

@@ -78,7 +78,7 @@ class FlightFrames:
         for line in self._lines.values():
             if line.tag is not None and line.frame is not None:
                 judged = None if line.result is None else line.result.verdict
-                reasons = [] if judged is None else [told(one, FRAME) for one in judged.reasons]
+                reasons = [] if judged is None else [str(told(one, FRAME)) for one in judged.reasons]
                 verdict = None if judged is None else {"state": judged.state, "reasons": reasons}
                 shown.append(ShownFrame(self._named(wire.frame_header(line.tag, line.frame, None)), verdict))
         return shown

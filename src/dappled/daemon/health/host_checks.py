@@ -43,7 +43,7 @@ class Machine:
 
 def next_step(found: Iterable[Finding]) -> str:
     """What to do first: the remedy of the first stop that has one; "" where there is none."""
-    return next((todo for one in found if one.level is Level.STOP and (todo := remedy(one))), "")
+    return next((str(todo) for one in found if one.level is Level.STOP and (todo := remedy(one))), "")
 
 
 HostCheck = Callable[[Settings, Machine], list[Finding]]

@@ -325,4 +325,4 @@ def line(health: Mapping[str, Any]) -> str:
     """A health record in one line, for `systemctl status`."""
     shots, found = health["shots"], above_note(in_record(health))
     counts = f"camera {health['camera']['state']}, {shots['safe']} of {shots['wished']} frames safe"
-    return f"{counts}; {'; '.join(map(told, found)) or ALL_IS_WELL}"
+    return f"{counts}; {'; '.join(str(told(one)) for one in found) or ALL_IS_WELL}"

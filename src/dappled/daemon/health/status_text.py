@@ -56,7 +56,7 @@ class Alarms:
         before, new = self._lasting, self._new.among(found, again=again)
         self._lasting = bool(standing) and (before or bool(self._new))
         before_stops, self._stops = self._stops, {one.subject: one for one in found if one.level is Level.STOP}
-        lines = [(told(one), _SEVERITIES[one.level]) for one in new]
+        lines = [(str(told(one)), _SEVERITIES[one.level]) for one in new]
         if before and not standing:
             return [("all is well again", mavlink.MAV_SEVERITY_INFO)]
         ended = [

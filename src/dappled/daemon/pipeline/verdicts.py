@@ -216,7 +216,7 @@ class VerdictCounts:
         """Three or more frames that were bad without a good or usable one between them; a change of the lens' settings,
         until so many frames show that it stays."""
         if self.bad_in_a_row >= BAD_IN_A_ROW and self.reason is not None:
-            yield finding(Code.FRAMES_BAD, Subject("flight"), in_a_row=self.bad_in_a_row, why=text(self.reason))
+            yield finding(Code.FRAMES_BAD, Subject("flight"), in_a_row=self.bad_in_a_row, why=str(text(self.reason)))
         if self.drift is not None and self.held < _STAYS:
             yield self.drift
 
@@ -320,7 +320,7 @@ class Judge:
             (tag.exposure_s is None, "the frame has no exposure time"),
             (tag.focal_length_mm is None, "the frame has no focal length"),
             (seen.side_mm is None, "the camera has no profile with the size of its sensor"),
-            (bool(tag.doubts), f"its time is in doubt: {'; '.join(told(one, FRAME) for one in tag.doubts)}"),
+            (bool(tag.doubts), f"its time is in doubt: {'; '.join(str(told(one, FRAME)) for one in tag.doubts)}"),
             (tag.utc_sigma_ns > _LATE_NS, f"its time is known to ±{tag.utc_sigma_ns / 1e6:.0f} ms only"),
             (pose.velocity_ned_m_s is None, "the telemetry has no velocity"),
             (pose.attitude is None, "the telemetry has no attitude"),

@@ -447,7 +447,7 @@ def _file(folder: FlightFolder, row: ShotRow, frame: Frame | None, doubt: Findin
     fired = None if called is None or returned is None else (called, returned)
     if frame is None:
         return RecordedShot(
-            row.shot.index, None, "", fired, reason=text(row.reason) if row.reason else "no frame was recorded"
+            row.shot.index, None, "", fired, reason=str(text(row.reason)) if row.reason else "no frame was recorded"
         )
     arrived_ns = frame.arrived_utc_ns - row.shot.wished_utc_ns + row.shot.wished_monotonic_ns
     facts = {} if doubt is None else {"doubt": codec.plain(doubt)}

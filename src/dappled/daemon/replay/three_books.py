@@ -414,7 +414,7 @@ class _Comparison:
                 yield Imbalance("lost", number, (), *at, "no request reached the camera", instead)
         elif self.pairs.shots[place] not in self.flight.files:
             row = self.flight.rows[self.pairs.shots[place]]
-            reason = text(row.reason) if row.reason else f"the shot is {row.state}"
+            reason = str(text(row.reason)) if row.reason else f"the shot is {row.state}"
             yield Imbalance("without a file", number, (row.shot.index,), *at, reason, instead)
         elif not self.outside:
             index = self.pairs.shots[place]

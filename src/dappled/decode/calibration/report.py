@@ -149,7 +149,7 @@ def as_lines(found: Calibration, mask_distance_mm: float) -> list[str]:
         if law.pupil_mm is not None:
             words += f", exit pupil at the focal length {law.pupil_mm:+.2f} mm"
         lines.append(f"{words}; {law.rms_bins:.2f} bins rms are left")
-    return [*lines, *([] if found.verdict is None else [text(found.verdict)])]
+    return [*lines, *([] if found.verdict is None else [str(text(found.verdict))])]
 
 
 def _table(table: Sequence[Row]) -> list[str]:

@@ -19,12 +19,13 @@ from dappled.flight import layout, log_reading, provenance, pruning, seals
 from dappled.flight.checks import chain_check, place_check, seal_check, telemetry_check
 from dappled.flight.checks.chain_check import ChainFindings
 from dappled.flight.checks.place_check import PlaceFindings
-from dappled.flight.checks.seal_check import SEAL, LedgerBytes, SealFindings, Vouched
+from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
 from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Removed
 from dappled.flight.seal_key import SealKey
+from dappled.flight.seals import SEAL
 from dappled.flight.stored_rows import StoredRows
 
 
@@ -84,8 +85,7 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
                 found += telemetry_check.compare(folder.telemetry, chained.links)
             with _examining("the seals", found):
                 sealed = seal_check.compare(folder, ledger, chained.links, before, key)
-    found += [finding(Code.SEAL_WRONG, SEAL, what=what) for what in sealed.problems]
-    found += [finding(Code.SEAL_NOTED, SEAL, what=what) for what in sealed.notes]
+    found += [*sealed.problems, *sealed.notes]
     found += place_check.compare(place, folder, recorded_as, closed=closed, at_work=sealed.unsealed > 0)
     return CheckReport(
         flight=folder.name,

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from dappled import durable
-from dappled.errors import counted
-from dappled.findings import Code, Finding, Subject, finding
+from dappled.findings import Code, Finding, Level, finding
 from dappled.flight import layout, provenance, seals
 from dappled.flight.chain import ChainLink
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.seal_key import SealKey
-from dappled.flight.seals import Seal
+from dappled.flight.seals import SEAL, Seal
 
 Vouched = Literal["signed", "not verified", "not signed", "not sealed"]
-SEAL = Subject("seal")
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,8 +43,8 @@ class SealFindings:
 
     vouched: Vouched
     verdict: Finding
-    problems: tuple[str, ...]
-    notes: tuple[str, ...]
+    problems: tuple[Finding, ...]
+    notes: tuple[Finding, ...]
     unsealed: int = 0
 
 
@@ -62,65 +60,58 @@ def compare(
     file, facts = seals.read(folder), ledger.facts()
     problems = [*file.problems, *_numbers(file.seals, links, facts), *_heads(file.seals, links, facts)]
     problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
-    notes = [f"seal {number} was never written: its work was interrupted" for number in seals.announced(facts)[1]]
+    notes = [finding(Code.SEAL_UNWRITTEN, SEAL, seal=number) for number in seals.announced(facts)[1]]
     notes += [
-        f"seal {number} was signed later, by hand (flight seal): what stands in the flight since an earlier time, key "
-        f"{seal.key} vouches for from then on"
+        finding(Code.SEAL_BY_OWNER, SEAL, seal=number, key=seal.key)
         for number, seal in file.seals.items()
         if seal.why == seals.BY_OWNER
     ]
-    notes += [event.text for event in ledger.events() if event.kind == seals.CHANGED]
+    notes += [found for event in ledger.events() if event.kind == seals.CHANGED and (found := event.finding)]
     last = file.last
     if last is None:
         return SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), tuple(problems), tuple(notes))
     unsealed = max(0, len(links) - last.links)
     if unsealed:
-        notes.append(
-            f"the flight was opened again after seal {last.seal} ({last.why}): {counted(unsealed, 'link')} "
-            "of the chain and the files written since are not sealed yet"
-        )
-    for wrong, text in _files(folder, last, _vouched_by_ledger(ledger, facts), unsealed=unsealed > 0):
-        (problems if wrong else notes).append(text)
+        notes.append(finding(Code.SEAL_UNSEALED, SEAL, seal=last.seal, why=last.why, links=unsealed))
+    for wrong, found in _files(folder, last, _vouched_by_ledger(ledger, facts), unsealed=unsealed > 0):
+        (problems if wrong else notes).append(replace(found, level=Level.STOP if wrong else Level.NOTE))
     if not unsealed:
         problems += _ledger_file(last, before)
     vouched, verdict = _verdict(file.seals, last, key, unsealed)
     return SealFindings(vouched, verdict, tuple(problems), tuple(notes), unsealed)
 
 
-def _numbers(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[str]:
+def _numbers(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[Finding]:
     """Seals that the ledger tells of and that are not there, and the other way round."""
     count, missing = seals.announced(facts)
     if count > len(links):  # each seal begins with a link
-        yield f"the ledger tells of {count} seals, and its chain has only {counted(len(links), 'link')}"
+        yield finding(Code.SEAL_MORE_THAN_LINKS, SEAL, seals=count, links=len(links))
         return
     for number in sorted(set(range(1, count + 1)) - missing - found.keys()):
-        yield (
-            f"seal {number} is missing from seals.jsonl: it was cut off, or its work was interrupted; that work "
-            "(dappled run, geotag, flight pickup) seals the flight again"
-        )
+        yield finding(Code.SEAL_LOST, SEAL, seal=number)
     for number in sorted(found.keys() - set(range(1, count + 1))):
-        yield f"the ledger does not tell of seal {number}"
+        yield finding(Code.SEAL_UNKNOWN, SEAL, seal=number)
 
 
-def _heads(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[str]:
+def _heads(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[Finding]:
     """Seals that contradict the chain."""
     for number, seal in found.items():
         if seal.flight != seals.of_flight(facts):
-            yield f"seal {number} is of another flight: {seal.flight}"
+            yield finding(Code.SEAL_ANOTHER_FLIGHT, SEAL, seal=number, flight=seal.flight)
         link = links.get(seal.links)
         if link is None or link.link != seal.head:
-            yield f"seal {number} contradicts the chain: link {seal.links} is another one, or is missing"
+            yield finding(Code.SEAL_CONTRADICTS_CHAIN, SEAL, seal=number, link=seal.links)
 
 
-def _signatures(found: Mapping[int, Seal], key: SealKey | None) -> Iterator[str]:
+def _signatures(found: Mapping[int, Seal], key: SealKey | None) -> Iterator[Finding]:
     for number, seal in found.items():
         if (seal.key is None) != (seal.mac is None):
-            yield f"seal {number} is signed in part"
+            yield finding(Code.SEAL_SIGNED_IN_PART, SEAL, seal=number)
         elif key is not None and seal.key == key.name and not key.signed(seal.signed_part(), seal.mac or ""):
-            yield f"the signature of seal {number} is wrong: key {key.name} did not make it"
+            yield finding(Code.SEAL_SIGNATURE_WRONG, SEAL, seal=number, key=key.name)
 
 
-def _rewritten(found: Mapping[int, Seal]) -> Iterator[str]:
+def _rewritten(found: Mapping[int, Seal]) -> Iterator[Finding]:
     """What was recorded never changes from one seal to the next, whoever made that one."""
     first: dict[str, tuple[int, tuple[int, str]]] = {}
     for number, seal in sorted(found.items()):
@@ -129,7 +120,7 @@ def _rewritten(found: Mapping[int, Seal]) -> Iterator[str]:
                 continue
             before, was = first.setdefault(name, (number, digest))
             if was != digest:
-                yield f"seal {number} holds another digest of {name} than seal {before}: it was changed in between"
+                yield finding(Code.SEAL_REWRITTEN, SEAL, seal=number, before=before, file=name)
 
 
 def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
@@ -140,37 +131,37 @@ def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[s
 
 def _files(
     folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]], *, unsealed: bool
-) -> Iterator[tuple[bool, str]]:
-    """(whether that is wrong, sentence) of files that are not those which the newest seal covers. Where work was not
+) -> Iterator[tuple[bool, Finding]]:
+    """(whether that is wrong, what it is) of files that are not those which the newest seal covers. Where work was not
     sealed, only what was recorded can't be the work's."""
     for name, (size, sha256) in last.files.items():
         if name in known and known[name] not in ((size, sha256), (None, sha256)):
             yield (
                 not unsealed or seals.never_changes(name),
-                f"seal {last.seal} and the ledger hold different digests of {name}",
+                finding(Code.SEAL_DIGESTS_DIFFER, SEAL, seal=last.seal, file=name),
             )
     for name, what in seals.differing(folder, last, {*known, folder.ledger.name}):
         if name in known or name == folder.ledger.name:
             continue
         wrong = not unsealed or seals.never_changes(name)
         if isinstance(what, OSError):
-            yield wrong, f"{name} can't be read: {what.strerror}"
+            yield wrong, finding(Code.SEAL_FILE_UNREADABLE, SEAL, file=name, why=what.strerror)
         elif what == "missing":
-            yield wrong, f"{name} is missing: seal {last.seal} covers it"
+            yield wrong, finding(Code.SEAL_FILE_MISSING, SEAL, file=name, seal=last.seal)
         elif what == "changed":
-            yield wrong, f"{name} was changed since seal {last.seal}"
+            yield wrong, finding(Code.SEAL_FILE_CHANGED, SEAL, file=name, seal=last.seal)
         elif name.startswith("inputs/"):
-            yield not unsealed, f"{name} was added since seal {last.seal}"
+            yield not unsealed, finding(Code.SEAL_INPUT_ADDED, SEAL, file=name, seal=last.seal)
         elif not name.startswith("frames/") or name.endswith(layout.SIDECAR):  # other frames are missed in the ledger
-            yield False, f"{name} was added since seal {last.seal}: no seal covers it"
+            yield False, finding(Code.SEAL_FILE_ADDED, SEAL, file=name, seal=last.seal)
 
 
-def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[str]:
+def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[Finding]:
     """The ledger's bytes, free pages too; its rows are compared with the chain."""
     if before.wal_size:
-        yield f"flight.sqlite-wal holds {counted(before.wal_size, 'byte')} that no seal covers"
+        yield finding(Code.SEAL_UNCOVERED, SEAL, bytes=before.wal_size)
     if last.files.get("flight.sqlite") != (before.size, before.sha256):
-        yield f"flight.sqlite was changed since seal {last.seal}: its SHA-256 is not the seal's"
+        yield finding(Code.SEAL_LEDGER_CHANGED, SEAL, seal=last.seal)
 
 
 def _verdict(found: Mapping[int, Seal], last: Seal, key: SealKey | None, unsealed: int) -> tuple[Vouched, Finding]:

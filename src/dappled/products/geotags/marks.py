@@ -113,7 +113,7 @@ def sentences(marked: Marked) -> list[str]:
         north, east, up = marked.shift_m
         lines.append(f"marks less autopilot (median): {north:+.2f} m north, {east:+.2f} m east, {up:+.2f} m up")
     lost = [f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost]
-    return [*lines, *lost, *map(told, marked.extra)]
+    return [*lines, *lost, *(str(told(one)) for one in marked.extra)]
 
 
 def _mark(mark: Mark) -> Subject:
