@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from pathlib import Path
@@ -33,6 +34,26 @@ def test_what_is_for_folders_is_refused_for_a_flight(
     usage, sentence = capsys.readouterr().err.splitlines()
     assert usage.startswith("usage: dappled replay ")
     assert sentence.startswith(f"dappled replay: {words[-2]} is for a folder of frames: ")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--start", "9999-12-31T23:59:59Z"],  # beyond what 64 bits of nanoseconds hold
+        ["--start", "0001-01-01T00:00:00+14:00"],
+        ["--interval", "1e300"],
+        ["--match", "/etc/*"],
+    ],
+)
+def test_times_and_names_that_lead_nowhere_are_one_sentence(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Image.new("RGB", (16, 16)).save(tmp_path / "1.jpg")
+    with contextlib.suppress(SystemExit):  # of argparse
+        assert main(["replay", str(tmp_path), *words])
+    (sentence,) = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("usage: ")]
+    assert words[0] in sentence
+    assert "unexpected" not in sentence
 
 
 @pytest.mark.parametrize("pace", ["max", "1000"])

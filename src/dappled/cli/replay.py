@@ -34,6 +34,7 @@ from dappled.flight import LIVE, TimeSource, layout
 from dappled.flight.checks import flight_check
 
 _OF_FOLDERS = ("telemetry", "vehicle", "match", "start", "interval")
+_LATEST_S = 4_102_444_800  # 2100
 _GIVEN = ("camera", "mask", "white", "dark", "calibration")
 
 
@@ -51,9 +52,12 @@ def _rate(text: str) -> float:
 def _utc_ns(text: str) -> int:
     try:
         time = datetime.fromisoformat(text)
-    except ValueError:
-        raise ValueError(f"{text!r} is not a UTC time such as 2026-11-21T10:15:03Z") from None
-    return round((time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp() * 1e9)
+        since_s = (time if time.tzinfo else time.replace(tzinfo=UTC)).timestamp()
+    except (ValueError, OverflowError):
+        since_s = math.inf
+    if not 0 <= since_s < _LATEST_S:
+        raise ValueError(f"{text!r} is not a UTC time such as 2026-11-21T10:15:03Z")
+    return round(since_s * 1e9)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +103,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         otherwise="the telemetry's first position",
     )  # fmt: skip
     interval: float | None = option(
-        "--interval", "time between the frames of a folder", None, metavar="S", low=0, otherwise="1",
+        "--interval", "time between the frames of a folder", None, metavar="S", low=0, high=86400, otherwise="1",
     )  # fmt: skip
     json: bool = flag("--json", "print one JSON object per frame, and one with what was found, if anything was")
 

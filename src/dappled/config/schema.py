@@ -108,7 +108,9 @@ def read_toml(path: Path) -> tuple[dict[str, Any], TomlSource]:
         words = read_bytes(path).decode("utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file; check the path") from None
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        raise ConfigError(f"{path} can't be read: {error.strerror or error}") from None
+    except ValueError as error:
         raise ConfigError(f"{path} can't be read: {error}") from None
     try:
         return parse_toml(words), TomlSource(str(path), words)

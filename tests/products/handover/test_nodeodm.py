@@ -271,6 +271,8 @@ def test_results_without_an_end_fill_no_disk(
     [
         (("http://127.0.0.1:9", "jpeg"), "no NodeODM server answers at http://127.0.0.1:9"),
         (("127.0.0.1:3000", "jpeg"), "is no address of a NodeODM server"),
+        (("http://[::1", "jpeg"), "is no address of a NodeODM server"),
+        (("http://me:secret@127.0.0.1:9", "jpeg"), "holds no user and no password"),
         (("http://127.0.0.1:9", "empty"), "empty holds no pictures"),
     ],
 )
@@ -281,6 +283,7 @@ def test_what_can_t_be_handed_over_is_one_sentence(
     assert main(["hand-over", "odm", words[0], str(photos.parent / words[1])]) == 1
     said = capsys.readouterr().err
     assert says in said
+    assert "secret" not in said
     assert said.count("\n") == 1
 
 

@@ -111,6 +111,9 @@ def test_the_geoid_is_where_its_makers_say(latitude: float, longitude: float, ex
 def test_a_constant_geoid_and_a_missing_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert geoid("-31.5").undulation_m(10, 10) == -31.5
     assert geoid("-31.5").name == "constant -31.5 m"
+    for metres in ("nan", "inf", "1e400", "-121"):
+        with pytest.raises(EarthError, match=f"nowhere {metres} m above"):
+            geoid(metres)
     with pytest.raises(EarthError, match=r"no geoid grid .*nowhere\.gtx"):
         geoid(str(tmp_path / "nowhere.gtx"))
     (tmp_path / "broken.gtx").write_bytes(b"no grid")

@@ -143,6 +143,8 @@ def of_folder(
     if telemetry is not None and not telemetry.is_file():
         raise DappledError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
+    if Path(match).is_absolute():
+        raise DappledError(f"--match {match} names another folder: give a pattern of names in {folder}")
     named = [path for path in folder.glob(match) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     taken_s = {path: _taken_s(path) for path in named}
     ordered = picture_order.by_time(named, Path.as_posix, taken_s.get)

@@ -115,7 +115,12 @@ class NodeOdm:
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         """Raises NodeOdmError for what is no address."""
-        parts = urllib.parse.urlsplit(url)
+        if "@" in url:  # a password there would stand in each message
+            raise NodeOdmError("a NodeODM server's address holds no user and no password: give its token in a file")
+        try:
+            parts = urllib.parse.urlsplit(url)
+        except ValueError:  # half an address of IPv6
+            parts = urllib.parse.urlsplit("")
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise NodeOdmError(f"{url!r} is no address of a NodeODM server: give one as http://127.0.0.1:3000")
         self._url, self._token = url.rstrip("/"), token

@@ -21,6 +21,7 @@ from dappled.errors import DappledError
 
 GEODETIC = "EPSG:4326"
 _OVERLAP_DEG = 6.0  # how far a projection may be used beyond the area that it was made for
+_MOST_M = 120.0  # of sea level above or below the ellipsoid: EGM2008 has -107 to 86
 _SYSTEM_GRIDS = Path("/usr/share/proj")
 _GEOID_GRIDS = ("egm96_15.gtx", "us_nga_egm96_15.tif", "us_nga_egm08_25.tif", "egm08_25.gtx")
 
@@ -75,12 +76,15 @@ def geoid(given: str | None) -> Geoid:
     """
     if given is not None:
         try:
-            return Geoid(offset_m=float(given))
+            offset_m = float(given)
         except ValueError:
             path = Path(given).expanduser().absolute()
             if not path.is_file():
                 raise EarthError(f"there is no geoid grid {given}: give a .gtx or .tif file, or metres") from None
             return Geoid(grid=path)
+        if not abs(offset_m) <= _MOST_M:
+            raise EarthError(f"sea level is nowhere {given} m above the ellipsoid: give {-_MOST_M:g} to {_MOST_M:g} m")
+        return Geoid(offset_m=offset_m)
     folders = [Path(get_data_dir().split(":")[0]), Path(get_user_data_dir())]
     for folder in (*folders, _SYSTEM_GRIDS):
         for name in _GEOID_GRIDS:
