@@ -3,6 +3,7 @@ from __future__ import annotations
 import hashlib
 import os
 import sqlite3
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from dappled.clock import RecordedClock
+from dappled.daemon.navigation import recorded_vehicles
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, ShotRow, ShotState, Stray
 from dappled.flight.ledger import advance
 from dappled.flight.stored_rows import ledger_damage
@@ -195,6 +197,25 @@ def test_a_record_that_is_no_text_is_told(tmp_path: Path) -> None:
             ledger._rows(f"INSERT INTO {table} VALUES (1, 'x', NULL, NULL)")  # noqa: S608  a constant
             with pytest.raises(FlightError, match="can't be read"):
                 read()
+
+
+@pytest.mark.parametrize("value", ["null", '"x"', "[[1]]", "1e308", '{"correction_ns": "x"}'])
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("began_utc_ns", LedgerReader.began_utc_ns),
+        ("utc_correction", LedgerReader.utc_correction_ns),
+        ("vehicles", recorded_vehicles),
+    ],
+)
+def test_a_fact_of_another_kind_is_told(
+    tmp_path: Path, name: str, read: Callable[[LedgerReader], object], value: str
+) -> None:
+    with ledger_at(tmp_path / "flight.sqlite") as ledger:
+        assert not read(ledger)
+        ledger._rows("INSERT INTO facts (key, value) VALUES (?, ?)", name, value)
+        with pytest.raises(FlightError, match="can't be read"):
+            read(ledger)
 
 
 def test_a_full_disk_is_told(tmp_path: Path) -> None:

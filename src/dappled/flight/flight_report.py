@@ -128,7 +128,8 @@ def balance(path: Path) -> Balance:
     folder = layout.open_folder(path)
     with LedgerReader.open(folder.ledger) as ledger:
         shots, frames, facts = ledger.shots(), ledger.frames(), ledger.facts()
-        correction_ns = ledger.utc_correction_ns()
+        correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.began_utc_ns()
+        cut_short = ledger.fact(dict[str, float], CUT_SHORT)
         events = ledger.events()
         results = ledger.results()
         judged = {index: found for index, one in results.items() if (found := one.verdict)}
@@ -152,9 +153,7 @@ def balance(path: Path) -> Balance:
             refused=_refused(events).total(),
             lost=sum(one.number("triggers") for one in lost),
             lost_triggers=tuple(lost),
-            began_utc_ns=None
-            if correction_ns is None or "began_utc_ns" not in facts
-            else facts["began_utc_ns"] + correction_ns,
+            began_utc_ns=None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns,
             judged=_by_verdict(judged, len(frames)),
             bad=_reasons("bad", judged, frames),
             unknown=_reasons("unknown", judged, frames),
@@ -162,8 +161,13 @@ def balance(path: Path) -> Balance:
             card=_found(events, NOTICED),
             stood=_stood(events, correction_ns),
             cut_short=None
-            if CUT_SHORT not in facts
-            else finding(Code.FLIGHT_CUT_SHORT, Subject("flight"), **facts[CUT_SHORT]),
+            if cut_short is None
+            else finding(
+                Code.FLIGHT_CUT_SHORT,
+                Subject("flight"),
+                shots_s=cut_short.get("shots_s"),
+                refusals_s=cut_short.get("refusals_s"),
+            ),
         )
 
 

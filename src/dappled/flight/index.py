@@ -136,7 +136,7 @@ class ImageIndex(Database):
         known = cut_short or folder.name in self.flights()
         reports = known and folder.telemetry.exists() and folder.telemetry.stat().st_size > 0
         with LedgerReader.open(folder.ledger) as ledger:
-            correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.facts().get("began_utc_ns")
+            correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.began_utc_ns()
             start_utc_ns = None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns
             self.add_flight(folder.name, start_utc_ns, correction_ns)
             frames = {frame.index: frame.name for frame in ledger.frames()}

@@ -238,13 +238,24 @@ class LedgerReader(Database):
         """Values that hold for the whole flight: telemetry_sha256, closed_utc_ns …"""
         return {key: self._load(Any, value) for key, value in self._rows("SELECT key, value FROM facts")}
 
+    def fact(self, kind: type[_Record], name: str) -> _Record | None:
+        """One of these values; None where there is none. Raises FlightError for one of another kind."""
+        rows = self._rows("SELECT value FROM facts WHERE key = ?", name)
+        return self._load(kind, rows[0][0]) if rows else None
+
+    def began_utc_ns(self) -> int | None:
+        """When the flight began, by the machine's clock."""
+        return self.fact(int, "began_utc_ns")
+
     def utc_correction_ns(self) -> int | None:
         """What to add to every `utc_ns` of this flight to get UTC: 0 where the machine knew UTC, None where it never
         learnt it."""
-        facts = self.facts()
-        if "utc_correction" in facts:
-            return int(facts["utc_correction"]["correction_ns"])
-        return 0 if facts.get("utc_known", True) else None
+        correction = self.fact(dict[str, Any], "utc_correction")
+        if correction is None:
+            return None if self.fact(bool, "utc_known") is False else 0
+        if type(found := correction.get("correction_ns")) is not int:
+            raise FlightError(f"a record in the ledger {self.path} can't be read: UTC's correction is no whole number")
+        return found
 
     def image(self) -> bytes:
         """The ledger as one file would hold it now, what stands in its write-ahead log included."""

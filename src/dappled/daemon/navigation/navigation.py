@@ -348,7 +348,7 @@ class Navigation:
 
 def recorded_vehicles(ledger: LedgerReader) -> list[tuple[int, int]]:
     """The vehicles that a flight followed, (number of the first telemetry packet, system id), for `Telemetry`."""
-    return [(packet, system_id) for packet, system_id in ledger.facts().get(_VEHICLES, [])]
+    return ledger.fact(list[tuple[int, int]], _VEHICLES) or []
 
 
 def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:
