@@ -19,6 +19,7 @@ import pytest
 
 from dappled import durable
 from dappled.clock import RecordedClock
+from dappled.findings import told
 from dappled.flight import FlightError, Frame, Recording, layout, recording
 from dappled.flight.checks.flight_check import check
 from tests.flight.conftest import START_UTC_NS
@@ -67,7 +68,7 @@ def shoot(index, size=2_500_000):
         told.append(str(error))
 {fault}
 frames = sorted(os.listdir(flight.folder.frames))
-rows = {{row.shot.index: [row.state, row.reason and text(row.reason)] for row in flight.ledger.shots()}}
+rows = {{row.shot.index: [row.state, row.reason and str(text(row.reason))] for row in flight.ledger.shots()}}
 flight.close()
 print(json.dumps({{"told": told, "safe": safe, "frames": frames, "rows": rows,
                   "problems": [str(one) for one in check(flight.folder.path).problems]}}))
@@ -297,9 +298,9 @@ def test_a_corrupted_ledger_of_a_crashed_flight_is_made_anew(flights: Path) -> N
     for page in range(pages(flight.folder.ledger)):
         spoil(flight.folder.ledger, page)
     after = recording.begin(flights, RecordedClock(LATER_UTC_NS))
-    told = "\n".join(after.recovered)
-    assert f"flight {name}: the ledger was damaged" in told
-    assert "flight.sqlite.damaged" in told
+    said = "\n".join(str(told(one)) for one in after.recovered)
+    assert f"flight {name}: the ledger was damaged" in said
+    assert "flight.sqlite.damaged" in said
     assert after.next_index == 6
     after.close()
     assert check(flight.folder.path).problems == ()

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
+from dappled.findings import told
 from dappled.flight import (
     FlightError,
     FlightsLock,
@@ -276,7 +277,7 @@ def test_an_offload_that_was_cut_short_is_left_to_itself(
     before = sorted(path.name for path in copy.rglob("*"))
     begun = recording.begin(there, CLOCK)
     begun.close()
-    assert any(f"{copy} is the copy of an offload that was cut short" in text for text in begun.recovered)
+    assert any(f"{copy} is the copy of an offload that was cut short" in str(told(one)) for one in begun.recovered)
     assert sorted(path.name for path in copy.rglob("*")) == before
     assert any(
         "an offload to this folder was cut short: run it again" in text for text in words_of(check(copy).problems)

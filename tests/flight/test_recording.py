@@ -15,7 +15,7 @@ import pytest
 
 from dappled.cli import main
 from dappled.clock import RecordedClock
-from dappled.findings import Code, Subject, finding
+from dappled.findings import Code, Subject, finding, told
 from dappled.flight import (
     FlightError,
     ImageIndex,
@@ -87,10 +87,10 @@ def test_a_flight_from_first_to_last(flights: Path, flight: Recording) -> None:
 def test_closing_fails_what_is_open(flight: Recording) -> None:
     request(flight, 0)
     flight.journal.note(shot(1))
-    assert flight.close() == [
-        "shot 1 was noted in the journal only; it is in the ledger now",
-        "shot 0: it was fired, and is lost: the recording ended before its file came",
-        "shot 1: it was wished, and is lost: the recording ended before its file came",
+    assert [(one.code, dict(one.facts)) for one in flight.close()] == [
+        (Code.SHOT_ENTERED, {"shot": 1}),
+        (Code.SHOT_LOST, {"shot": 0, "state": "fired"}),
+        (Code.SHOT_LOST, {"shot": 1, "state": "wished"}),
     ]
     assert check(flight.folder.path).problems == ()
 
@@ -113,28 +113,28 @@ def test_a_crash_is_put_in_order_before_the_next_flight(flights: Path, flight: R
         file.write(logged(2, mavlink_2(b"b"))[:-3])
 
     second = begin_later(flights)
-    told = "\n".join(second.recovered)
+    said = "\n".join(str(told(one)) for one in second.recovered)
     for words in (
         "the half-written file .000002.cr2.part was removed",
         "the last line of",
         "shot 3 was noted in the journal only",
         "frames/000001.cr2 was complete but had no row; it is adopted as the frame of shot 1",
-        "file frames/000007.cr2: it belongs to no shot",
-        "shot 2: it was fired, and is lost",
-        "shot 3: it was wished, and is lost",
+        "frames/000007.cr2 belongs to no shot",
+        "shot 2 was fired, and is lost",
+        "shot 3 was wished, and is lost",
         "18 bytes at the end are not telemetry",
         "it was not closed; it is now",
     ):
-        assert words in told
+        assert words in said
     assert second.next_index == 8  # beyond the stray's number
-    assert [event.text for event in second.ledger.events()] == list(second.recovered)
+    assert [event.finding for event in second.ledger.events()] == list(second.recovered)
     with LedgerReader.open(flight.folder.ledger) as ledger:
         assert [row.state for row in ledger.shots()] == ["safe", "safe", "failed", "failed"]
         assert [frame.name for frame in ledger.frames()] == ["frames/000000.cr2", "frames/000001.cr2"]
         assert [stray.name for stray in ledger.strays()] == ["frames/000007.cr2"]
     assert check(flight.folder.path).problems == ()
     again = recovery.recover_flight(flight.folder, RecordedClock(LATER_UTC_NS))
-    assert again == [f"the last line of {flight.folder.journal} is torn (8 bytes)"]
+    assert [one.code for one in again] == [Code.JOURNAL_TORN]
     second.close()
     third = begin_later(flights)
     assert third.recovered == ()
@@ -173,7 +173,7 @@ def test_a_shot_that_only_the_ledger_kept_is_noted_again(flights: Path, flight: 
 def test_a_flight_that_died_while_it_was_made(flights: Path) -> None:
     folder = layout.create(flights, START_UTC_NS)
     second = begin_later(flights)
-    assert second.recovered == (f"flight {folder.name}: it was not closed; it is now",)
+    assert second.recovered == (finding(Code.FLIGHT_PUT_RIGHT, Subject("flight", folder.name)),)
     assert check(folder.path).problems == ()
     second.close()
 
@@ -186,7 +186,7 @@ def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flig
     flight.folder.ledger.write_bytes(b"damage" * 1000)
     second = begin_later(flights)
     assert second.next_index == 5  # the journal and the frame's name say so
-    assert "the ledger was damaged" in second.recovered[0]
+    assert second.recovered[0].code is Code.LEDGER_REBUILT
     assert (flight.folder.path / "frames/000004.cr2").read_bytes() == b"raw"
     second.close()
 
@@ -224,7 +224,8 @@ def test_the_index_is_made_anew_from_the_flights(flights: Path, flight: Recordin
             db.execute("CREATE TABLE other (a)")
             db.close()
     second = begin_later(flights)
-    assert ("index.sqlite.damaged" in " ".join(second.recovered)) == (harm != "gone")
+    moved = [one.facts["aside"] for one in second.recovered if one.code is Code.INDEX_REBUILT]
+    assert moved == ([] if harm == "gone" else ["index.sqlite.damaged"])
     assert second.index.lookup(0) == IndexEntry(0, flight.folder.name, frame.name, "safe")
     assert second.next_index == 1
     second.close()

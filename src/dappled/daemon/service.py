@@ -152,8 +152,8 @@ class Service:
             self._start_parts(names, stack)
             self._started = True
             self._stack = stack.pop_all()
-        for text in self._recording.recovered:
-            log.warning("earlier flight: %s", text)
+        for one in self._recording.recovered:
+            log.warning("earlier flight: %s", findings.told(one))
 
     def _begin_recording(self, names: Names, recipe: Recipe | None, stack: ExitStack) -> Recipe | None:
         """Begin the flight folder. Returns the recipe with the copies of its files that the flight keeps."""
@@ -489,8 +489,8 @@ class PeriodicTask:
 
 
 def _close(recording: Recording) -> None:
-    for text in recording.close():
-        log.warning("%s", text)
+    for one in recording.close():
+        log.warning("%s", findings.told(one))
 
 
 def _remove_empty(recording: Recording) -> None:

@@ -120,7 +120,7 @@ class ListedFlight:
     name: str
     path: Path
     balance: Balance | None
-    problem: str | None
+    problem: Finding | None
 
 
 def balance(path: Path) -> Balance:
@@ -252,7 +252,8 @@ def list_flights(root: Path) -> list[ListedFlight]:
         try:
             listed.append(ListedFlight(folder.name, folder.path, balance(folder.path), None))
         except FlightError as error:
-            listed.append(ListedFlight(folder.name, folder.path, None, str(error)))
+            why = finding(Code.FLIGHT_UNREADABLE, Subject("flight", folder.name), why=str(error))
+            listed.append(ListedFlight(folder.name, folder.path, None, why))
     return listed
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import cast
 
 from dappled import confined
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, log_reading
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
@@ -127,12 +128,12 @@ class ImageIndex(Database):
         """The flights that are closed and fully indexed."""
         return {row[0] for row in self._rows("SELECT name FROM flights WHERE sealed")}
 
-    def take_in(self, folder: FlightFolder, *, seal: bool, cut_short: bool = False) -> list[str]:
-        """Index all shots of a flight from its ledger. `seal`: no more shots will come. Returns sentences.
+    def take_in(self, folder: FlightFolder, *, seal: bool, cut_short: bool = False) -> list[Finding]:
+        """Index all shots of a flight from its ledger. `seal`: no more shots will come. Returns what was found.
 
         A sealed flight that had a MAVLink link leaves its unreported shots behind, if this index saw it begin. One that
         was `cut_short` does so in any case: an index that lost its reports makes them once more."""
-        problems: list[str] = []
+        problems: list[Finding] = []
         known = cut_short or folder.name in self.flights()
         reports = known and folder.telemetry.exists() and folder.telemetry.stat().st_size > 0
         with LedgerReader.open(folder.ledger) as ledger:
@@ -145,7 +146,7 @@ class ImageIndex(Database):
                 try:
                     self.put(IndexEntry(index, folder.name, frames.get(index), row.state))
                 except FlightError as error:
-                    problems.append(str(error))
+                    problems.append(finding(Code.INDEX_TAKEN, Subject("flight", folder.name), why=str(error)))
         if seal:
             self._seal(folder, reports=reports)
         return problems
@@ -193,10 +194,10 @@ class ImageIndex(Database):
         return max((index for index in known if index is not None), default=-1) + 1
 
 
-def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
+def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[Finding]]:
     """Open the index; a damaged one is moved aside and replaced by an empty one, to be filled from the ledgers.
 
-    Returns the index and a report in sentences. Raises FlightError when no index can be opened or made.
+    Returns the index and what was done. Raises FlightError when no index can be opened or made.
     """
     try:
         return ImageIndex(root), []
@@ -211,7 +212,7 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[str]]:
                 path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
         except OSError as second:
             raise disk_error("move away the damaged index", path, second) from second
-        return ImageIndex(root), [f"{error}; it was moved to {aside.name} and rebuilt from the flights"]
+        return ImageIndex(root), [finding(Code.INDEX_REBUILT, Subject("flights"), why=str(error), aside=aside.name)]
 
 
 def in_order(root: Path) -> list[FlightFolder]:

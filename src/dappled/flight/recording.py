@@ -190,7 +190,7 @@ class Recording:
     telemetry: TelemetryLog
     index: ImageIndex
     next_index: int
-    recovered: tuple[str, ...]
+    recovered: tuple[Finding, ...]
     _lock: FlightsLock
     _clock: Clock
     _key: SealKey | None
@@ -229,8 +229,8 @@ class Recording:
         began_utc_ns = self.ledger.facts()["began_utc_ns"]
         self.index.add_flight(self.folder.name, began_utc_ns + correction_ns, correction_ns)
 
-    def close(self) -> list[str]:
-        """End the flight. Shots still open become failed. Returns sentences.
+    def close(self) -> list[Finding]:
+        """End the flight. Shots still open become failed. Returns what was found.
 
         Raises FlightError when the ledger can't be closed properly; the recovery of the next flight closes it then.
         """
@@ -242,7 +242,8 @@ class Recording:
             stack.callback(self.recorder.close)
             self.journal.close()
             telemetry = self.telemetry.close()
-            report = [text for text in (self.journal.problem, self.telemetry.problem) if text is not None]
+            whys = (self.journal.problem, self.telemetry.problem)
+            report = [finding(Code.LOG_UNWRITTEN, Subject("flight"), why=why) for why in whys if why is not None]
             recovery.close_ledger(self.folder, self.ledger, self._clock.utc_ns(), telemetry, report)
             report += recovery.recover_flight(self.folder, self._clock)
             self.ledger.close()
@@ -287,8 +288,8 @@ def begin(
         journal = ShotJournal(folder.journal, clock=clock)
         stack.callback(journal.close)
         _sync_names(folder)
-        for text in recovered:
-            ledger.add_event("recovery", text)
+        for one in recovered:
+            ledger.add_event("recovery", findings.json_text(one))
         recorder = Recorder(folder, ledger)
         opened = Recording(
             folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, clock, seal_key

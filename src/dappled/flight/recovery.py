@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 from dappled import durable, refusals
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.findings import Code, Subject, finding, named, text, told
+from dappled.findings import Code, Finding, Subject, finding, json_text
 from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
@@ -25,19 +26,19 @@ from dappled.flight.records import CUT_SHORT, Frame, Stray
 from dappled.flight.seal_key import SealKey
 from dappled.flight.stored_rows import ledger_damage
 
+FLIGHT = Subject("flight")
 _JPEG = (".jpg", ".jpeg")
 
 
-def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) -> list[str]:
+def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) -> list[Finding]:
     """Repair all flights that were not closed, and index them. The caller holds the flights' lock.
 
-    A flight that can't be repaired is reported and left as it is; the next flight can begin all the same. Returns
-    sentences.
+    A flight that can't be repaired is reported and left as it is; the next flight can begin all the same.
     """
-    report: list[str] = []
+    report: list[Finding] = []
     for path in layout.unmade(root):
         shutil.rmtree(path, ignore_errors=True)
-        report.append(f"the half-made flight folder {path.name} was removed: nothing had been recorded in it")
+        report.append(finding(Code.FLIGHT_FOLDER_REMOVED, Subject("flights"), folder=path.name))
     sealed = index.sealed()
     for folder in layout.flights(root):
         if folder.name in sealed:
@@ -46,12 +47,12 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
             layout.refuse_unfinished(folder)
             cut_short = not _closed(folder)
             signs = key if key is not None and (cut_short or seals.may_sign(folder, key)) else None
-            report += [f"flight {folder.name}: {text}" for text in recover_flight(folder, clock)]
+            report += [replace(one, subject=Subject("flight", folder.name)) for one in recover_flight(folder, clock)]
             if not seals.is_sealed(folder):
                 seals.seal(folder, clock, "recovered", signs)
             report += index.take_in(folder, seal=True, cut_short=cut_short)
         except (DappledError, OSError) as error:
-            report.append(f"flight {folder.name} could not be repaired: {error}")
+            report.append(finding(Code.FLIGHT_UNREPAIRED, Subject("flight", folder.name), why=str(error)))
     return report
 
 
@@ -64,28 +65,28 @@ def _closed(folder: FlightFolder) -> bool:
         return False
 
 
-def recover_flight(folder: FlightFolder, clock: Clock) -> list[str]:
-    """Repair one flight and close it; a second call finds nothing to do. Returns sentences.
+def recover_flight(folder: FlightFolder, clock: Clock) -> list[Finding]:
+    """Repair one flight and close it; a second call finds nothing to do.
 
     Raises FlightError or OSError when ledger or disk don't allow it, OutsideError when a part of it is a link.
     """
     folder.refuse_links()
-    report = [f"the half-written file {name} was removed" for name in layout.remove_parts(folder)]
+    report = [finding(Code.FILE_PART_REMOVED, FLIGHT, file=name) for name in layout.remove_parts(folder)]
     report += _move_damaged_ledger(folder)
     with Ledger(folder.ledger, clock) as ledger:
         report += _add_noted_shots(folder, ledger)
         report += _adopt(folder, ledger)
         for row in ledger.shots():
             if row.state in ("wished", "fired"):
-                lost = finding(Code.SHOT_LOST, Subject("shot", row.shot.index), state=row.state)
+                lost = finding(Code.SHOT_LOST, FLIGHT, shot=row.shot.index, state=row.state)
                 ledger.failed(row.shot.index, lost)
-                report.append(str(named(lost)))
+                report.append(lost)
         if "closed_utc_ns" not in ledger.facts():
             ledger.set_fact(CUT_SHORT, {"shots_s": logs.DURABLE_S, "refusals_s": refusals.INTERVAL_S})
             close_ledger(folder, ledger, clock.utc_ns(), None, report)
-            report.append("it was not closed; it is now")
-        for text in report:
-            ledger.add_event("recovery", text)
+            report.append(finding(Code.FLIGHT_PUT_RIGHT, FLIGHT))
+        for one in report:
+            ledger.add_event("recovery", json_text(one))
     return report
 
 
@@ -94,11 +95,11 @@ def close_ledger(
     ledger: Ledger,
     utc_ns: int,
     telemetry: logs.TelemetrySummary | None,
-    report: list[str],
+    report: list[Finding],
 ) -> None:
     """Store in the ledger the telemetry's summary (read from the file when not given) and the flight's end."""
     if telemetry is None and folder.telemetry.exists():
-        telemetry = log_reading.summarise(folder.telemetry, lambda gap: report.append(str(told(gap))))
+        telemetry = log_reading.summarise(folder.telemetry, report.append)
     if telemetry is not None:
         ledger.set_fact("telemetry_packets", telemetry.packets)
         ledger.set_fact("telemetry_bytes", telemetry.size)
@@ -106,7 +107,7 @@ def close_ledger(
     ledger.set_fact("closed_utc_ns", utc_ns)
 
 
-def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
+def _move_damaged_ledger(folder: FlightFolder) -> list[Finding]:
     """Move a damaged ledger aside; journal and frames will fill a new one."""
     damage = ledger_damage(folder.ledger)
     if damage is None:
@@ -118,17 +119,16 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[str]:
     if folder.seals.exists():  # they are about that ledger's chain
         os.replace(folder.seals, folder.seals.with_name(folder.seals.name + ".damaged"))
     durable.sync_folder(folder.path)
-    lost = "it was rebuilt from shots.jsonl and frames, without poses, tags and times of firing"
-    return [f"the ledger was damaged ({damage}) and moved to {aside.name}; {lost}"]
+    return [finding(Code.LEDGER_REBUILT, FLIGHT, damage=damage, aside=aside.name)]
 
 
-def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
+def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[Finding]:
     journal = log_reading.read_journal(folder.journal)
-    report = [str(text(one)) for one in journal.problems]
+    report = [*journal.problems]
     for shot in journal.shots:
         if ledger.shot(shot.index) is None:
             ledger.add_shot(shot)
-            report.append(f"shot {shot.index} was noted in the journal only; it is in the ledger now")
+            report.append(finding(Code.SHOT_ENTERED, FLIGHT, shot=shot.index))
     noted = {shot.index for shot in journal.shots}
     missing = [row.shot for row in ledger.shots() if row.shot.index not in noted]
     if missing:
@@ -136,13 +136,13 @@ def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[str]:
         try:
             for shot in missing:
                 writer.note(shot)
-                report.append(f"shot {shot.index} was missing from the journal; it is noted again")
+                report.append(finding(Code.SHOT_NOTED_AGAIN, FLIGHT, shot=shot.index))
         finally:
             writer.close()
     return report
 
 
-def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
+def _adopt(folder: FlightFolder, ledger: Ledger) -> list[Finding]:
     """Adopt files without a row. A file under a final name is complete: the rename came after its fsync."""
     if not folder.frames.is_dir():
         return []
@@ -155,7 +155,7 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
             continue
         path = folder.frames / file_name
         if path.is_symlink():
-            report.append(f"{name} is a link: it is not followed, and is not the frame of any shot")
+            report.append(finding(Code.FILE_NOT_FOLLOWED, FLIGHT, file=name))
             continue
         try:
             stat = path.stat()
@@ -166,14 +166,14 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[str]:
         row = None if number is None else ledger.shot(number)
         if number is not None and row is not None and row.state != "safe":
             ledger.safe(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
-            report.append(f"{name} was complete but had no row; it is adopted as the frame of shot {number}")
+            report.append(finding(Code.FILE_ADOPTED, FLIGHT, file=name, shot=number))
         elif number is not None and file_name.endswith(_JPEG) and _has_raw_frame(ledger, number):
             ledger.add_companion(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
-            report.append(f"{name} was complete but had no row; it is adopted beside the frame of shot {number}")
+            report.append(finding(Code.FILE_ADOPTED_BESIDE, FLIGHT, file=name, shot=number))
         else:
-            why = finding(Code.FILE_UNCLAIMED, Subject("file", name))
+            why = finding(Code.FILE_UNCLAIMED, FLIGHT, file=name)
             ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, why))
-            report.append(str(named(why)))
+            report.append(why)
     return report
 
 

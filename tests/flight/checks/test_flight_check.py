@@ -187,6 +187,7 @@ def test_flights_are_listed_with_what_is_wrong(recorded: FlightFolder) -> None:
     listed = flight_report.list_flights(recorded.path.parent)
     assert [each.name for each in listed] == [other.name, recorded.name]
     assert listed[0].problem is not None
+    assert listed[0].problem.code is Code.FLIGHT_UNREADABLE
     assert listed[0].balance is None
     assert listed[1].balance == flight_report.balance(recorded.path)
     with pytest.raises(FlightError, match="no flights folder"):

@@ -20,7 +20,7 @@ def of_list(one: ListedFlight) -> str:
     """A flight of a list: when it began and what is in it, or why it can't be read."""
     b = one.balance
     if b is None:
-        return f"{one.name}  {one.problem}"
+        return f"{one.name}  {findings.text(one.problem) if one.problem else ''}"
     state = "" if b.closed else "  (open)"
     began = "UTC not known" if b.began_utc_ns is None else _utc(b.began_utc_ns)[:16].replace("T", " ")
     if not b.wishes:

@@ -134,7 +134,7 @@ def _settle(
         flights += 1
         problems += [f"{listed.name}: {text(one)}" for one in flight_check.check(listed.path).problems]
         if listed.balance is None:
-            problems.append(f"{listed.name}: {listed.problem}")
+            problems.append(f"{listed.name}: {listed.problem and str(text(listed.problem))}")
             continue
         safe, failed = safe + listed.balance.safe, failed + listed.balance.failed
         if not listed.balance.balanced or listed.balance.open:
