@@ -66,16 +66,31 @@ class PatternPlace:
         return rows, columns
 
 
+def kept_by_mean(frequencies: Floats, reach_px: float, step: tuple[int, int]) -> Floats:
+    """(K,) what `local_mean` keeps of waves of these frequencies (K, 2), in cycles a pixel: next to nothing, but of
+    those that fold to low ones on samples that stand far apart."""
+    kept = np.ones(len(frequencies))
+    for f, one in zip(frequencies.T, step, strict=True):
+        size, around = _width(reach_px, one), _PASSES * (_width(reach_px, one) - 1)
+        shares = np.exp(-2j * np.pi * np.outer(f * one, np.arange(size) - (size - 1) / 2)).mean(axis=1).real
+        kept *= shares**_PASSES * np.cos(np.pi * f * one * (around % 2))
+    return kept
+
+
 def local_mean(values: Singles, reach_px: float, step: tuple[int, int], weights: Singles | None = None) -> Singles:
     """Values (h, w) of one place averaged over about `reach_px` pixels of the frame; `weights` 0 leaves samples out.
 
     With weights the values have been multiplied by them already, and are divided by the weights' own mean.
     """
-    sizes = [max(1, round(reach_px / one)) for one in step]
+    sizes = [_width(reach_px, one) for one in step]
     if weights is None:
         return _smooth(values, sizes)
     mean = _smooth(weights, sizes)
     return np.asarray(_smooth(values, sizes) / np.maximum(mean, 1e-3), dtype=np.float32)
+
+
+def _width(reach_px: float, step: int) -> int:
+    return max(1, round(reach_px / step))
 
 
 def _smooth(values: Singles, sizes: list[int]) -> Singles:

@@ -4,7 +4,8 @@ Out of focus a carrier's band holds another function of the scene than its local
 over the shadow keeps a ghost: about Σ e^{2πi k·F x} a_k·∇L with L the band around the mean, which has no ghost and no
 detail beyond half of the carriers' distance. Detail of the scene itself goes with ∇L at the carriers no more than
 between them. Block by block the two are compared; where the ghost stands out, sharp picture and band are mixed as their
-errors tell (a Wiener weight).
+errors tell (a Wiener weight). So they are where all that is finer than the band is hardly more than noise, and
+neighbouring pixels, of other colours too, share next to nothing of it.
 """
 
 from __future__ import annotations
@@ -26,20 +27,30 @@ _BLOCK_PX, _BLOCK_PERIODS = 64, 8  # a block's side is at least both
 _EDGE = (0.45, 0.55)  # of the carriers' distance: where the band ends
 _SEEN, _SURE = 3.0, 8.0  # ghost and detail over detail: from where on it counts, and counts in full
 _GEOMETRIC = 1.2  # mean of Gamma(2) variables over the exponential of their mean logarithm, of four
-_NOISE = 1.25  # times what is measured: detail is rather left out than noise kept
+_QUIET, _DETAILED = 1.2, 2.0  # what is finer than the band over its noise: up to where it is weighed, and is not
+_FALLS = 2.5  # times: neighbouring pixels share at least one part in so many of the flattest detail
 _GAIN = 0.2  # a square period: by how much a ghost gains on detail, found for f^-1.1 to f^-1.5, 1 to 5 px a view
 _MARGIN_PERIODS = 4  # reflected around the frame before it is transformed
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sharp:
-    """The samples of one place of the colour pattern: over the shadow, before that, and the mean variance of their
-    noise."""
+    """The samples of one place of the colour pattern: over the shadow, before that, and the variance of their noise."""
 
     place: PatternPlace
     picture: Singles
     frame: Singles
-    noise: float
+    noise: Singles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mixed:
+    """The picture's samples with the band in place of ghosts and of noise; for each, the share of the noise's standard
+    error that is left, None where all is. `soft_share` of the blocks lose more than half of their detail to ghosts."""
+
+    pictures: list[Singles]
+    sigma_left: list[Singles] | None
+    soft_share: float
 
 
 def band_of(frame: Singles, step: tuple[int, int], shadow: Shadow) -> Singles:
@@ -64,9 +75,8 @@ def band_of(frame: Singles, step: tuple[int, int], shadow: Shadow) -> Singles:
     return np.ascontiguousarray(made[top : top + frame.shape[0], left : left + frame.shape[1]], dtype=np.float32)
 
 
-def mixed(samples: Sequence[Sharp], shadow: Shadow) -> tuple[list[Singles], Floats]:
-    """The picture's samples with the band in place of ghosts, and the weights (blocks down, across) of the sharp
-    one."""
+def mixed(samples: Sequence[Sharp], shadow: Shadow) -> Mixed:
+    """Sharp picture and band, block by block as each is nearer to the truth."""
     shape, step = shadow.shape, samples[0].place.step
     side = max(_BLOCK_PX, round(_BLOCK_PERIODS * period_of(shadow.lattice)))
     lengths = [-(-side // one) * one for one in step]
@@ -95,29 +105,70 @@ def mixed(samples: Sequence[Sharp], shadow: Shadow) -> tuple[list[Singles], Floa
         around = np.exp(np.log(power[..., count:][..., nearest] + 1e-30).mean(axis=-1))
         ghost += power[..., :count].sum(axis=-1)
         detail += _GEOMETRIC * around.sum(axis=-1)
-        area = block_sums(np.ones_like(rest), *edges)
         total += block_sums(rest * rest, *edges)
-        noise += one.noise * area
-        pixels += area
+        noise += block_sums(one.noise, *edges)
+        pixels += block_sums(np.ones_like(rest), *edges)
     gain = _GAIN * lengths[0] * lengths[1] / period_of(shadow.lattice) ** 2
-    weights = _weights(ghost / np.maximum(detail, 1e-30), gain, total / pixels, noise / pixels)
+    sharp = _weights(ghost / np.maximum(detail, 1e-30), gain, total / pixels, noise / pixels)
+    detailed = total / np.maximum(noise, 1e-30)
+    if (detailed < _DETAILED).any():
+        detailed = np.maximum(detailed, 1 / (1 - _shared(samples, bands, shape, lengths, blocks)))
+    clean = _weights_of_noise(detailed)
+    soft_share = float(np.mean(sharp < 0.5))
+    weights = np.minimum(sharp, clean)
+    if (weights == 1).all():
+        return Mixed([one.picture for one in samples], None, soft_share)
     smooth = [
         _between(np.arange(n, dtype=np.float64) + 0.5, one, number)
         for n, one, number in zip(shape, lengths, blocks, strict=True)
     ]
-    made = []
+    least = min(1.0, abs(float(np.linalg.det(shadow.lattice.matrix()))) * step[0] * step[1])  # the band's own noise
+    made, left = [], []
     for one, band in zip(samples, bands, strict=True):
         down, across = smooth[0][one.place.row :: step[0]], smooth[1][one.place.column :: step[1]]
         weight = (down @ weights @ across.T).astype(np.float32)
         made.append(band + weight * (one.picture - band))
-    return made, weights
+        left.append((down @ np.sqrt(np.maximum(clean, least)) @ across.T).astype(np.float32))
+    return Mixed(made, left, soft_share)
+
+
+def _shared(
+    samples: Sequence[Sharp], bands: list[Singles], shape: tuple[int, int], lengths: list[int], blocks: list[int]
+) -> Floats:
+    """(blocks down, across): the share of detail in all that is finer than the band, from what neighbouring pixels
+    have in common: of noise nothing, of detail as much more as they have more in common than the next but one."""
+    rest = np.zeros(shape, dtype=np.float32)
+    for one, band in zip(samples, bands, strict=True):
+        rest[one.place.cut] = one.picture - band
+    # The spread plane of a staggered chip has neighbours on diagonals only.
+    diagonal = all((one.place.row + one.place.column) % 2 == 0 for one in samples) and samples[0].place.step != (1, 1)
+    edges = [np.arange(number) * one for number, one in zip(blocks, lengths, strict=True)]
+    common, own = np.zeros((2, 2, *blocks))
+    for index, lag in enumerate((1, 2)):
+        if diagonal:
+            pairs = [(rest[lag:, lag:], rest[:-lag, :-lag]), (rest[lag:, :-lag], rest[:-lag, lag:])]
+        else:
+            pairs = [(rest[:, lag:], rest[:, :-lag]), (rest[lag:], rest[:-lag])]
+        for first, second in pairs:
+            common[index] += block_sums(first * second, *edges)
+            own[index] += block_sums(first * first + second * second, *edges) / 2
+    one, two = common.sum(axis=(1, 2)) / np.maximum(own.sum(axis=(1, 2)), 1e-30)
+    falls = min(one / two, _FALLS) if two > 0 else _FALLS
+    return np.asarray(np.clip(max(falls, 1.0) * common[0] / np.maximum(own[0], 1e-30), 0, 0.99))
+
+
+def _weights_of_noise(ratio: Floats) -> Floats:
+    """Weights of what is finer than the band, from its power over its noise's: 1 where it is detail for the most part;
+    else as a Wiener filter has them, by which no more than `sqrt(weight)` of the error is left."""
+    quiet = np.clip((_DETAILED - ratio) / (_DETAILED - _QUIET), 0, 1)
+    return np.asarray(1 - quiet / np.maximum(ratio, 1))
 
 
 def _weights(ratio: Floats, gain: float, total: Floats, noise: Floats) -> Floats:
     """Weights of the sharp picture: 1 where no ghost stands out; else detail over detail, noise and ghost, which are
     `total`. A ghost adds up over a block, detail doesn't: `ratio` is 1 + `gain` · ghost / (detail and noise)."""
     seen = np.clip((ratio - _SEEN) / (_SURE - _SEEN), 0, 1)
-    detail = np.maximum(total / (1 + np.maximum(ratio - 1, 0) / gain) - _NOISE * noise, 0)
+    detail = np.maximum(total / (1 + np.maximum(ratio - 1, 0) / gain) - noise, 0)
     return np.asarray(1 - seen * (1 - detail / np.maximum(total, 1e-30)))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane, local_mean
-from dappled.decode.picture.focus import Sharp, mixed
+from dappled.decode.picture.focus import Mixed, Sharp, mixed
 from dappled.decode.picture.shadow import Shadow, ShadowFrom
 
 # Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
@@ -20,6 +21,8 @@ _NOISE_PX = 16  # samples on a side of the parts that the noise is measured in
 _NOISE_LEVELS = 6  # of brightness
 _QUIET = 0.1  # of the parts of a level have as little detail as this
 _EVEN_OUT = 36.0  # sum of the squares of (1, −2, 1) times itself
+_ALIKE = 3.78  # the samples that one independent value of that is spread over: Σ of its autocorrelation squared
+_QUIET_SIGMAS = 1.28  # below the mean, where as many values as `_QUIET` lie
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,17 +64,14 @@ def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPi
         light = np.maximum(base + slope * values, base) / (known * known)
         variance = light + (made * np.float32(shadow.sigma[place.colour]) / known) ** 2
         sigma[place.cut], trusted[place.cut] = np.sqrt(variance), sound
-        sharp.append(Sharp(place, made, made * known, float(variance.mean())))
-    mix = np.ones((1, 1))
-    if shadow.source == ShadowFrom.NONE:
-        shown = [one.picture for one in sharp]
-    else:
-        shown, mix = mixed(sharp, shadow)
-    for one, image in zip(sharp, shown, strict=True):
+        sharp.append(Sharp(place, made, made * known, variance))
+    plain = Mixed([one.picture for one in sharp], None, 0.0)
+    shown = plain if shadow.source == ShadowFrom.NONE else mixed(sharp, shadow)
+    for one, image in zip(sharp, shown.pictures, strict=True):
         plane[one.place.cut] = image
-    return UnmaskedPicture(
-        plane, mosaic.pattern, sigma, trusted, shadow, dark / max(samples, 1), float(np.mean(mix < 0.5))
-    )
+    for one, left in zip(sharp, shown.sigma_left or (), strict=False):
+        sigma[one.place.cut] *= left
+    return UnmaskedPicture(plane, mosaic.pattern, sigma, trusted, shadow, dark / max(samples, 1), shown.soft_share)
 
 
 def noise_of(made: Singles, shadow: Singles) -> tuple[float, float]:
@@ -91,6 +91,8 @@ def noise_of(made: Singles, shadow: Singles) -> tuple[float, float]:
     inner = shadow[1:-1, 1:-1]
     variance = parts(bent * bent) / _EVEN_OUT / parts(np.float32(1) / (inner * inner))
     level = parts(made[1:-1, 1:-1])
+    # Of parts that are all alike, the quietest are so by chance.
+    variance /= max(0.3, 1 - _QUIET_SIGMAS * math.sqrt(2 * _ALIKE / (high * wide)))
     edges = np.quantile(level, np.linspace(0, 1, _NOISE_LEVELS + 1))
     quiet, at = [], []
     for low, high_level in itertools.pairwise(edges):

@@ -21,7 +21,7 @@ from scipy import fft, ndimage
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.optics import Lattice, Order
-from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, local_mean, wave_sums
+from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, kept_by_mean, local_mean, wave_sums
 
 Coefficients = NDArray[np.complex128]
 # Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
@@ -35,6 +35,7 @@ _STEP_BINS = 0.3  # of the search, at the outermost order
 _CLEAR = 5.5  # standard deviations of what the search finds where no carriers are
 _FOUND_BINS = 0.5  # standard error of the lattice after the search
 _DEEP = 0.2  # standard deviation of W from which on local means are taken again with the shadow known
+_KEPT = 0.02  # of a carrier in local means: from which on it counts that it is missing beside them
 _STEPS = 3  # of Gauss and Newton, at most
 _ENOUGH = 0.1  # of the frame
 _STILL_BINS = 3e-3  # of a frame: a lattice so near is kept
@@ -121,7 +122,11 @@ def shadow_of(
         # Where pixels are left out, a block's middle is not where its samples are.
         equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half)
     first = equations.fitted(0)
-    if known := first.depth > _DEEP or mosaic.valid is not None:
+    kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
+    lost = bool(np.any(np.abs(kept) > _KEPT))
+    if lost:
+        first = replace(first, coefficients=first.coefficients / np.maximum(1 - kept, 0.1)[:, None])
+    if known := first.depth > _DEEP or mosaic.valid is not None or lost:
         means = _Means.of(mosaic, means.period, first)  # where the light was is known better behind a known shadow
     if known or equations.at != found:
         equations = _Equations.of(means, equations.at, half)

@@ -1,0 +1,83 @@
+"""The picture over masks, layouts, stops, noise and distances drawn by Latin hypercube, against rays of their own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from dappled.decode.optics.carriers import MaskedOptics, Sensor
+from dappled.decode.optics.visibility import order_strengths
+from dappled.decode.picture.blocks import MosaicPlane
+from dappled.decode.picture.picture import picture_of
+from dappled.decode.picture.shadow import period_of, shadow_of
+from tests.decode.picture.drawn import COUNT, FILMS, SHAPE, V_MM, Drawn, draw
+from tests.decode.ray_trials import mask_of
+
+_SEEN = 2e-3  # of the mean, as frames' pictures are made
+
+
+@dataclass(frozen=True)
+class Judged:
+    """`short_db`: how far the picture falls short of the better of raw over the true shadow and the band around the
+    mean; `depth` the shadow's standard deviation; `shares` of the pixels within 1 and 2 σ."""
+
+    short_db: float
+    depth: float
+    shares: tuple[float, float]
+
+
+def judged(shot: Drawn) -> Judged:
+    sensor = Sensor(SHAPE, (shot.pitch_mm[0], 0.0), (0.0, shot.pitch_mm[1]))
+    optics = MaskedOptics(sensor, mask_of(shot.film), "geometric", shot.distance_mm)
+    lattice = optics.lattice(V_MM)
+    there = [one for one in order_strengths(optics, lattice, shot.f_number) if one.on_sensor]
+    orders = [one.order for one in there if one.most > _SEEN] or [one.order for one in there]
+    frame = shot.frame()
+    mosaic = MosaicPlane(frame, shot.pattern)
+    shadow = shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02)
+    made = picture_of(mosaic, shadow, period_of(lattice))
+    others = [shot.psnr(frame / np.maximum(shot.lights[2], 0.01)), shot.psnr(shot.band(frame))]
+    cut = np.zeros(SHAPE, dtype=bool)
+    cut[20:-20, 20:-20] = True
+    inside = cut & made.trusted & (shot.colour_at >= 0)
+    off = np.abs(made.plane - shot.lights[1])[inside] / np.maximum(made.sigma[inside], 1e-9)
+    return Judged(
+        shot.psnr(made.plane) - max(others),
+        float(shot.lights[2][shot.colour_at >= 0].std()),
+        (float(np.mean(off < 1)), float(np.mean(off < 2))),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("number", "most_short_db"), [(5, 0.5), (35, 0.2), (50, 3.0), (90, 0.2), (155, 1.5), (185, 0.3)]
+)
+def test_a_drawn_picture_is_about_as_good_as_the_better_of_true_shadow_and_band(
+    number: int, most_short_db: float
+) -> None:
+    assert judged(draw()[number]).short_db > -most_short_db
+
+
+@pytest.mark.slow
+def test_shares_within_one_and_two_sigma_where_detail_ends_before_the_noise() -> None:
+    shares = judged(draw()[20]).shares
+    assert 0.6 < shares[0] < 0.78
+    assert 0.9 < shares[1] < 0.99
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_two_hundred_drawn_pictures() -> None:
+    drawn = draw()
+    assert len(drawn) == COUNT
+    for levels in (Counter(one.mask for one in drawn), Counter((one.stop) for one in drawn)):
+        assert min(levels.values()) >= 20
+    assert {one.mask for one in drawn} == set(FILMS)
+    found = [judged(one) for one in drawn]
+    for deep in (True, False):
+        short = np.array([one.short_db for one in found if (one.depth > 0.1) == deep])
+        assert np.median(short) > -0.5, deep
+        assert np.quantile(short, 0.1) > -4, deep
