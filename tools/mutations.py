@@ -162,7 +162,7 @@ MUTATIONS = (
     ),
     Mutation(
         "a stale epoch of the clock is used",
-        "daemon/navigation/vehicle_history.py",
+        "daemon/navigation/autopilot_time.py",
         "min([limit, *(one.number for one in self._epochs[at + 1 : at + 2])])",
         "limit",
         ("daemon/navigation/test_clock_steps.py", "daemon/navigation/test_jumps.py"),
@@ -170,8 +170,8 @@ MUTATIONS = (
     Mutation(
         "a report of the hot shoe from another epoch is used",
         "daemon/navigation/vehicle_history.py",
-        "between(self._feedbacks, *self.time.span(limit, utc_ns))",
-        "between(self._feedbacks, 0, limit)",
+        "return between(self._feedbacks, first, end)",
+        "return between(self._feedbacks, 0, limit)",
         ("daemon/navigation/test_owned_triggers.py",),
     ),
     Mutation(

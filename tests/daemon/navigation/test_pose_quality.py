@@ -274,7 +274,7 @@ def test_the_clock_is_fitted_once_while_nothing_better_is_known(monkeypatch: pyt
         fits.append(len(arrivals))
         return from_arrivals(arrivals)
 
-    monkeypatch.setattr("dappled.daemon.navigation.vehicle_history.from_arrivals", counted)
+    monkeypatch.setattr("dappled.daemon.navigation.autopilot_time.from_arrivals", counted)
     link = Link()
     for step in range(STEPS):
         link.vehicle(step / 10)

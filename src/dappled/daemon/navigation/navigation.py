@@ -15,6 +15,7 @@ from dataclasses import replace
 
 from dappled.clock import Clock
 from dappled.daemon.live_settings import LiveSettings
+from dappled.daemon.navigation.autopilot_time import TIMESYNC_WINDOW_NS
 from dappled.daemon.navigation.clocks import (
     BootClock,
     ExposureTime,
@@ -38,7 +39,7 @@ from dappled.daemon.navigation.samples import (
     TelemetryStatistics,
     UtcCorrection,
 )
-from dappled.daemon.navigation.vehicle_history import TIMESYNC_WINDOW_NS, USED_MESSAGES, VehicleHistory
+from dappled.daemon.navigation.vehicle_history import USED_MESSAGES, VehicleHistory
 from dappled.decode.geometry import (
     Gnss,
     Pose,
@@ -187,7 +188,8 @@ class Telemetry:
         with self._lock:
             limit = self._packets if upto_packet is None else upto_packet
             clock = self._history.clock(limit, exposure.utc_ns)
-            events = self._history.feedbacks(limit, exposure.utc_ns)
+            either = exposure.trigger is not None and clock is not None and clock.stepped is not None
+            events = self._history.feedbacks(limit, exposure.utc_ns, beside=either)
             late_ns = None
             if clock is not None and exposure.asked_utc_ns is not None:
                 late_ns = self._history.late_ns(exposure.asked_utc_ns, limit, clock)
