@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
@@ -58,6 +59,7 @@ class AutopilotTime:
         self._fitted: tuple[_FitKey | None, BootClock | None] = (None, None)
         self.now_boot_ns: int | None = None
         self.unix_minus_boot_ns: int | None = None  # as the autopilot has it, for other messages with its UTC
+        self._unix: deque[tuple[int, int]] = deque(maxlen=8)  # when it came, and what `unix_minus_boot_ns` was then
         self.utc = AutopilotUtc()
         self.reboots = 0
 
@@ -77,6 +79,7 @@ class AutopilotTime:
             self._requests.clear()
             self._arrivals.forget()
             self.unix_minus_boot_ns = None
+            self._unix.clear()
             self.utc = AutopilotUtc()
             self.now_boot_ns = boot_ns
         self._back_since_ns = None
@@ -85,8 +88,16 @@ class AutopilotTime:
             before_ns = self._arrivals.last_ns
             by_ns = self._arrivals.sooner_ns(stamp_ns, boot_ns)
             if by_ns is not None:
-                self._epochs.append(Epoch(number, before_ns, stamp_ns, -by_ns))
+                self._step(Epoch(number, before_ns, stamp_ns, -by_ns), -by_ns)
         return True
+
+    def _step(self, epoch: Epoch, by_ns: int) -> None:
+        """Begin an epoch. The autopilot's UTC didn't step with its clock: SYSTEM_TIME says so a second later."""
+        self._epochs.append(epoch)
+        old_ns = next((offset for stamp_ns, offset in reversed(self._unix) if stamp_ns <= epoch.before_ns), None)
+        now_ns = self.unix_minus_boot_ns
+        if old_ns is not None and now_ns is not None and abs(now_ns - old_ns) < abs(by_ns) / 2:
+            self.unix_minus_boot_ns = old_ns + by_ns
 
     def first(self, limit: int) -> int:
         """The packet number at which the epoch began that was current below `limit`."""
@@ -157,6 +168,7 @@ class AutopilotTime:
             return False
         unix_ns, boot_ns = message.time_unix_usec * 1000, message.time_boot_ms * 10**6 + telemetry_samples.HALF_MS_NS
         self.unix_minus_boot_ns = unix_ns - boot_ns
+        self._unix.append((stamp_ns, unix_ns - boot_ns))
         return not self.utc.take(unix_ns, boot_ns, stamp_ns)
 
     def timesync(self, number: int, stamp_ns: int, message: MavlinkMessage, *, from_autopilot: bool) -> bool:
@@ -178,7 +190,7 @@ class AutopilotTime:
         known = between(self._answers[-_LOOKED_AT:], self._epochs[-1].number, number)
         by_ns = step_ns(known, answer)
         if by_ns is not None:
-            self._epochs.append(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns))
+            self._step(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns), by_ns)
         self._answers.append(answer)
         return False
 

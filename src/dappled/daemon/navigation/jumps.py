@@ -41,13 +41,16 @@ class JumpFinder:
         self._last: PositionSample | None = None
         self._sums: deque[_Sum] = deque()
         self._widest_m, self.standing_m = 0.0, _NONE
+        self.since = self.begun = (
+            0  # packets: of the first of the positions without a gap, and of the doubt's first jump
+        )
 
     def jump(self, sample: PositionSample, first: int) -> Jump | None:
         """Take the next position; `first` is the first packet of the autopilot's boot. The jump that ends there, if
         any."""
         last, self._last = self._last, sample
         if last is None or last.number < first or sample.boot_ns - last.boot_ns > NEAREST_NS:
-            self._sums = deque([_Sum(sample.boot_ns, (0.0, 0.0, 0.0), 0.0)])
+            self._sums, self.since = deque([_Sum(sample.boot_ns, (0.0, 0.0, 0.0), 0.0)]), sample.number
             return None
         moved, allowed_m = _unexplained(last, sample)
         before = self._sums[-1]
@@ -71,6 +74,7 @@ class JumpFinder:
         self._sums.append(found)
         if most <= 0:
             return None
+        self.begun = sample.number if self.standing_m == _NONE else self.begun
         north, east, down = (a + b for a, b in zip(self.standing_m, by_m, strict=True))
         self._widest_m = max(self._widest_m, norm((north, east, down)))
         back = norm((north, east, down)) <= _FLOOR_M + _BACK * self._widest_m < self._widest_m
@@ -91,9 +95,9 @@ class ReceiverTrack:
     def __init__(self) -> None:
         self._finder, self._compared = JumpFinder(), -1
 
-    def confirms(self, heard: GnssSample, estimate: PositionSample, first: int) -> bool:
-        """Take the receiver's place with a fix, once for each position. Whether it has not jumped, and the last
-        position is there as well."""
+    def confirms(self, heard: GnssSample, estimate: PositionSample, first: int, begun: int) -> bool:
+        """Take the receiver's place with a fix, once for each position. Whether it has not jumped since before packet
+        `begun`, and the last position is there as well."""
         if estimate.number == self._compared:
             return False
         self._compared = estimate.number
@@ -109,7 +113,7 @@ class ReceiverTrack:
         self._finder.jump(there, first)
         apart_m = norm(displacement(there, estimate))
         near_m = _APART_M + _APART_S * norm(estimate.velocity_ned_m_s)
-        return self._finder.standing_m == _NONE and apart_m <= near_m
+        return self._finder.since < begun and self._finder.standing_m == _NONE and apart_m <= near_m
 
 
 def _unexplained(a: PositionSample, b: PositionSample) -> tuple[Vector3, float]:

@@ -47,7 +47,7 @@ from dappled.drivers.mavlink.sample_judge import (
 
 POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
 _REPEATS = 64
-_TOGETHER_NS = 200_000_000
+_TOGETHER_NS, _COMPARED_NS = 200_000_000, 300_000_000
 _PART_NS, _FAST = 2 * 10**9, 0.2
 _ALIVE_NS = 5 * 10**9
 _AUTOPILOT, _FIX_3D = 1, 3
@@ -316,10 +316,10 @@ class VehicleHistory:
 
     def _compare(self, heard: GnssSample, estimate: PositionSample) -> None:
         """A doubt of the position is over where a receiver that has not jumped is."""
-        if abs(heard.stamp_ns - estimate.stamp_ns) > _TOGETHER_NS:
+        if abs(heard.stamp_ns - estimate.stamp_ns) > _COMPARED_NS:
             return
-        confirms = self._receiver_track.confirms(heard, estimate, self.time.boot_first(heard.number + 1))
-        if confirms and self.displaced:
+        first = self.time.boot_first(heard.number + 1)
+        if self._receiver_track.confirms(heard, estimate, first, self._finder.begun) and self.displaced:
             keep(self._jumps, self._finder.over(estimate, heard.number, heard.stamp_ns))
 
     def _height(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
