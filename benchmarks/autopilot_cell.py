@@ -37,6 +37,8 @@ WARM_UP_S, LEAD_S, REST_S = 12.0, 0.5, 0.9
 LINK_S, SPREAD_S = 0.002, 0.001
 STEP_S = 0.2
 FILES_S = 2.2  # where files are late: a USB download, in which later shots are fired
+GLITCH_M = 33.0
+BUSY_NS = 150_000_000  # the next photograph can't be begun sooner: several requests come at once where a link held them
 SILENCE_S = 11.0  # longer than the answers of the autopilot that are compared
 WAIT_NS = round(PoseSettings().wait_ms * 1e6)
 VEHICLE = (1, 1)
@@ -60,16 +62,22 @@ FAULTS = (
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """One wiring, one fault, shots at one rate."""
+    """One wiring, one fault or several (", " between), shots at one rate."""
 
     wiring: str
     fault: str
     hz: float
 
+    @property
+    def faults(self) -> frozenset[str]:
+        """Each of its faults."""
+        return frozenset(self.fault.split(", "))
+
 
 @dataclass(frozen=True, slots=True)
 class Tagged:
-    """One frame: errors against the truth in σ; None where σ is unknown. `doubt`: the tag names one."""
+    """One frame: errors against the truth in σ; None where σ is unknown. `axes`: north, east, down, by the covariance.
+    `doubt`: the tag names one."""
 
     time: float
     time_ms: float
@@ -78,6 +86,7 @@ class Tagged:
     attitude: float | None
     doubt: bool
     source: str
+    axes: tuple[float, ...] = ()
 
 
 @dataclass(slots=True)
@@ -124,8 +133,9 @@ class World:
         self.found = Outcome()
         self.daemon = Daemon(outside=self.outside, camera=self.own, send=self._asked_time, fired=self._fired)
         self.of_burst = {0.2: 1, 1.0: 2, 5.0: 3}[cell.hz]
-        self.lead_s = LEAD_S + (SILENCE_S if cell.fault.startswith("silence") else 0.0)
-        self.files_s = FILES_S if cell.fault.startswith("late files") else 0.0
+        self.faults = cell.faults
+        self.lead_s = LEAD_S + (SILENCE_S if "silence" in self.faults else 0.0)
+        self.files_s = FILES_S if "late files" in self.faults else 0.0
         self.burst_s = self.lead_s + (self.of_burst - 1) / cell.hz + max(REST_S, 1 / cell.hz)
         self.bursts = bursts
         self.end_s = WARM_UP_S + bursts * self.burst_s + 4
@@ -140,22 +150,25 @@ class World:
         self._stamps: set[int] = set()
         self._boots = self._requests = 0
         self._down: list[tuple[int, int]] = []
+        self._held: list[tuple[int, int]] = []
+        self._free_ns = 0
+        self.glitch_s = math.inf, math.inf
         self._now_ns = START_NS
         self._plan()
 
     # time
 
     def _plan(self) -> None:
-        rng, cell = self.rng, self.cell
+        rng, cell, faults = self.rng, self.cell, self.faults
         starts = [WARM_UP_S + burst * self.burst_s for burst in range(self.bursts)]
         places, turns = (ACROSS_M / 2**0.5, ACROSS_M / 2**0.5, UPRIGHT_M), (ATTITUDE_SIGMA_RAD / 3**0.5,) * 3
         self._slow = [(_Slow(places, 20.0, rng), _Slow(turns, 3.0, rng)) for _ in range(self.bursts + 2)]
         jumps: list[tuple[float, float]] = []
         near: set[int] = set()
         offset_s, drift = 41.7, 30e-6
-        if cell.fault == "pin wraps":
+        if "pin wraps" in faults:
             offset_s = 2**32 / 1e6 - WARM_UP_S - self.bursts * self.burst_s / 2
-        if cell.fault == "clock 2 % fast":
+        if "clock 2 % fast" in faults:
             drift = 0.02
         for burst, at_s in enumerate(starts):
             shots_s = [at_s + self.lead_s + i / cell.hz + rng.uniform(0, 0.05) for i in range(self.of_burst)]
@@ -164,11 +177,16 @@ class World:
                 near.update(range(round(t_s / STEP_S) - 2, round(t_s / STEP_S) + 6))
             edge = burst in (0, self.bursts - 1)
             jumps += self._steps(burst, at_s, shots_s)
-            if cell.fault == "reboots" and burst % 40 == 20:
+            if "glitch" in faults and burst == self.bursts // 3:
+                self.glitch_s = at_s, at_s + rng.uniform(5.0, 40.0)
+            if "link holds" in faults and burst % 4 == 1 and not edge:
+                held_s = shots_s[0] - rng.uniform(0.0, 0.5)
+                self._held.append((_utc_ns(held_s), _utc_ns(held_s + rng.uniform(0.5, 3.5))))
+            if "reboots" in faults and burst % 40 == min(20, self.bursts // 2):
                 boot_s = offset_s + at_s + 0.2
                 jumps.append((at_s + 0.2, 3.0 - boot_s - sum(by for _, by in jumps)))
                 self._at(at_s + 0.2, self._reboot)
-            if cell.fault == "link down" and burst % 5 == 2 and not edge:
+            if "link down" in faults and burst % 5 == 2 and not edge:
                 lost_s = rng.choice(shots_s)
                 self._down.append((_utc_ns(lost_s - 0.05), _utc_ns(lost_s + 0.12)))
         self.boot = BootTime(offset_s, drift, tuple(jumps))
@@ -176,16 +194,15 @@ class World:
             if step % 5 == 0 or step in near:  # no pose is made of what is left out
                 self._at(step * STEP_S, self._sampler(step))
             self._at(step * STEP_S + 0.05, self._tick)
-        if cell.fault == "forged messages":
+        if "forged messages" in faults:
             for step in range(round(WARM_UP_S), round(self.end_s)):
                 self._at(step + 0.33, self._forge)
 
     def _steps(self, burst: int, at_s: float, shots_s: Sequence[float]) -> Iterator[tuple[float, float]]:
         """The steps of the clock in one burst, (when, seconds gained); with its silence, which ends just before the
         first trigger."""
-        rng, fault = self.rng, self.cell.fault
-        silent = fault.startswith("silence")
-        if fault.endswith("clock steps") and burst % 3 == 1:
+        rng, silent = self.rng, "silence" in self.faults
+        if "clock steps" in self.faults and burst % 3 == 1:
             step_s = at_s + rng.uniform(1, SILENCE_S - 1) if silent else shots_s[-1] + rng.uniform(-0.3, 0.3)
             yield step_s, rng.choice((-1, 1)) * rng.uniform(0.12, 0.4)
         if silent:
@@ -219,7 +236,7 @@ class World:
         return self.boot.ns(self.now_s if t_s is None else t_s) // 1000
 
     def _unix_us(self) -> int:
-        return 0 if self.cell.fault == "no satellites" else self._now_ns // 1000 + GPS_MINUS_UTC_US
+        return 0 if "no satellites" in self.faults else self._now_ns // 1000 + GPS_MINUS_UTC_US
 
     # the link
 
@@ -232,22 +249,31 @@ class World:
         request: int = 0,
     ) -> None:
         """Send to the camera; what is a shot's message and arrives is noted as heard, for request `request`."""
-        fault, edge_s = self.cell.fault, self.burst_s
+        faults, edge_s = self.faults, self.burst_s
         middle = WARM_UP_S + edge_s < self.now_s < self.end_s - 4 - edge_s
         for message in messages:
             if any(begin <= self._now_ns < end for begin, end in self._down):
                 continue
-            for link in (0, 1) if fault == "two ports" else (0,):
-                if fault == "one packet of ten lost" and middle and not sure and self.rng.random() < 0.1:
+            for link in (0, 1) if "two ports" in faults else (0,):
+                if "one packet of ten lost" in faults and middle and not sure and self.rng.random() < 0.1:
                     continue
                 raw = pack(message, self._packers[who, link], version_1=False)
                 delay_s = LINK_S + self.rng.expovariate(1 / SPREAD_S) + 0.08 * link
-                if fault == "late packets":
+                delay_s += self._hold_s(delay_s)
+                if "late packets" in faults:
                     delay_s += self.rng.expovariate(1 / 0.01)
                 self._arrives(delay_s, link, message, raw)
-                if fault == "every packet twice":
+                if "every packet twice" in faults:
                     self._arrives(delay_s + 0.01, link, message, raw)
                 self._note_heard(message, request)
+
+    def _hold_s(self, delay_s: float) -> float:
+        """How much longer a link holds what would have come so much later than now. It keeps the order."""
+        there_ns = self._now_ns + round(delay_s * 1e9)
+        for begin, end in self._held:
+            if begin <= there_ns < end:
+                return (end - there_ns) / 1e9 + (there_ns - begin) / 1e12
+        return 0.0
 
     def _arrives(self, delay_s: float, link: int, message: MavlinkMessage, raw: bytes) -> None:
         self._at(self.now_s + delay_s, lambda: self.daemon.receive(link, message, raw))
@@ -270,7 +296,7 @@ class World:
             self._deliver([mavlink.MAVLink_timesync_message(self._boot_us() * 1000, sent_us)])
 
         there_s = LINK_S + self.rng.expovariate(1 / SPREAD_S)
-        if self.cell.fault == "late packets":
+        if "late packets" in self.faults:
             there_s += self.rng.expovariate(1 / 0.01)
         self._at(self.now_s + there_s, answer)
 
@@ -283,6 +309,7 @@ class World:
             position, turn = self._slow[max(0, min(int((t_s - WARM_UP_S) // self.burst_s) + 1, self.bursts + 1))]
             x, y, z = (angle / 2 for angle in turn.at(t_s))
             north, east, down = position.at(t_s)
+            north += GLITCH_M if self.glitch_s[0] <= t_s < self.glitch_s[1] else 0.0
             north_m, east_m = metres_per_radian(math.radians(truth.latitude_deg), truth.altitude_msl_m)
             seen = replace(
                 truth,
@@ -308,7 +335,7 @@ class World:
         """One photograph is asked for: by the mission, or by a ground station that sends to all components."""
         self._requests += 1
         number = self._requests
-        if self.cell.fault == "stations broadcast":
+        if "stations broadcast" in self.faults:
             digicam = self.triggers.personality == "px4"
             command, seven = (203, (0, 0, 0, 0, 1, 0, 0)) if digicam else (2000, (0, 0, 1, number, 0, 0, 0))
             message = mavlink.MAVLink_command_long_message(0, 0, command, 0, *seven)
@@ -344,13 +371,13 @@ class World:
         begin_s = self.now_s + self.rng.gauss(LATENCY_MS, LATENCY_SIGMA_MS) / 1e3
         self._truth[key] = _utc_ns(begin_s + EXPOSURE_S / 2)
         self.found.files += 1
-        fault = self.cell.fault
+        faults = self.faults
         stamp_us = self._boot_us(begin_s + self.rng.gauss(0, CONTACT_SIGMA_MS) / 1e3)
         middle = 3 < self.found.triggers < self.bursts * self.of_burst - 3
-        if fault == "contacts lost" and middle and self.rng.random() < 0.2:
+        if "contacts lost" in faults and middle and self.rng.random() < 0.2:
             return
         contacts_us = [stamp_us]
-        if fault == "contacts doubled" and self.rng.random() < 0.3:
+        if "contacts doubled" in faults and self.rng.random() < 0.3:
             contacts_us.append(stamp_us + 15_000)
         for contact_us in contacts_us:  # its loop reports a contact within 20 ms
             at_s = begin_s + (contact_us - stamp_us) / 1e6 + self.rng.uniform(0.001, 0.013)
@@ -360,10 +387,12 @@ class World:
         return lambda: self._deliver(triggers.contact(contact_us, self.own)) if triggers is self.triggers else None
 
     def _fired(self, shot: Shot) -> None:
-        expected = self.daemon.expected(shot)
-        self._pending.append((shot, expected, self._boots))
+        busy_ns = 0 if self.outside else max(0, self._free_ns - self._now_ns)
+        self._free_ns = self._now_ns + busy_ns + BUSY_NS
+        self._pending.append((shot, self.daemon.expected(shot, busy_ns), self._boots))
         if not self.outside:
-            self._expose((-1, shot.index), self.triggers)
+            triggers = self.triggers
+            self._at(self.now_s + busy_ns / 1e9, lambda: self._expose((-1, shot.index), triggers))
 
     # tags
 
@@ -427,10 +456,14 @@ def _tagged(truth_ns: int, exposure: ExposureTime, pose: Pose) -> Tagged:
     truth = PATH.pose((truth_ns - START_NS) / 1e9)
     off_ms = (exposure.utc_ns - truth_ns) / 1e6
     across = upright = attitude = None
+    axes: tuple[float, ...] = ()
     if pose.latitude_rad is not None and pose.longitude_rad is not None and pose.altitude_msl_m is not None:
         north_m, east_m = metres_per_radian(pose.latitude_rad, truth.altitude_msl_m)
         north = (pose.latitude_rad - math.radians(truth.latitude_deg)) * north_m
         east = (pose.longitude_rad - math.radians(truth.longitude_deg)) * east_m
+        if (known := pose.position_covariance_m2) is not None:
+            down = truth.altitude_msl_m - pose.altitude_msl_m
+            axes = tuple(off / math.sqrt(known[place]) for off, place in ((north, 0), (east, 3), (down, 5)))
         if pose.position_sigma_m is not None:
             across = math.hypot(north, east) / pose.position_sigma_m
         if pose.vertical_sigma_m is not None:
@@ -438,7 +471,7 @@ def _tagged(truth_ns: int, exposure: ExposureTime, pose: Pose) -> Tagged:
     if pose.attitude is not None and pose.attitude_sigma_rad is not None:
         attitude = turn_rad(pose.attitude, truth.attitude) / pose.attitude_sigma_rad
     doubt = bool(exposure.doubts)
-    return Tagged(off_ms * 1e6 / exposure.sigma_ns, off_ms, across, upright, attitude, doubt, exposure.source)
+    return Tagged(off_ms * 1e6 / exposure.sigma_ns, off_ms, across, upright, attitude, doubt, exposure.source, axes)
 
 
 def _utc_ns(t_s: float) -> int:

@@ -103,9 +103,9 @@ class Daemon:
             self._send(message)
         return True
 
-    def expected(self, shot: Shot) -> ExposureTime:
-        """As `Tagging` has it: the call is a millisecond after the request."""
-        called_ns = clocks.called_utc_ns(shot, shot.wished_monotonic_ns + 10**6)
+    def expected(self, shot: Shot, busy_ns: int = 0) -> ExposureTime:
+        """As `Tagging` has it: the call is a millisecond after the request, or after the body was `busy_ns`."""
+        called_ns = clocks.called_utc_ns(shot, shot.wished_monotonic_ns + busy_ns + 10**6)
         return clocks.owned(clocks.mid_exposure(called_ns, self.latency, EXPOSURE_S), shot, self.latency)
 
     def obstacle(self) -> None:
