@@ -19,6 +19,8 @@ import httpx
 import pytest
 from pymavlink import mavutil
 
+from dappled.daemon.camera_protocol.ground_client import GroundClient
+from dappled.drivers.mavlink import mavlink
 from dappled.mocks.simulation import free_port
 from tests.standing import problems
 from tests.system.conftest import dappled
@@ -110,6 +112,28 @@ def test_systemd_hears_of_a_whole_life(manager: socket.socket, served: subproces
     assert "reload: record.min_free_mb is 2 now (was 1)" in said
     assert "takes a restart" in said
     assert "reload: the settings stay as they are:" in said
+
+
+@pytest.mark.slow
+def test_a_service_whose_disk_takes_no_flight_answers_and_says_why_until_it_does(
+    manager: socket.socket, tmp_path: Path
+) -> None:
+    (tmp_path / "flights").symlink_to("/proc/there-is-none")
+    port = free_port()
+    settings = f'{RECORD}[mavlink]\nurl = "udpin:127.0.0.1:{port}"\n'
+    with serving(manager, tmp_path, settings) as daemon, GroundClient(f"udpout:127.0.0.1:{port}") as ground:
+        until(manager, "READY=1".__eq__)
+        assert "no photographs: cannot make" in until(manager, lambda text: text.startswith("STATUS="))
+        until(manager, "WATCHDOG=1".__eq__)
+        assert ground.find_camera(60)[1] == mavlink.MAV_COMP_ID_CAMERA
+        refused, _ = ground.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, 1)
+        assert refused == mavlink.MAV_RESULT_FAILED
+        (tmp_path / "flights").unlink()
+        (tmp_path / "flights").mkdir()
+        until(manager, lambda text: "the camera is" in text)  # of a flight: it has begun
+        daemon.send_signal(signal.SIGTERM)
+        assert daemon.wait(60) == 0
+    assert [one.name for one in (tmp_path / "flights").iterdir() if one.is_dir()]
 
 
 @pytest.mark.slow

@@ -8,11 +8,12 @@ import sys
 import tempfile
 import threading
 import time
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dappled import durable
 from dappled.cli.stop_condition import Asker, StopCondition
 from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
 from dappled.cli.verb import Output, Report, SettingsArgument, Verb, flag, option
@@ -22,15 +23,18 @@ from dappled.config.schema import ConfigError, refuse
 from dappled.config.settings import Settings
 from dappled.daemon import settings_check
 from dappled.daemon.flight_handover import FlightHandover, flights
+from dappled.daemon.grounded import answer_meanwhile
 from dappled.daemon.health.systemd import Notifier
 from dappled.daemon.service import Service
-from dappled.errors import DappledError
+from dappled.errors import DappledError, sentence
+from dappled.flight import FlightError
 
 if TYPE_CHECKING:
     from dappled.mocks.simulation import Simulation
 
 
 _ALL, _CAMERA = "all", "camera"
+_LOOK_NS = 5 * 10**9
 _SWITCH_S = 0.0005  # a thread that computes gives Python to one that acknowledges; by itself after 5 ms, at each call
 
 
@@ -137,9 +141,29 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
     around = RunSurroundings(camera, simulation, plan.frames)
     goal = StopCondition(tally, plan.frames, plan.seconds, around=around, clock=SystemClock())
 
+    def begun(flown: Settings, after: FlightHandover) -> Service | None:
+        """Begin a flight. A service whose flights can't be recorded says so on its links until they can, or until it is
+        stopped (None): restarts would be silence, and end what hears the autopilot. Raises DappledError."""
+        while not asked.is_set():
+            service = Service(flown, observer=RunObserver(tally, frames, camera), after=after)
+            try:
+                service.start()
+            except FlightError as error:
+                if not manager.listens or not flown.mavlink.url:
+                    raise
+                remark(f"no photographs: {sentence(error)}")
+                manager.ready(time.monotonic_ns())
+                manager.status(f"no photographs: {sentence(error)}")
+                answer_meanwhile(flown, sentence(error), _FlightsDisk(Path(flown.record.directory), manager, asked).may_do)
+            else:
+                return service
+        return None
+
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """Run one flight. Returns whether another may follow."""
-        service = Service(flown, observer=RunObserver(tally, frames, camera), after=after)
+        service = begun(flown, after)
+        if service is None:
+            return False
         problems = ProblemRemarks(service, manager)
 
         def turn() -> bool:
@@ -153,7 +177,6 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
             return asked.is_set() or goal.reached()
 
         with ExitStack() as stack:
-            service.start()
             stack.callback(service.stop)
             stack.callback(lambda: None if after.next and not asked.is_set() else manager.stopping())
             after.began = True
@@ -185,6 +208,29 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
         flights(settings, fly)
     remark(tally.summary())
     return 1 if goal.short and not asked.is_set() else 0  # a signal is a regular end
+
+
+@dataclass(slots=True)
+class _FlightsDisk:
+    """Where flights can't be recorded now; looked at every few seconds."""
+
+    directory: Path
+    manager: Notifier
+    asked: threading.Event
+    due_ns: int = field(default_factory=lambda: time.monotonic_ns() + _LOOK_NS)
+
+    def may_do(self) -> bool:
+        """Whether a flight may begin there by now, or the daemon is to end. Feeds the watchdog."""
+        now_ns = time.monotonic_ns()
+        self.manager.working(now_ns)
+        if now_ns < self.due_ns or self.asked.is_set():
+            return self.asked.is_set()
+        self.due_ns = now_ns + _LOOK_NS
+        with suppress(OSError):
+            durable.make_folder(self.directory)
+            with tempfile.TemporaryFile(dir=self.directory):
+                return True
+        return False
 
 
 def _reload(service: Service, plan: RunPlan, manager: Notifier) -> None:

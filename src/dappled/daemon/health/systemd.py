@@ -112,6 +112,11 @@ class Notifier:
         self._fed_ns = 0
         self._status = ""
 
+    @property
+    def listens(self) -> bool:
+        """Whether there is one."""
+        return bool(self._address)
+
     def ready(self, monotonic_ns: int) -> None:
         """The daemon answers capture requests from now on. Also ends `reloading`."""
         self._fed_ns = monotonic_ns
