@@ -154,7 +154,9 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
                 remark(f"no photographs: {sentence(error)}")
                 manager.ready(time.monotonic_ns())
                 manager.status(f"no photographs: {sentence(error)}")
-                answer_meanwhile(flown, sentence(error), _FlightsDisk(Path(flown.record.directory), manager, asked).may_do)
+                answer_meanwhile(
+                    flown, sentence(error), _FlightsDisk(Path(flown.record.directory), manager, asked).may_do
+                )
             else:
                 return service
         return None

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import gphoto2 as gp
 import pytest
 
+from dappled.drivers.gphoto2 import session as opening
 from dappled.drivers.gphoto2.protocol import CameraFile, RefusedError, SettingTurned
 from dappled.drivers.gphoto2.session import GPhoto2Session
+from dappled.drivers.gphoto2.settings import parse_settings
 
 FOLDER = "/store/DCIM/100CANON"
 
@@ -54,6 +57,9 @@ class FakeLibrary:
     widgets: dict[str, Widget] = field(default_factory=dict)
     asked: list[str] = field(default_factory=list)
     coming: list[tuple[int, str]] = field(default_factory=list)
+
+    def exit(self) -> None:
+        """The session ends."""
 
     def get_single_config(self, name: str) -> Any:
         if name not in self.widgets:
@@ -133,3 +139,31 @@ def test_mirror_lock_up_is_one_of_canon_s_custom_functions(
 ) -> None:
     library.widgets = {"customfuncex": Widget(text, kind=gp.GP_WIDGET_TEXT)}
     assert [one.value for one in session.settings()] == ([] if value is None else [value])
+
+
+def test_of_two_bodies_without_a_number_the_one_in_its_socket_stays_whatever_the_bus_calls_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ports = {"usb:001,004": "1-1.2", "usb:001,005": "1-1.3"}
+
+    def renumber() -> None:
+        for port, name in ports.items():
+            (tmp_path / name).mkdir(exist_ok=True)
+            (tmp_path / name / "busnum").write_text(f"{int(port[4:7])}\n")
+            (tmp_path / name / "devnum").write_text(f"{int(port[8:])}\n")
+        (tmp_path / f"{name}:1.0").mkdir(exist_ok=True)  # an interface, which has no numbers
+
+    library = FakeLibrary(widgets={"serialnumber": Widget("0" * 32)})
+    monkeypatch.setattr(opening, "_DEVICES", tmp_path)
+    monkeypatch.setattr(opening, "_candidates", lambda _ports: [("Canon EOS 450D", port) for port in sorted(ports)])
+    monkeypatch.setattr(opening, "_opened", lambda _model, _port: library)
+    renumber()
+    first = opening.open_session(parse_settings({})).identity
+    assert (first.port, first.serial) == ("usb:001,004", "usb 1-1.2")
+    ports = {"usb:001,009": "1-1.2", "usb:001,008": "1-1.3"}
+    renumber()
+    again = opening.open_session(parse_settings({}), first.serial).identity
+    assert (again.port, again.serial) == ("usb:001,009", "usb 1-1.2")
+    assert opening.open_session(parse_settings({"serial": "usb 1-1.3"})).identity.port == "usb:001,008"
+    del ports["usb:001,009"]  # it is gone: the other one is taken as another
+    assert opening.open_session(parse_settings({}), first.serial).identity.serial == "usb 1-1.3"

@@ -10,6 +10,7 @@ import mmap
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from typing import Any
 
 import gphoto2 as gp
@@ -34,6 +35,7 @@ from dappled.drivers.gphoto2.protocol import (
 from dappled.drivers.gphoto2.settings import CaptureTarget, GPhoto2Settings
 
 _CHUNK_BYTES = 1 << 20
+_DEVICES = Path("/sys/bus/usb/devices")
 _FOLDERS = 256
 """More folders than a card has: bounds the walk."""
 _DRAIN = 64
@@ -169,11 +171,13 @@ class GPhoto2Session:
         self._camera = camera
         printed = _text(camera, "eosserialnumber")  # as printed on the body; the PTP number is another
         reported = _text(camera, "serialnumber")
-        self.serials = {text for text in (printed, reported, reported.lstrip("0")) if text}
+        reported = reported if reported.strip("0") else ""  # zeros are no number
+        place = "" if printed or reported else _place(port)
+        self.serials = {text for text in (printed, reported, reported.lstrip("0"), place) if text}
         self.identity = Identity(
             make=_text(camera, "manufacturer"),
             model=_text(camera, "cameramodel"),
-            serial=printed or reported,
+            serial=printed or reported or place,
             port=port,
         )
         self._in_pieces = True
@@ -368,6 +372,19 @@ class GPhoto2Session:
     def close(self) -> None:
         """End the session."""
         _close(self._camera)
+
+
+def _place(port: str) -> str:
+    """Where on the bus a body stands ("usb 1-1.2": bus, socket, socket of the hub), which stays when buses are numbered
+    anew. It stands for the serial number of a body that has none, so that of two the one is not taken for the other;
+    "" where the system doesn't tell."""
+    found = re.fullmatch(r"usb:(\d+),(\d+)", port)
+    for device in () if found is None else sorted(_DEVICES.glob("*-*")):
+        with contextlib.suppress(OSError, ValueError):
+            numbers = [int((device / name).read_text(encoding="ascii")) for name in ("busnum", "devnum")]
+            if found is not None and numbers == [int(found[1]), int(found[2])]:
+                return f"usb {device.name}"
+    return ""
 
 
 def _time(info: Any) -> int | None:
