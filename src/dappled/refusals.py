@@ -11,6 +11,7 @@ from dappled.clock import Clock, SystemClock
 from dappled.findings import Code, Finding, Subject
 
 INTERVAL_S = 60.0
+SHOTS_INTERVAL_S = 5.0  # of refused shots, which are in the flight's books: a power cut takes what was only counted
 PEERS = 20  # for each reason; all further ones count as one
 OTHERS = "other peers"
 
@@ -30,8 +31,8 @@ class RefusalLog:
     number of `times`, and within how many seconds (`within_s`; none for the first).
     """
 
-    def __init__(self, log: logging.Logger, clock: Clock | None = None) -> None:
-        self._log, self._clock = log, clock or SystemClock()
+    def __init__(self, log: logging.Logger, clock: Clock | None = None, interval_s: float = INTERVAL_S) -> None:
+        self._log, self._clock, self._interval_s = log, clock or SystemClock(), interval_s
         self._lock = threading.Lock()
         self._repeated: dict[tuple[Code, Subject], _Repeated] = {}
 
@@ -60,7 +61,7 @@ class RefusalLog:
         with self._lock:
             for kind, known in list(self._repeated.items()):
                 within_s = (now_ns - known.since_ns) / 1e9
-                if not all_of_them and within_s < INTERVAL_S:
+                if not all_of_them and within_s < self._interval_s:
                     continue
                 if known.more:
                     written.append(known.last.with_facts(times=known.more, within_s=within_s))

@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.clock import SystemClock
 from dappled.flight import Cause, FlightError, Shot, log_reading, logs
 from dappled.flight.logs import Flusher
 from tests.flight.makers import shot, words_of
@@ -103,7 +104,19 @@ def test_no_journal_is_an_empty_one(tmp_path: Path) -> None:
         log_reading.read_journal(tmp_path)
 
 
-def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class WaitsNoted(SystemClock):
+    """Notes for how long somebody waited."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.waits: list[float | None] = []
+
+    def pause(self, event: threading.Event, timeout_s: float | None) -> bool:
+        self.waits.append(timeout_s)
+        return super().pause(event, timeout_s)
+
+
+def test_a_note_is_one_write_and_reaches_the_disk_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     writes: list[bytes] = []
     flushed = threading.Event()
     write, fdatasync = os.write, os.fdatasync
@@ -118,11 +131,13 @@ def test_a_note_is_one_write_and_reaches_the_disk_soon(tmp_path: Path, monkeypat
 
     monkeypatch.setattr(os, "write", watched_write)
     monkeypatch.setattr(os, "fdatasync", watched_fdatasync)
-    journal = logs.ShotJournal(tmp_path / "shots.jsonl", flush_interval_s=0.01)
+    clock = WaitsNoted()
+    journal = logs.ShotJournal(tmp_path / "shots.jsonl", clock=clock)
     journal.note(shot(3))
     assert len(writes) == 1
     assert writes[0].endswith(b"\n")
     assert flushed.wait(60)
+    assert not any(clock.waits)  # a power cut may follow at once
     assert journal.problem is None
     journal.close()
 

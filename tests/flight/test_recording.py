@@ -152,11 +152,11 @@ def test_the_report_of_a_flight_that_was_cut_short_says_what_it_can_not_know(
     path = str(flight.folder.path)
     balance = flight_report.balance(flight.folder.path)
     assert balance.balanced
-    assert balance.cut_short == finding(Code.FLIGHT_CUT_SHORT, Subject("flight"), shots_s=1.0, refusals_s=60.0)
+    assert balance.cut_short == finding(Code.FLIGHT_CUT_SHORT, Subject("flight"), shots_s=1.0, refusals_s=6.0)
     assert main(["flight", "report", path]) == 1
     said = capsys.readouterr()
     assert said.out.splitlines()[-1] == "what is recorded adds up; what came last is not known"
-    assert "shots accepted in its last 1 s, and requests refused in its last 60 s, may be missing" in said.err
+    assert "shots accepted in its last 1 s, and requests refused in its last 6 s, may be missing" in said.err
     assert main(["flight", "report", path, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["balanced"] is None
 

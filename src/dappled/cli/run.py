@@ -8,6 +8,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -141,29 +142,11 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
     around = RunSurroundings(camera, simulation, plan.frames)
     goal = StopCondition(tally, plan.frames, plan.seconds, around=around, clock=SystemClock())
 
-    def begun(flown: Settings, after: FlightHandover) -> Service | None:
-        """Begin a flight. A service whose flights can't be recorded says so on its links until they can, or until it is
-        stopped (None): restarts would be silence, and end what hears the autopilot. Raises DappledError."""
-        while not asked.is_set():
-            service = Service(flown, observer=RunObserver(tally, frames, camera), after=after)
-            try:
-                service.start()
-            except FlightError as error:
-                if not manager.listens or not flown.mavlink.url:
-                    raise
-                remark(f"no photographs: {sentence(error)}")
-                manager.ready(time.monotonic_ns())
-                manager.status(f"no photographs: {sentence(error)}")
-                answer_meanwhile(
-                    flown, sentence(error), _FlightsDisk(Path(flown.record.directory), manager, asked).may_do
-                )
-            else:
-                return service
-        return None
-
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """Run one flight. Returns whether another may follow."""
-        service = begun(flown, after)
+        service = _begun(
+            lambda: Service(flown, observer=RunObserver(tally, frames, camera), after=after), flown, manager, asked
+        )
         if service is None:
             return False
         problems = ProblemRemarks(service, manager)
@@ -210,6 +193,26 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
         flights(settings, fly)
     remark(tally.summary())
     return 1 if goal.short and not asked.is_set() else 0  # a signal is a regular end
+
+
+def _begun(make: Callable[[], Service], flown: Settings, manager: Notifier, asked: threading.Event) -> Service | None:
+    """Begin a flight. A service whose flights can't be recorded says so on its links until they can, or until it is
+    stopped (None): ending would be silence, and restarts would not mend a disk. Raises DappledError."""
+    while not asked.is_set():
+        service = make()
+        try:
+            service.start()
+        except FlightError as error:
+            if not manager.listens or not flown.mavlink.url:
+                raise
+            reason = sentence(error)
+            remark(f"no photographs: {reason}")
+            manager.ready(time.monotonic_ns())
+            manager.status(f"no photographs: {reason}")
+            answer_meanwhile(flown, reason, _FlightsDisk(Path(flown.record.directory), manager, asked).may_do)
+        else:
+            return service
+    return None
 
 
 @dataclass(slots=True)

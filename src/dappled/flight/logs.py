@@ -1,8 +1,8 @@
 """Write the two files of a flight that are only appended to: shots.jsonl and telemetry.tlog.
 
-Each entry is one write(2), which survives the death of the process at once. A thread brings it to the disk within
-`DURABLE_S`; after that it survives a power cut. Neither firing nor receiving waits for a frame's fsync or for a
-database.
+Each entry is one write(2), which survives the death of the process at once. A thread brings it to the disk, a shot at
+once, telemetry within `DURABLE_S`; after that it survives a power cut. Neither firing nor receiving waits for a frame's
+fsync or for a database.
 
 shots.jsonl, the shot journal, has one JSON line for each shot, written before the camera is touched. telemetry.tlog has
 every MAVLink packet received and sent, in the ground stations' common format: an 8-byte big-endian count of
@@ -147,8 +147,11 @@ class Flusher:
 class ShotJournal:
     """The open journal of one flight; owns its descriptor and its flusher. `note` may be called by any thread."""
 
-    def __init__(self, path: Path, flush_interval_s: float = 0.5, clock: Clock | None = None) -> None:
-        """Open or make the journal. After a torn last line the next note begins on a new line. Raises FlightError."""
+    def __init__(self, path: Path, flush_interval_s: float = 0.0, clock: Clock | None = None) -> None:
+        """Open or make the journal. After a torn last line the next note begins on a new line. Raises FlightError.
+
+        A note is brought to the disk at once: a shot that was acknowledged, and perhaps fired, must be in the books.
+        """
         self.path = path
         self._file = AppendedFile(path, "the shot journal", flush_interval_s, new=False, clock=clock)
         self._lock = threading.Lock()

@@ -14,7 +14,7 @@ from dappled.daemon.pipeline.repeats import FORWARDED_NS, CaptureRequest, Forwar
 from dappled.errors import report
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Cause, FlightError, Shot
-from dappled.refusals import RefusalLog
+from dappled.refusals import SHOTS_INTERVAL_S, RefusalLog
 from dappled.workers import Loop
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
@@ -124,7 +124,7 @@ class Shutter:
         self._capacity = capacity
         self._lock = threading.Lock()
         self._recent, self._forwarded = RecentRequests(), ForwardedRequests()
-        self._refusals = RefusalLog(log, clock)
+        self._refusals = RefusalLog(log, clock, SHOTS_INTERVAL_S)
         self._pending: set[int] = set()
         self._interval: _Interval | None = None
         self._shots = self._refused = self._succeeded = self._failed = 0
@@ -212,7 +212,7 @@ class Shutter:
                 self._wake.set()
 
     def settle_refusals(self, *, all_of_them: bool = False) -> None:
-        """Hand the refusals that were only counted to the sink, where a minute is over; at the end of a flight
+        """Hand the refusals that were only counted to the sink, where five seconds are over; at the end of a flight
         `all_of_them`."""
         for one in self._refusals.settle(all_of_them=all_of_them):
             self._sink.refused(one)
