@@ -139,6 +139,14 @@ def test_unreadable_facts_are_told(flights: Path) -> None:
         folder.settings.write_text(text)
         with pytest.raises(FlightError, match=r"flight\.toml is not readable as TOML"):
             layout.read_facts(folder)
+    for text, words in (
+        ("settings = 1", "settings is no table"),
+        ("settings = {pose = [1]}", r"settings\.pose is no table"),
+        ("names = 'x'", "names is no table"),
+    ):
+        folder.settings.write_text(text)
+        with pytest.raises(FlightError, match=rf"flight\.toml is damaged: {words}"):
+            layout.read_facts(folder)
     folder.settings.unlink()
     with pytest.raises(FlightError, match="does not exist"):
         layout.read_facts(folder)

@@ -244,14 +244,24 @@ def facts_as_toml(facts: Mapping[str, Any]) -> bytes:
     return tomli_w.dumps(codec.table(facts)).encode()
 
 
+_TABLES = ("camera", "names", "settings", "software")  # of flight.toml, where they are there
+
+
 def read_facts(folder: FlightFolder) -> dict[str, Any]:
     """Read flight.toml. Raises FlightError."""
     try:
-        return parse_toml(read_log(folder.settings).decode("utf-8"))
+        facts = parse_toml(read_log(folder.settings).decode("utf-8"))
     except OSError as error:
         raise disk_error("read", folder.settings, error) from error
     except ValueError as error:
         raise FlightError(f"{folder.settings} is not readable as TOML: {error}") from error
+    tables = {name: facts[name] for name in _TABLES if name in facts}
+    settings = tables.get("settings")
+    tables |= {f"settings.{name}": one for name, one in settings.items()} if isinstance(settings, dict) else {}
+    for name, one in tables.items():
+        if not isinstance(one, dict):
+            raise FlightError(f"{folder.settings} is damaged: {name} is no table")
+    return facts
 
 
 class LockHeldError(FlightError):

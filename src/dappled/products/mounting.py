@@ -6,8 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dappled import codec
+from dappled.codec import CodecError
 from dappled.decode.geometry import Pose, Vector3, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
+from dappled.errors import DappledError
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,14 +27,17 @@ class Mounting:
 
     @classmethod
     def of(cls, facts: Mapping[str, Any]) -> Mounting:
-        """The mounting in a flight's facts: its settings `pose.lever_arm_m`, `pose.mount` and `pose.on_gimbal`."""
+        """The mounting in a flight's facts: its settings `pose.lever_arm_m`, `pose.mount` and `pose.on_gimbal`. Raises
+        DappledError for other ones."""
         given, default = facts.get("settings", {}).get("pose", {}), cls()
-        forward, right, down = given.get("lever_arm_m") or default.lever_m
-        return cls(
-            (float(forward), float(right), float(down)),
-            tuple(map(float, given.get("mount") or default.mount)),
-            bool(given.get("on_gimbal", False)),
-        )
+        try:
+            return cls(
+                codec.read(tuple[float, float, float], given.get("lever_arm_m") or default.lever_m),
+                codec.read(tuple[float, ...], given.get("mount") or default.mount),
+                codec.read(bool, given.get("on_gimbal", False)),
+            )
+        except CodecError as error:
+            raise DappledError(f"the flight's settings of [pose] are damaged: a mounting {error}") from None
 
     @property
     def matrix(self) -> Matrix:

@@ -642,3 +642,11 @@ def test_minutes_never_reach_sixty(degrees: float) -> None:
     whole, minutes = sidecars._minutes(degrees, "EW")[:-1].split(",")
     assert 0 <= float(minutes) < 60
     assert int(whole) + float(minutes) / 60 == pytest.approx(abs(degrees), abs=2e-9)
+
+
+@pytest.mark.parametrize(
+    "pose", [{"lever_arm_m": ["a", 0, 0]}, {"lever_arm_m": 1}, {"mount": [[1]]}, {"on_gimbal": "yes"}, {"mount": "x"}]
+)
+def test_a_mounting_that_is_none_is_told(pose: dict[str, object]) -> None:
+    with pytest.raises(DappledError, match=r"settings of \[pose\] are damaged"):
+        Mounting.of({"settings": {"pose": pose}})
