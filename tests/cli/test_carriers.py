@@ -178,3 +178,27 @@ def test_peaks_at_simple_fractions_of_the_frame_are_called_suspect(
     assert at[0, 1]["suspect"]
     assert at[0, 1]["fx"] == pytest.approx(1 / 6, abs=1e-5)
     assert told["carriers_from"] == "predicted"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "told"), [("scale", "+0.30"), ("turn", "turned by -0.50")])
+def test_a_mask_printed_larger_or_turned_is_decoded_where_its_weak_carriers_stand(
+    shared_data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, told: str
+) -> None:
+    """Frames by a simulator that shares nothing with the project's: print and turn cost the views next to nothing."""
+    frames = shared_data / "optics"
+    words = ["--camera", str(frames / "eighth.toml"), "--mask", MASK, "--black", "0", "--white-level", "255"]
+    words += ["--focal-length", "50"]
+    known = ["--calibration", str(tmp_path / "known.toml")]
+    white = ["calibrate", str(frames / "white-f62.png"), "--f-number", "62", "-o", str(tmp_path / "known.toml")]
+    assert main([*white, *words]) == 0
+    capsys.readouterr()
+    assert main(["carriers", str(frames / f"{name}-f9.9.png"), "--f-number", "9.9", *words, *known]) == 0
+    assert told in capsys.readouterr().out
+    views = []
+    for one in ("good", name):
+        made = tmp_path / f"{one}.npz"
+        decode = ["decode", str(frames / f"{one}-f9.9.png"), "--f-number", "9.9", "-o", str(made)]
+        assert main([*decode, *words, *known]) == 0
+        views.append(np.load(made)["views"][:, :, 6:-6, 6:-6])
+    assert -10 * math.log10(float(np.mean((views[1] - views[0]) ** 2))) > 38

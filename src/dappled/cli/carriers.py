@@ -55,7 +55,7 @@ class Table:
     @property
     def doubt(self) -> Finding | None:
         """Why the carriers can't be where slices are cut, or what can't be told of them; None where nothing is."""
-        return None if self.checked is None else self.checked.contradiction or self.off or self.checked.unsettled
+        return None if self.checked is None else self.checked.contradiction or self.checked.unsettled
 
     @property
     def used(self) -> Lattice:
@@ -177,7 +177,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
                 decoder = checked.decoder
                 predicted = decoder.predict(length)
                 used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
-            off = decoder.off_calibration(spectrum, length, predicted, seen, carriers_from)
+            change = decoder.change(spectrum, length, predicted, seen) if carriers_from == "measured" else None
             known = {(c.ky, c.kx): m for c, m in zip(predicted, seen, strict=True)}
             lattice = decoder.lattice_at(length)
             mask = decoder.optics.mask
@@ -200,7 +200,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
                 own=used,
                 rotation_rad=turned,
                 checked=checked,
-                off=off,
+                off=None if change is None else change.finding,
             )
 
 
@@ -332,6 +332,8 @@ def _summary(table: Table) -> str:
         orders = [(c.ky, c.kx) for c, _ in table.rows]
         if table.search is not None:
             sentence += f"; {table.search.sentence}"
+        if table.off is not None:
+            sentence += f"; {told(table.off, FRAME)}"
         strange = table.doubt or displaced(table.used.carriers(orders), [c for c, _ in table.rows])
         return f"{sentence}; {told(strange, FRAME)}" if strange else sentence
     whose = "calibration's" if table.carriers_from == "calibrated" else "law's"
@@ -342,5 +344,4 @@ def _summary(table: Table) -> str:
             f"{start}; no carriers in this frame: it was taken without this mask, or near the mask's ideal "
             f"aperture, where flat areas show none; a decode uses the {whose} prediction"
         )
-    why = "too few or weak" if table.doubt is None else str(told(table.doubt, FRAME))
-    return f"{start}; {table.seen} of {there} carriers seen, {why}: a decode uses the {whose} prediction"
+    return f"{start}; {table.seen} of {there} carriers seen, too few or weak: a decode uses the {whose} prediction"

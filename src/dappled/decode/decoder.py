@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from dappled import codec
 from dappled.decode.array_types import Singles
 from dappled.decode.calibration.calibration import Calibration, LatticeFit, moved
-from dappled.decode.calibration.testimony import off_calibration
+from dappled.decode.calibration.testimony import LatticeChange, lattice_change
 from dappled.decode.errors import DecodeError
 from dappled.decode.joint.clipping import clipped_shares, unclipped
 from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of
@@ -47,7 +47,6 @@ from dappled.decode.spectrum.peaks import (
     farther_lattice,
     measure,
     own_lattice,
-    stretch,
     turn_between,
 )
 from dappled.decode.spectrum.slices import Slices, extract
@@ -65,6 +64,7 @@ _UNKNOWN: Mapping[str, Any] = {
     "views_unclipped": False,
 }
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
+_UNLIKE = frozenset({Code.APERTURE_DISAGREES, Code.APERTURE_UNEXPLAINED})
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
 
@@ -243,7 +243,6 @@ class MaskDecoder:
                 spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=min(0.5, needed))
             slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
             noise = noise_rms(spectrum)
-            off = self.off_calibration(spectrum, focal_length_mm, predicted, measured, carriers_from)
         if views:
             clips = self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
             made = self.views(
@@ -258,8 +257,9 @@ class MaskDecoder:
         else:
             made = MadeViews(*no_views(slices.values.shape[1:]))
         place = made.moved or self._moved(slices, lattice, focal_length_mm)
-        if off is not None:  # by the carriers themselves: beyond what a search by parallax reaches
-            place = (off, *(one for one in place if one.code is not Code.MASK_TURNED))
+        if carriers_from == "measured" and any(one.code in _UNLIKE for one in made.findings):
+            change = self.change(spectrum, focal_length_mm, predicted, measured)  # the cause, rather than the aperture
+            place = place if change is None else (change.finding, *place)
         report = DecodeReport(
             tuple(predicted),
             tuple(measured),
@@ -319,7 +319,10 @@ class MaskDecoder:
         least = STRONGER if self._placed else STRONG
         own = own_lattice(spectrum, predicted, measured, least)
         if own is None and self.calibration is not None:
-            return lattice, measured, "calibrated"
+            change = self.change(spectrum, focal_length_mm, predicted, measured)
+            if change is None:
+                return lattice, measured, "calibrated"
+            own = change.of(lattice)
         if own is None and self.ratio is not None:
             return lattice, measured, "predicted"
         own = own or farther_lattice(spectrum, predicted)
@@ -333,25 +336,17 @@ class MaskDecoder:
         at_own = measure(spectrum, own.carriers([(c.ky, c.kx) for c in predicted]), 2.0)
         return own, at_own, "measured"
 
-    def off_calibration(
+    def change(
         self,
         spectrum: Spectrum,
         focal_length_mm: float,
         predicted: Sequence[Carrier],
         measured: Sequence[Measured | None],
-        carriers_from: CarriersFrom,
-    ) -> Finding | None:
-        """That carriers, each too weak to overrule the calibration, together contradict it; None where they don't."""
-        if carriers_from != "calibrated" or self.calibration is None:
+    ) -> LatticeChange | None:
+        """How a frame's carriers together contradict the calibration; None where they don't, or there is none."""
+        if self.calibration is None:
             return None
-        longer = self.lattice_at(focal_length_mm + self.focal_sigma_mm).carriers([(c.ky, c.kx) for c in predicted])
-        return off_calibration(
-            spectrum,
-            predicted,
-            measured,
-            lattice_bins=self.calibration.nearest(focal_length_mm).residual_bins,
-            off_sigma=abs(stretch(longer, predicted)),
-        )
+        return lattice_change(spectrum, predicted, measured, self.calibration.nearest(focal_length_mm).residual_bins)
 
     def radii(self, carriers: Sequence[Carrier], focal_length_mm: float) -> list[float]:
         """How far from each prediction a carrier may lie, in bins: rotation, rounding of the focal length, 1.5 bins."""
@@ -433,10 +428,11 @@ class MaskDecoder:
         place, told = None, False
         if self.calibration is not None:
             known = self.calibration.nearest(focal_length_mm)
-            found = self._calibrated(taken, lattice, known)
+            turn = turn_between(lattice, self.lattice_at(focal_length_mm))
+            found = self._calibrated(taken, lattice, known, turn)
             if plane is not None and found[1].fits and not (found[2] and found[2].turn_rad):
                 taken = replace(taken, values=self._unclipped(found[0], plane, lattice))
-                again = self._calibrated(taken, lattice, known)
+                again = self._calibrated(taken, lattice, known, turn)
                 found, told = (again, True) if again[1].fits else (found, False)
             taken, width, place = found
             views_from: ViewsFrom = "calibration"
@@ -497,14 +493,14 @@ class MaskDecoder:
             return extract(spectrum, taken.carriers, size, taper=self.taper, workers=self.workers).values
 
     def _calibrated(
-        self, taken: TakenSlices, lattice: Lattice, known: LatticeFit
+        self, taken: TakenSlices, lattice: Lattice, known: LatticeFit, turn_rad: float
     ) -> tuple[TakenSlices, UsedAperture, MaskPlace | None]:
         """The slices with a calibration's transfers, and the aperture that they show; with the joint model, where
         they place the mask, and as a mask in its place would make them."""
         magnitudes = dict(zip(self.optics.mask.half_orders(), known.transfer, strict=True))
         corner = at_corner(known.origin, lattice, self.optics.sensor.shape)
         transfers = transfer(taken.orders, [magnitudes[order] for order in taken.orders], corner)
-        taken = replace(taken, transfers=transfers, rotation_rad=known.rotation_rad)
+        taken = replace(taken, transfers=transfers, rotation_rad=known.rotation_rad + turn_rad)
         width = taken.width(distance_known=known.distance_fitted)
         found = taken.through(width)
         if not self.joint_views:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.optics import Carrier
+from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.findings import FRAME, Code, Finding, finding
@@ -25,8 +25,7 @@ _FARTHER = 0.055  # of their frequency: 3°, or 5 %
 _NEAR_BINS, _ALIKE_BINS = 2.0, 0.35
 _LEAST_SCATTER_BINS = 0.04  # of carriers from their lattice, on right frames
 _SURE = 5.0  # standard errors
-_LEAST_BINS = 0.15  # of the outermost carrier: smaller moves may be the scene's
-_LEAST_TURN = 6.5e-3  # radians: smaller ones are found, and allowed for, by `joint.mask_place`
+_LEAST_BINS = 0.08  # of the outermost carrier: smaller moves cost no view anything
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,12 +37,15 @@ class LatticeChange:
     turn_rad: float
     turn_sigma_rad: float
 
-    def finding(self, outermost_bins: float) -> Finding | None:
-        """That they contradict the prediction; None where they don't, or where the turn is one to be allowed for."""
-        scaled = abs(self.off) > max(_SURE * self.off_sigma, _LEAST_BINS / outermost_bins)
-        turned = abs(self.turn_rad) > max(_SURE * self.turn_sigma_rad, _LEAST_TURN)
-        if not (scaled or turned):
-            return None
+    def of(self, lattice: Lattice) -> Lattice:
+        """A predicted lattice, changed so."""
+        c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
+        (ay, ax), (by, bx) = (1 + self.off) * lattice.matrix() @ np.array([[c, -s], [s, c]])
+        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+
+    @property
+    def finding(self) -> Finding:
+        """That carriers stand elsewhere than their calibration has them."""
         return finding(
             Code.CARRIERS_OFF_CALIBRATION,
             FRAME,
@@ -54,34 +56,30 @@ class LatticeChange:
         )
 
 
-def off_calibration(
-    spectrum: Spectrum,
-    predicted: Sequence[Carrier],
-    measured: Sequence[Measured | None],
-    *,
-    lattice_bins: float,
-    off_sigma: float,
-) -> Finding | None:
-    """That the carriers a frame shows contradict those predicted of it; None where they agree, or too few are seen.
+def lattice_change(
+    spectrum: Spectrum, predicted: Sequence[Carrier], measured: Sequence[Measured | None], lattice_bins: float
+) -> LatticeChange | None:
+    """How the carriers that a frame shows contradict those predicted of it; None where they agree, or too few are seen.
 
-    `lattice_bins` is the rms by which the calibration's own carriers lie off its lattice, `off_sigma` by what share the
-    prediction may be off in scale as the focal length is rounded.
+    `lattice_bins` is the rms by which the calibration's own carriers lie off its lattice.
     """
     outer = [c for c in predicted if (c.ky, c.kx) != (0, 0)]
     if not outer:
         return None
     bins = math.sqrt(spectrum.padded[0] * spectrum.padded[1])
+    away = [math.hypot(c.fy, c.fx) * bins for c in outer]
     change = _change(spectrum, predicted, measured, lattice_bins=lattice_bins, share=0.5)
     if change is None:
-        away = [math.hypot(c.fy, c.fx) for c in outer]
         inner = [outer[i] for i in np.argsort(away, kind="stable")[:_INNER]]
         reach = [_NEAR_BINS + _FARTHER * math.hypot(c.fy, c.fx) * bins for c in inner]
         seen = dict(zip(inner, measure(spectrum, inner, reach), strict=True))
         change = _change(spectrum, predicted, [seen.get(c) for c in predicted], lattice_bins=lattice_bins, share=2 / 3)
     if change is None:
         return None
-    change = LatticeChange(change.off, math.hypot(change.off_sigma, off_sigma), change.turn_rad, change.turn_sigma_rad)
-    return change.finding(max(math.hypot(c.fy, c.fx) for c in outer) * bins)
+    least = _LEAST_BINS / max(away)
+    scaled = abs(change.off) > max(_SURE * change.off_sigma, least)
+    turned = abs(change.turn_rad) > max(_SURE * change.turn_sigma_rad, least)
+    return change if scaled or turned else None
 
 
 def _change(
