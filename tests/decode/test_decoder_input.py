@@ -83,6 +83,15 @@ def test_a_plane_with_a_pixel_that_is_no_number_is_told(value: float) -> None:
         LensletDecoder(SHAPE).decode(plane)
 
 
+def test_a_damaged_value_is_told_before_it_is_decoded() -> None:
+    plane = np.random.default_rng(1).random(SHAPE).astype(np.float32)
+    plane[17, 400] = 1e30
+    with pytest.raises(DecodeError, match="a value of 1e\\+30, where white is 1"):
+        lineariser(SHAPE, black=0, white=1).apply(plane)
+    with pytest.raises(DecodeError, match="some of its values are damaged"):
+        _decoder(SHAPE).decode(plane, focal_length_mm=FOCAL_MM)
+
+
 @pytest.mark.parametrize("level", [0.0, 0.4, 1.0], ids=["black", "grey", "saturated"])
 def test_a_plane_without_a_picture_has_no_lenslets_and_no_carriers(level: float) -> None:
     plane = np.full(SHAPE, level, dtype=np.float32)

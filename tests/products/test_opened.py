@@ -145,10 +145,19 @@ def _frame(folder: Path) -> Path:
     return folder / "b.dng"
 
 
-def test_a_raw_frame_keeps_where_its_lens_was_focused(tmp_path: Path) -> None:
+def test_an_array_is_decoded_with_the_lens_that_is_told_and_keeps_where_it_was_focused(tmp_path: Path) -> None:
     camera = reference_camera(1, scale=0.5, scene="bench")
-    (tmp_path / "frame.dng").write_bytes(camera.expose(0.0, 0).file)
-    frame = dappled.open(tmp_path / "frame.dng", mask="reference-5x5", focus_m=20.0)
+    np.save(tmp_path / "frame.npy", camera.expose(0.0, 0).raw)
+    frame = dappled.open(
+        tmp_path / "frame.npy",
+        camera="reference-36mm",
+        mask="reference-5x5",
+        focal_length_mm=50.0,
+        f_number=7.4,
+        focus_m=20.0,
+        black=camera.sensor.black,
+        white_level=camera.sensor.white,
+    )
     assert isinstance(frame, OpenedFrame)
     metres = frame.light_field.metres()
     assert -metres.gain_px_m / metres.offset_px == pytest.approx(20.0)

@@ -277,13 +277,18 @@ class SharpPicture:
 
 @dataclass(frozen=True, repr=False)
 class OpenedFrame(Refocusable):
-    """A raw frame, decoded once, by `light_field`. `tag` says when and where it was taken; None outside a flight."""
+    """A raw frame, decoded once, by `light_field`. `tag` says when and where it was taken; None outside a flight.
+
+    `focal_length_mm` and `f_number` are for a frame without a tag whose file doesn't say them, or says them wrong.
+    """
 
     path: Path
     darkroom: Darkroom
     tag: Tag | None = None
     index: int | None = None
     focus_m: float | None = None
+    focal_length_mm: float | None = None
+    f_number: float | None = None
 
     @cached_property
     def light_field(self) -> OpenedLightField:
@@ -304,8 +309,9 @@ class OpenedFrame(Refocusable):
 
     @property
     def _optics(self) -> tuple[float | None, float | None]:
-        """Focal length and f-number as the tag has them; None: as the file has."""
-        return (None, None) if self.tag is None else (self.tag.focal_length_mm, self.tag.f_number)
+        """Focal length and f-number as told, or as the tag has them; None: as the file has."""
+        known = self if self.tag is None else self.tag
+        return known.focal_length_mm, known.f_number
 
     def _decoded(self) -> OpenedLightField:
         return self.light_field
@@ -402,8 +408,8 @@ def open(path: str | Path, *, kind: str | None = None, focus_m: float | None = N
     `kind` says which of them is expected, so that the result has one type: "light field", "frame" or "flight".
     `focus_m` is the distance at which the lens was focused (inf: infinity). `recipe` says how frames are decoded:
     `camera`, `mask`, `law`, `calibration`, `white`, `dark`, `colour` … as in `Recipe`; in a flight these replace values
-    of its own recipe. Raises DappledError, also where the path is of another kind, and for a recipe with a light field,
-    which is decoded already.
+    of its own recipe. A frame whose file doesn't say them needs `focal_length_mm` and `f_number`. Raises DappledError,
+    also where the path is of another kind, and for a recipe with a light field, which is decoded already.
     """
     if kind is not None and kind not in _KINDS:
         raise OpenError(f"there is no kind {kind!r}: choose {', '.join(_KINDS)}, or leave it out")
@@ -424,8 +430,10 @@ def _open(path: str | Path, focus_m: float | None, recipe: Mapping[str, Any]) ->
     if not found.is_dir():
         if found.suffix.lower() in _TEXTS:
             raise OpenError(f"{path} is no frame: open takes a raw frame, a decoded light field or a flight")
-        darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), recipe, found))
-        return OpenedFrame(found, darkroom, focus_m=focus_m)
+        given = dict(recipe)
+        length, stop = given.pop("focal_length_mm", None), given.pop("f_number", None)
+        darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), given, found))
+        return OpenedFrame(found, darkroom, focus_m=focus_m, focal_length_mm=length, f_number=stop)
     if layout.FlightFolder(found).ledger.exists():
         record = flight_report.show(found)
         own = of_flight(found, record.settings, recipe)

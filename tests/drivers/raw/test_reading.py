@@ -227,6 +227,23 @@ def test_a_jpeg_of_four_colours_is_a_jpeg() -> None:
     assert read(file.getvalue()).developed == "it is a JPEG"
 
 
+@pytest.mark.parametrize("kind", [">u2", "i2", "i4", "u4", "i8"])
+def test_integers_of_any_size_and_byte_order_are_those_of_16_bits(kind: str) -> None:
+    values = np.arange(12).reshape(3, 4) * 100
+    frame = read(npy(values.astype(kind)))
+    assert frame.mosaic.dtype == np.uint16
+    assert frame.white == 65535
+    np.testing.assert_array_equal(frame.mosaic, values)
+
+
+@pytest.mark.parametrize("kind", ["f2", ">f4", ">f8", "longdouble"])
+def test_floats_of_any_size_and_byte_order_are_read(kind: str) -> None:
+    values = np.linspace(0, 1, 12).reshape(3, 4)
+    frame = read(npy(values.astype(kind)))
+    assert frame.white == 1
+    np.testing.assert_allclose(frame.mosaic, values, atol=5e-4)
+
+
 @pytest.mark.parametrize(
     ("data", "words"),
     [
@@ -239,7 +256,9 @@ def test_a_jpeg_of_four_colours_is_a_jpeg() -> None:
         (b"\x89PNG\r\n\x1a\n", "not a frame"),
         (b"\xff\xd8\xff\xe0" + bytes(50), "not a frame"),
         (b"\x93NUMPY1234567890", "damaged or cut short"),
-        (npy(np.zeros((3, 4), np.int64)), "8 or 16 bits"),
+        (npy(np.full((3, 4), 70000)), "70000 to 70000; a frame has 8 or 16 bits"),
+        (npy(np.full((3, 4), -1)), "8 or 16 bits"),
+        (npy(np.zeros((3, 4), complex)), "8 or 16 bits"),
         (npy(np.zeros(7, np.uint8)), "its shape is"),
         (npy(np.zeros((0, 7), np.uint8)), "its shape is"),
         (npy(np.array([{}], dtype=object)), "can't be read"),

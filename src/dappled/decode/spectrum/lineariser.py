@@ -406,11 +406,18 @@ def check_frame(
     _check_values(mosaic, white)
 
 
+_MOST_WHITES = 1e5  # more than a 16-bit frame whose white is taken for 1: such a value is damage, not light
+
+
 def _check_values(mosaic: NDArray[Any], white: float) -> None:
     if mosaic.dtype.kind not in "uif":
         raise DecodeError(f"the frame holds {mosaic.dtype} values: give integers or floats")
     if mosaic.dtype.kind == "f" and not np.isfinite(mosaic).all():
         raise DecodeError("the frame holds NaN or infinite values")
+    if mosaic.dtype.kind == "f" and (most := max(float(mosaic.max()), -float(mosaic.min()))) > _MOST_WHITES * white:
+        raise DecodeError(
+            f"the frame holds a value of {most:g}, where white is {white:g}: mend it, or give --white-level"
+        )
     some = mosaic[:: mosaic.shape[0] // 256 | 1, :: mosaic.shape[1] // 256 | 1]  # odd steps: all colours are among them
     if some.min() == some.max() and mosaic.min() == mosaic.max():
         raise DecodeError(f"the frame is constant: every pixel is {mosaic.flat[0]}")

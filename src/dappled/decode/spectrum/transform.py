@@ -23,6 +23,7 @@ from dappled.workers import each, share, spans
 Source: TypeAlias = "Plane | LinearRows"
 Complex = NDArray[np.complex64]
 TILE = 24  # columns that lie together in memory: a tile of them stays in the cache while it is transformed
+_MOST_MEAN = 1e9  # times white: no light, and squares of it soon overflow
 _TILES = 4  # transformed at a time
 _NOISE_SIDE = 34  # bins of a part that noise is measured in, one at each edge for the window
 _NOISE_PARTS = (8, 8)  # rows and columns of parts
@@ -252,6 +253,8 @@ def transform(source: Source, *, tiles: Complex | None = None, workers: int = 1,
     spectrum = Spectrum(tiles, columns, (height, width), padded, level)
     if not math.isfinite(spectrum.mean):  # every pixel is part of the mean
         raise DecodeError("the frame holds NaN or infinite values")
+    if abs(spectrum.mean) > _MOST_MEAN:
+        raise DecodeError(f"the mean of the frame is {spectrum.mean:g}: some of its values are damaged")
     return spectrum
 
 

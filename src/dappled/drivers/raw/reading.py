@@ -298,6 +298,14 @@ def _plain(values: NDArray[Any], settings: ExposureSettings) -> RawFile:
     """Make a frame of an array without a mosaic; white is the largest integer of its type, or 1. Raises ValueError."""
     if values.dtype.kind == "b":
         values = values.astype(np.uint8) * np.uint8(255)
+    kind = values.dtype.kind
+    if kind == "f" and values.dtype not in (np.float32, np.float64):  # half or long ones, or of the other byte order
+        values = values.astype(np.float32 if values.dtype.itemsize <= 4 else np.float64)
+    elif kind in "iu" and values.dtype not in (np.uint8, np.uint16) and values.size:
+        low, high = int(values.min()), int(values.max())
+        if low < 0 or high > np.iinfo(np.uint16).max:
+            raise ValueError(f"its values are {low} to {high}; a frame has 8 or 16 bits unsigned, or floats")
+        values = values.astype(np.uint16)
     if values.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise ValueError(f"its values are {values.dtype}; a frame has 8 or 16 bits unsigned, or floats")
     white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
