@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
@@ -115,6 +116,32 @@ def test_each_colour_has_a_shadow_of_its_own() -> None:
     found = _picture(shots[1], MosaicPlane(frame.astype(np.float32), pattern))
     truth = np.choose(index, [one.truth * gain for one, gain in zip(shots, (0.5, 1.0, 0.7), strict=True)])
     assert psnr(found.plane, truth) > 40
+
+
+def _lab(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n, 3) CIE L*a*b* of linear sRGB, D65."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    x, y, z = np.cbrt(rgb @ to_xyz.T / to_xyz.sum(axis=1)).T  # patches are brighter than where the curve is straight
+    return np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("f_number", [7.5, 15.0])
+def test_patches_keep_their_colours(f_number: float) -> None:
+    shot = Shot(f_number=f_number, shape=(288, 416), white=True)
+    chart = np.random.default_rng(24).uniform(0.06, 0.7, size=(4, 6, 3))
+    pattern = np.array([[0, 1], [1, 2]])
+    index = np.tile(pattern, (144, 208))
+    whole = np.pad(chart.repeat(64, 0).repeat(64, 1), [(16, 16), (16, 16), (0, 0)], "edge")
+    plain = np.choose(index, np.moveaxis(whole, 2, 0))
+    frame = plain * shot.shadow + shot.noise()
+    found = _picture(shot, MosaicPlane(frame.astype(np.float32), pattern)).plane
+    means = []
+    for image in (found, plain):
+        patches = image[16:-16, 16:-16].reshape(4, 64, 6, 64).transpose(0, 2, 1, 3).reshape(24, 32, 2, 32, 2)
+        a, b, c, d = (patches[:, :, row, :, column].mean(axis=(1, 2)) for row in (0, 1) for column in (0, 1))
+        means.append(_lab(np.stack([a, (b + c) / 2, d], axis=1).astype(np.float64)))
+    assert np.linalg.norm(means[0] - means[1], axis=1).max() <= 1
 
 
 def test_a_chip_with_staggered_rows_gives_a_picture_in_every_pixel() -> None:

@@ -29,6 +29,8 @@ _SEEN, _SURE = 3.0, 8.0  # ghost and detail over detail: from where on it counts
 _GEOMETRIC = 1.2  # mean of Gamma(2) variables over the exponential of their mean logarithm, of four
 _QUIET, _DETAILED = 1.2, 2.0  # what is finer than the band over its noise: up to where it is weighed, and is not
 _FALLS = 2.5  # times: neighbouring pixels share at least one part in so many of the flattest detail
+_AROUND = ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0), (0.5, 0), (0, -0.5), (0, 0.5))
+_ALONG = 60.0  # times what is on diagonals: edges along rows or columns have all their detail on a line of carriers
 _GAIN = 0.2  # a square period: by how much a ghost gains on detail, found for f^-1.1 to f^-1.5, 1 to 5 px a view
 _MARGIN_PERIODS = 4  # reflected around the frame before it is transformed
 
@@ -102,9 +104,13 @@ def mixed(samples: Sequence[Sharp], shadow: Shadow) -> Mixed:
             + yy[..., None] * np.abs(sums[1]) ** 2
             - 2 * yx[..., None] * (sums[0] * sums[1].conj()).real
         ) / own
-        around = np.exp(np.log(power[..., count:][..., nearest] + 1e-30).mean(axis=-1))
+        nearby = np.log(power[..., count:][..., nearest] + 1e-30)
+        around = _GEOMETRIC * np.exp(nearby[..., :4].mean(axis=-1))
+        for pair in (nearby[..., 4:6], nearby[..., 6:]):
+            along = np.exp(pair.mean(axis=-1))
+            around = np.where(along > _ALONG * around, along, around)
         ghost += power[..., :count].sum(axis=-1)
-        detail += _GEOMETRIC * around.sum(axis=-1)
+        detail += around.sum(axis=-1)
         total += block_sums(rest * rest, *edges)
         noise += block_sums(one.noise, *edges)
         pixels += block_sums(np.ones_like(rest), *edges)
@@ -173,14 +179,14 @@ def _weights(ratio: Floats, gain: float, total: Floats, noise: Floats) -> Floats
 
 
 def _frequencies(shadow: Shadow) -> tuple[Floats, Floats, NDArray[np.intp]]:
-    """Carriers (K, 2), the points (M, 2) midway between four carriers each, and (K, 4) which of them lie around
-    which."""
+    """Carriers (K, 2), the points (M, 2) midway between carriers, and (K, 8) which of them lie around which: four
+    on diagonals, two along each axis."""
     orders = np.array(shadow.orders, dtype=np.float64)
-    around = orders[:, None, :] + np.array([(-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5)])
+    around = orders[:, None, :] + np.array(_AROUND)
     flipped = np.where((around[..., :1] < 0) | ((around[..., :1] == 0) & (around[..., 1:] < 0)), -around, around)
     points, index = np.unique(flipped.reshape(-1, 2), axis=0, return_inverse=True)
     matrix = shadow.lattice.matrix()
-    return orders @ matrix, points @ matrix, index.reshape(len(orders), 4)
+    return orders @ matrix, points @ matrix, index.reshape(len(orders), len(_AROUND))
 
 
 def _between(places: Floats, length: int, count: int) -> Floats:
