@@ -1,16 +1,21 @@
-"""Threads: `Loop` runs one function, `Worker` works off a bounded queue, `each` and `share` split work among several.
+"""Threads: `Loop` runs one function, `Worker` works off a bounded queue, `each` and `share` split work among several,
+`one_blas_thread` keeps OpenBLAS from doing so.
 
 What `each` and `share` compute is the same for any number of threads.
 """
 
 from __future__ import annotations
 
+import ctypes
+import itertools
 import logging
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
 from dappled.clock import Clock, SystemClock
@@ -235,3 +240,52 @@ def share(start: Callable[[], Callable[[Part], None]], parts: Iterable[Part], wo
 def spans(size: int, step: int) -> list[slice]:
     """0…size in runs of `step`."""
     return [slice(start, min(start + step, size)) for start in range(0, size, step)]
+
+
+class _BlasThreads:
+    """How many threads OpenBLAS has: one while someone is inside, then as many as before."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._inside = 0
+        self._before: list[tuple[Callable[[int], object], int]] = []
+
+    @contextmanager
+    def one(self) -> Iterator[None]:
+        """Meanwhile the OpenBLAS of NumPy and SciPy computes in the calling threads alone, in the whole process.
+
+        Matrices here are small, and its threads wait for each other with all cores busy. The command needs no such
+        limit: it sets OPENBLAS_NUM_THREADS, which is read once, when NumPy is loaded.
+        """
+        with self._lock:
+            if not self._inside:
+                self._before = [(put, ask()) for ask, put in _openblas()]
+                for put, _ in self._before:
+                    put(1)
+            self._inside += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._inside -= 1
+                if not self._inside:
+                    for put, count in self._before:
+                        put(count)
+
+
+one_blas_thread = _BlasThreads().one
+
+
+def _openblas() -> Iterator[tuple[Callable[[], int], Callable[[int], object]]]:
+    """What asks for and what sets the number of threads of each OpenBLAS that is loaded; none where the system has no
+    list of what is loaded."""
+    listed = Path("/proc/self/maps")
+    lines = listed.read_text("utf-8", "replace").splitlines() if listed.exists() else []
+    mapped = [line.split(maxsplit=5) for line in lines]
+    for path in sorted({words[5] for words in mapped if len(words) == 6 and "openblas" in Path(words[5]).name}):
+        with suppress(OSError):  # replaced by another version since
+            library = ctypes.CDLL(path)
+            for before, after in itertools.product(("scipy_", ""), ("64_", "")):
+                names = [f"{before}openblas_{what}_num_threads{after}" for what in ("get", "set")]
+                if all(hasattr(library, name) for name in names):
+                    yield getattr(library, names[0]), getattr(library, names[1])

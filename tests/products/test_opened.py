@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import base64
+import ctypes
 import io
 import re
 import sys
@@ -26,6 +27,7 @@ from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products import opened
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFrame, OpenedLightField, OpenError
+from tests.needs import without
 from tests.products.fields import DISPARITY, light_field
 
 CLIPPED = codec.plain(finding(Code.FRAME_CLIPPED, FRAME, share=0.03))
@@ -59,6 +61,39 @@ def test_a_light_field_is_opened_refocused_and_measured(path: Path) -> None:
     depth = found.depth()
     assert np.nanmedian(depth.disparity) == pytest.approx(DISPARITY, abs=0.01)
     assert found.eyes().left.shape == (60, 80)
+
+
+def test_blas_has_one_thread_while_the_face_computes(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = sorted((Path(np.__file__).parents[1] / "numpy.libs").glob("*openblas*"))
+    library = ctypes.CDLL(str(found[0])) if found else None
+    if not hasattr(library, "scipy_openblas_get_num_threads64_"):
+        without("NumPy has no OpenBLAS of its own here")
+    assert library is not None
+    threads, put = library.scipy_openblas_get_num_threads64_, library.scipy_openblas_set_num_threads64_
+    before, inside = threads(), list[int]()
+
+    def seen(*_: object, **__: object) -> None:
+        inside.append(threads())
+        raise DecodeError("seen")
+
+    monkeypatch.setattr("dappled.products.opened.Darkroom.decode", seen)
+    monkeypatch.setattr("dappled.products.opened.depths.estimate", seen)
+    frame = tmp_path / "frame.npy"
+    np.save(frame, np.zeros((64, 64), np.float32))
+    put(3)
+    try:
+        for ask in (
+            lambda: dappled.open(frame, kind="frame", mask="reference-5x5", camera="reference-36mm").views,
+            lambda: dappled.open(path, kind="light field").depth(),
+        ):
+            with pytest.raises(DecodeError, match="seen"):
+                ask()
+            assert threads() == 3
+    finally:
+        put(before)
+    assert inside == [1, 1]
 
 
 def test_metres_need_a_calibration_or_a_focus(path: Path) -> None:

@@ -40,6 +40,7 @@ from dappled.findings import FRAME, Finding, told
 from dappled.flight import Tag, flight_report, layout
 from dappled.products import figures, summaries
 from dappled.products.exports import light_files, view_folders
+from dappled.workers import one_blas_thread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -88,6 +89,7 @@ class Refocusable(ABC):
         weights = None if aperture is None else refocusing.disc(one.stack, aperture)
         return refocusing.tilted(one.stack, FocalPlane(at, *tilt), weights=weights, workers=one.workers)
 
+    @one_blas_thread()
     def depth(
         self, method: str = "combined", *, between: tuple[float, float] | None = None, window: int | None = None
     ) -> DepthMap:
@@ -291,12 +293,14 @@ class OpenedFrame(Refocusable):
     f_number: float | None = None
 
     @cached_property
+    @one_blas_thread()
     def light_field(self) -> OpenedLightField:
         """The decoded frame. Raises DappledError."""
         length, stop = self._optics
         made = self.darkroom.decode(self.path, focal_length_mm=length, f_number=stop)
         return OpenedLightField(made.light_field, self.path, self.focus_m)
 
+    @one_blas_thread()
     def picture(self, *, colour: bool = True) -> SharpPicture:
         """Return the frame's picture with every pixel of the sensor; no light field is decoded for it. A frame of a
         grey sensor has no `colour`. Raises DappledError, also behind lenslets."""
