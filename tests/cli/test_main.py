@@ -4,16 +4,29 @@ from __future__ import annotations
 
 import json
 import logging
+import subprocess
+import sys
 import warnings
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
 import dappled.cli
 from dappled.cli import VERBS, main
-from dappled.cli.command_line import options
+from dappled.cli.command_line import options, verb_class
+from dappled.cli.mask.arguments import FILM_NAMES
 from dappled.cli.table import GROUPS
 from dappled.cli.verb import Report
+from dappled.config.settings import LAW_NAMES
+from dappled.decode.depth import estimate
+from dappled.decode.optics import LAWS
+from dappled.decode.optics.film import FILMS
+from dappled.decode.optics.laser_bench import THESIS_DISTANCE_M, THESIS_WAVELENGTH_NM
+from dappled.decode.optics.lenses import SHIFT_SIGMA_PX
+from dappled.decode.spectrum.pictures import Look
+from dappled.products.exports.exports import ESLF_LENSLET_PX
+from dappled.products.maps.refly import SLOWEST_M_S
 
 
 @pytest.mark.parametrize("path", [*VERBS, *GROUPS])
@@ -22,6 +35,44 @@ def test_every_verb_has_help_with_an_example_of_itself(path: str, capsys: pytest
         main([*path.split(), "--help"])
     assert ended.value.code == 0
     assert f"dappled {path}" in capsys.readouterr().out.partition("example")[2]
+
+
+HELPS = """
+import contextlib, io, json, sys
+from dappled.cli import main
+from dappled.cli.table import GROUPS, VERBS
+said = {}
+for path in [*VERBS, *GROUPS]:
+    sys.argv = ["dappled", *path.split(), "--help"]
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+        main()
+    said[path] = out.getvalue()
+print(json.dumps([said, list(sys.modules)]))
+"""
+WORK = {"numpy", "scipy", "PIL", "zmq", "pymavlink", "rawpy", "pyproj", "tifffile", "usb", "gphoto2", "tomli_w"}
+
+
+def test_help_loads_nothing_of_what_the_work_needs() -> None:
+    done = subprocess.run([sys.executable, "-c", HELPS], capture_output=True, text=True, timeout=60, check=True)
+    said, loaded = json.loads(done.stdout)
+    for path in [*VERBS, *GROUPS]:
+        assert f"dappled {path}" in said[path].partition("example")[2], path
+    assert not WORK & set(loaded)
+    ours = {".".join(name.split(".")[1:3]) for name in loaded if name.startswith("dappled.daemon.")}
+    assert ours <= {"daemon.health"}
+
+
+def test_what_help_names_by_itself_is_what_the_work_knows() -> None:
+    words = {path: verb_class(path).__dataclass_fields__ for path in VERBS}
+    assert tuple(LAWS) == LAW_NAMES
+    assert tuple(FILMS) == FILM_NAMES
+    assert words["carriers"]["look"].metadata["argument"].rule.choices == get_args(Look)
+    assert words["depth"]["method"].metadata["argument"].rule.text == ", ".join(estimate.METHODS)
+    assert f"LFToolbox: {ESLF_LENSLET_PX})" in words["export"]["lenslet"].metadata["argument"].rule.text
+    assert words["mask design"]["shift_error"].default == SHIFT_SIGMA_PX
+    assert words["flight coverage"]["slowest"].default == SLOWEST_M_S
+    bench = words["mask diffraction"]
+    assert (bench["wavelength"].default, bench["distance"].default) == (THESIS_WAVELENGTH_NM, THESIS_DISTANCE_M)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,8 @@ import sys
 from collections.abc import Callable, Sequence
 
 import dappled
-from dappled.cli.table import VERBS
+from dappled.cli import table
+from dappled.cli.table import GROUPS, VERBS
 from dappled.shown import say
 
 __all__ = ["VERBS", "main"]
@@ -22,6 +23,10 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
     if words == ["--version"]:
         say(f"dappled {dappled.__version__}")
         return 0
+    if arguments is None:
+        *named, last = words or [""]
+        asked = last in ("--help", "-h") and " ".join(named) in {**VERBS, **GROUPS}
+        table.words_only = asked or words[:1] == ["completion"]
     from dappled.cli import calling  # noqa: PLC0415  # --version waits for nothing
 
     return calling.run(words, loaded)

@@ -11,17 +11,20 @@ from pathlib import Path
 from dappled import codec
 from dappled.cli.geotag import MarkArguments, geoid_or_none
 from dappled.cli.placing import Placing
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, argument, flag, option
 from dappled.errors import DappledError, counted
 from dappled.findings import Finding, Subject, first_by_name
-from dappled.flight import disk_error, layout
-from dappled.products.batch import batch, workers
-from dappled.products.batch.batch import KINDS, Done, Job, Manifest
-from dappled.products.geotags import geotags, marks
-from dappled.products.geotags.geotags import Placed
-from dappled.products.handover import forms, photo_files
-from dappled.products.handover.forms import FORMS
-from dappled.products.maps import earth
+from dappled.products.handover import FORMS, KINDS
+
+if not words_only:
+    from dappled.flight import disk_error, layout
+    from dappled.products.batch import batch, workers
+    from dappled.products.batch.batch import Done, Job, Manifest
+    from dappled.products.geotags import geotags, marks
+    from dappled.products.geotags.geotags import Placed
+    from dappled.products.handover import forms, photo_files
+    from dappled.products.maps import earth
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,27 +7,30 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-from PIL import Image
+from typing import Any, Literal
 
 from dappled import codec, durable
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.config import profiles
-from dappled.decode.calibration.law_search import LawSearch
-from dappled.decode.decoder import CarriersFrom
-from dappled.decode.optics import Carrier, Lattice, Mask, Order
-from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
-from dappled.decode.spectrum import Plane
-from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
-from dappled.decode.spectrum.peaks import Measured, displaced, measure
-from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
-from dappled.decode.spectrum.transform import padded_shape, transform
-from dappled.drivers.raw.darkroom import Darkroom, known_to
-from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
 from dappled.errors import DappledError, counted
 from dappled.findings import FRAME, Finding, told
+
+if not words_only:
+    from PIL import Image
+
+    from dappled.config import profiles
+    from dappled.decode.calibration.law_search import LawSearch
+    from dappled.decode.decoder import CarriersFrom
+    from dappled.decode.optics import Carrier, Lattice, Mask, Order
+    from dappled.decode.optics.carrier_tables import crossed_orders, lattice_rotation
+    from dappled.decode.spectrum import Plane
+    from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
+    from dappled.decode.spectrum.peaks import Measured, displaced, measure
+    from dappled.decode.spectrum.pictures import Look, around, spectrum_boxes
+    from dappled.decode.spectrum.transform import padded_shape, transform
+    from dappled.drivers.raw.darkroom import Darkroom, known_to
+    from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,8 +90,9 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
         "--shape", "only predict, for frames of this size", None, metavar=("H", "W"), low=1,
     )  # fmt: skip
     picture: Path | None = option("--picture", "draw the spectrum with its boxes", None, metavar="FILE.png")
-    look: Look | None = option(
-        "--look", "what the picture shows", None, choices=LOOKS, otherwise="magnitude; with --around: phase",
+    look: Literal["magnitude", "phase", "laplacian"] | None = option(
+        "--look", "what the picture shows", None, choices=("magnitude", "phase", "laplacian"),
+        otherwise="magnitude; with --around: phase",
     )  # fmt: skip
     around: tuple[int, int] | None = option(
         "--around", "draw the bins around this carrier, each as a square", None, metavar=("KY", "KX"),

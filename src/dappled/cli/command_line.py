@@ -13,6 +13,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type_hints
 
 import dappled
+from dappled.cli import table
 from dappled.cli.table import GROUPS, VERBS
 from dappled.cli.verb import Argument, CallError, Verb
 from dappled.errors import DappledError
@@ -66,7 +67,13 @@ class Call:
 
 def verb_class(path: str) -> type[Verb]:
     """The class of a verb, by its words."""
-    found: type[Verb] = importlib.import_module(f"dappled.cli.{VERBS[path][0]}").CLASSES[path]
+    name = f"dappled.cli.{VERBS[path][0]}"
+    try:
+        module = importlib.import_module(name)
+    except NameError:  # one of its words is what was left out: with all of it the help is slow, and whole
+        table.words_only = False
+        module = importlib.import_module(name)
+    found: type[Verb] = module.CLASSES[path]
     return found
 
 

@@ -6,11 +6,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import tomli_w
-
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, argument
-from dappled.config import profiles, settings
-from dappled.daemon import settings_check
+from dappled.config import settings
+
+if not words_only:
+    import tomli_w
+
+    from dappled.config import profiles
+    from dappled.daemon import settings_check
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,11 +10,14 @@ from typing import Any
 from dappled import codec
 from dappled.cli.field_arguments import views_words
 from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
+from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, flag, option
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Finding, told
-from dappled.products.exports import light_files
+
+if not words_only:
+    from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
+    from dappled.products.exports import light_files
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,26 +10,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dappled import codec
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.decode import DecodeError
-from dappled.decode.depth import DepthMap, DistanceMap
-from dappled.decode.depth import estimate as depths
 from dappled.errors import counted
-from dappled.flight import layout
-from dappled.products.exports import exports, point_cloud, prints
-from dappled.products.maps import photographs, terrain
-from dappled.products.maps.georeference import Survey
-from dappled.products.maps.terrain import TerrainModel
-from dappled.products.mounting import Mounting
-from dappled.products.opened import OpenedLightField, OpenError
-from dappled.products.survey import flight_sweep, frame_terrain
-from dappled.products.survey.frame_depths import FrameDepths
+
+if not words_only:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from dappled.decode.depth import DepthMap, DistanceMap
+    from dappled.decode.depth import estimate as depths
+    from dappled.flight import layout
+    from dappled.products.exports import exports, point_cloud, prints
+    from dappled.products.maps import photographs, terrain
+    from dappled.products.maps.georeference import Survey
+    from dappled.products.maps.terrain import TerrainModel
+    from dappled.products.mounting import Mounting
+    from dappled.products.opened import OpenedLightField, OpenError
+    from dappled.products.survey import flight_sweep, frame_terrain
+    from dappled.products.survey.frame_depths import FrameDepths
 
 _POINTS = (".ply", ".las", ".laz")
 _RASTERS, _PICTURES = (".tif", ".tiff"), (".png", ".jpg", ".jpeg")  # of a flight's heights
@@ -49,7 +52,10 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         "OUT: .png (false colours), .npz (all values), .pfm (disparity), .ply, .las, .laz (points); of a flight .tif."
     )
 
-    method: str = option("--method", ", ".join(depths.METHODS), "combined", metavar="M", parse=depths.known_method)
+    method: str = option(
+        "--method", "combined, contrast, stereo", "combined", metavar="M",
+        parse=lambda name: depths.known_method(name),  # noqa: PLW0108  # --help doesn't load it
+    )  # fmt: skip
     between: tuple[float, float] | None = option(
         "--between", "range of disparities to search, px/view", None, metavar=("LOW", "HIGH"), otherwise="the scene's",
     )  # fmt: skip

@@ -15,18 +15,22 @@ from typing import Any
 from dappled import codec
 from dappled.cli import status
 from dappled.cli.status import is_listening, stream_endpoint
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, SettingsArgument, Verb, flag, option
 from dappled.config import settings as configuration
 from dappled.config.schema import read_toml
 from dappled.config.settings import Settings
-from dappled.daemon import settings_check, test_shot
-from dappled.daemon.health import frame_checks, go_no_go, host_checks
-from dappled.daemon.health.standing import in_record
-from dappled.daemon.pipeline import recipes
-from dappled.daemon.test_shot import Latency
-from dappled.drivers import usb_bus
+from dappled.daemon.health import go_no_go
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, Finding, Level, Subject, finding, remedy, text
+
+if not words_only:
+    from dappled.daemon import settings_check, test_shot
+    from dappled.daemon.health import frame_checks, host_checks
+    from dappled.daemon.health.standing import in_record
+    from dappled.daemon.pipeline import recipes
+    from dappled.daemon.test_shot import Latency
+    from dappled.drivers import usb_bus
 
 _WORDS = {Level.NOTE: "go", Level.CAUTION: "caution", Level.STOP: "NO GO"}
 _SETTINGS = Subject("settings")

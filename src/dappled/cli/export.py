@@ -7,10 +7,13 @@ from pathlib import Path
 
 from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, RangingArguments, doubts, opened_field, views_words
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
 from dappled.errors import DappledError
-from dappled.products.exports import exports, light_files
-from dappled.products.opened import OpenedLightField
+
+if not words_only:
+    from dappled.products.exports import exports, light_files
+    from dappled.products.opened import OpenedLightField
 
 KINDS = {
     "hci": "HCI benchmark folder: one PNG per view, parameters.cfg; with --depth also disp_estimate.pfm",
@@ -34,7 +37,7 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
     kind: str = option("--as", "the format", choices=tuple(KINDS))
     depth: bool = flag("--depth", "hci, rerun: add a depth map (method combined)")
     lenslet: int = option(
-        "--lenslet", f"eslf: side of a lenslet (LFToolbox: {exports.ESLF_LENSLET_PX})", 0, unit="px", low=0,
+        "--lenslet", "eslf: side of a lenslet (LFToolbox: 14)", 0, unit="px", low=0,
     )  # fmt: skip
     disparity: float = option(
         "--disparity", "quilt: the disparity that appears in the plane of the screen", 0.0, metavar="D",

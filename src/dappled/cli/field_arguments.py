@@ -5,13 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, argument, option
-from dappled.decode.depth import RANGING, Ranging
-from dappled.decode.lightfield import LightField
-from dappled.drivers.raw import calibration_files
 from dappled.findings import Finding, Subject, of_subject
-from dappled.products import opened
-from dappled.products.opened import OpenedLightField
+
+if not words_only:
+    from dappled.decode.depth import RANGING, Ranging
+    from dappled.decode.lightfield import LightField
+    from dappled.drivers.raw import calibration_files
+    from dappled.products import opened
+    from dappled.products.opened import OpenedLightField
 
 FIELD_HELP = "decoded light field (.zarr, .npz, .h5), or a folder of n × n pictures"
 

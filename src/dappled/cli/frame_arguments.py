@@ -7,13 +7,16 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from dappled import picture_order
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Report, argument, option
-from dappled.decode.optics import LAWS
-from dappled.drivers.raw.darkroom import Recipe
-from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
+from dappled.config.settings import LAW_NAMES
 from dappled.errors import DappledError, counted
 from dappled.findings import Finding, Level, first_by_name, worst
-from dappled.flight import layout
+
+if not words_only:
+    from dappled.drivers.raw.darkroom import Recipe
+    from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
+    from dappled.flight import layout
 
 # No JPEG: beside a raw file it is the same picture again. One that is named is taken.
 FRAME_SUFFIXES = (".arw", ".cr2", ".dng", ".lfp", ".lfr", ".nef", ".npy", ".png", ".raf", ".tif", ".tiff")
@@ -26,7 +29,7 @@ class RecipeArguments:
 
     camera: str = option("--camera", "camera profile or TOML file", "auto", otherwise="the one that fits the frame")
     mask: str | None = option("--mask", "mask profile or TOML file, or lenslet", None)
-    law: str = option("--law", "carrier law", "", choices=tuple(LAWS), otherwise="the camera's")
+    law: str = option("--law", "carrier law", "", choices=LAW_NAMES, otherwise="the camera's")
     calibration: str = option("--calibration", "file written by dappled calibrate", "", metavar="FILE", there=True)
     white: str = option("--white", "white frame", "", metavar="FILE", there=True)
     dark: str = option("--dark", "dark frame", "", metavar="FILE", there=True)

@@ -11,17 +11,20 @@ from pathlib import Path
 
 from dappled.cli.calibrate import lens
 from dappled.cli.placing import Refining
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.errors import DappledError, counted
-from dappled.flight import layout
-from dappled.products.maps import difference, map_files, photographs, terrain
-from dappled.products.maps.difference import DifferenceError, MapDifference
-from dappled.products.maps.georeference import Survey
-from dappled.products.maps.hyperstereo import HyperstereoError
-from dappled.products.maps.terrain import TerrainModel
-from dappled.products.survey import frame_terrain
-from dappled.products.survey.frame_depths import FrameDepths
-from dappled.products.survey.frame_terrain import FrameTerrainError
+
+if not words_only:
+    from dappled.flight import layout
+    from dappled.products.maps import difference, map_files, photographs, terrain
+    from dappled.products.maps.difference import DifferenceError, MapDifference
+    from dappled.products.maps.georeference import Survey
+    from dappled.products.maps.hyperstereo import HyperstereoError
+    from dappled.products.maps.terrain import TerrainModel
+    from dappled.products.survey import frame_terrain
+    from dappled.products.survey.frame_depths import FrameDepths
+    from dappled.products.survey.frame_terrain import FrameTerrainError
 
 _FILES = {
     "kmz": ("mosaic.kmz",),

@@ -11,6 +11,7 @@ from typing import Any
 from dappled import codec
 from dappled.cli import sealing
 from dappled.cli.placing import Mounted, check_geoid
+from dappled.cli.table import words_only
 from dappled.cli.verb import (
     CallError,
     Doubtable,
@@ -25,18 +26,20 @@ from dappled.cli.verb import (
 )
 from dappled.clock import TimeOfDayClock
 from dappled.config.settings import PoseSettings
-from dappled.daemon.replay import late_tags
-from dappled.daemon.replay.vehicle_choice import VehicleError
 from dappled.decode.geometry import Vector3
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, Finding, Level, Subject, finding
-from dappled.flight import Tag, layout, seals
-from dappled.flight.layout import LockHeldError
-from dappled.flight.seal_key import SealKey
-from dappled.products.geotags import geotags, marks
-from dappled.products.maps import earth
-from dappled.products.maps.earth import EarthError, Geoid
-from dappled.products.mounting import Mounting
+
+if not words_only:
+    from dappled.daemon.replay import late_tags
+    from dappled.daemon.replay.vehicle_choice import VehicleError
+    from dappled.flight import Tag, layout, seals
+    from dappled.flight.layout import LockHeldError
+    from dappled.flight.seal_key import SealKey
+    from dappled.products.geotags import geotags, marks
+    from dappled.products.maps import earth
+    from dappled.products.maps.earth import EarthError, Geoid
+    from dappled.products.mounting import Mounting
 
 
 @dataclass(frozen=True, kw_only=True)

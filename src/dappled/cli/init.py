@@ -9,18 +9,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
 from dappled import durable
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, of_setting, option
-from dappled.config import profiles, settings
+from dappled.config import settings
 from dappled.config.schema import TomlSource
 from dappled.config.settings import CameraSettings, RecordSettings, SettingsFile
-from dappled.daemon import settings_check
-from dappled.drivers import usb_bus
-from dappled.drivers.usb_bus import UsbBody
 from dappled.errors import DappledError
 from dappled.shown import say
+
+if not words_only:
+    import tomli_w
+
+    from dappled.config import profiles
+    from dappled.daemon import settings_check
+    from dappled.drivers import usb_bus
+    from dappled.drivers.usb_bus import UsbBody
 
 ANY, NONE = "auto", "none"
 FLIGHTS = RecordSettings().directory

@@ -9,11 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import key_files
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, argument, flag, option
-from dappled.daemon.stream import curve
-from dappled.drivers.mavlink import SigningError, make_key
 from dappled.errors import DappledError
-from dappled.flight import seal_key
+
+if not words_only:
+    from dappled.daemon.stream import curve
+    from dappled.drivers.mavlink import SigningError, make_key
+    from dappled.flight import seal_key
 
 _HOME = Path("~/.config/dappled/keys")
 

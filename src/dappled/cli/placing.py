@@ -10,19 +10,23 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli.field_arguments import FIELD_HELP, RangingArguments
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, argument, flag, of_setting, option
-from dappled.config import profiles
 from dappled.config.settings import PoseSettings
-from dappled.daemon.pipeline import recipes
-from dappled.decode.geometry import Vector3, camera_pose
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.decode.geometry import Vector3
 from dappled.errors import DappledError
-from dappled.flight import layout
-from dappled.products.maps import earth, georeference
-from dappled.products.maps.earth import EarthError
-from dappled.products.maps.georeference import Options, Survey, Watch
-from dappled.products.maps.references import BaseMapError
-from dappled.products.mounting import Mounting
+
+if not words_only:
+    from dappled.config import profiles
+    from dappled.daemon.pipeline import recipes
+    from dappled.decode.geometry import camera_pose
+    from dappled.drivers.raw.darkroom import Recipe
+    from dappled.flight import layout
+    from dappled.products.maps import earth, georeference
+    from dappled.products.maps.earth import EarthError
+    from dappled.products.maps.georeference import Options, Survey, Watch
+    from dappled.products.maps.references import BaseMapError
+    from dappled.products.mounting import Mounting
 
 Matrix9 = tuple[float, float, float, float, float, float, float, float, float]
 

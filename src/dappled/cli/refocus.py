@@ -10,25 +10,35 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dappled import codec, durable
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
-from dappled.decode.depth.estimate import disparity_range
-from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
-from dappled.decode.lightfield.refocus import StereoPair, all_in_focus, anaglyph, focal_stack, magnified, side_by_side
-from dappled.products.exports import prints
-from dappled.products.maps.georeference import Survey
-from dappled.products.opened import OpenedLightField
-from dappled.products.survey import stereo_pair, synthetic_aperture
-from dappled.products.survey.synthetic_aperture import WAYS
+
+if not words_only:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from dappled.decode.depth.estimate import disparity_range
+    from dappled.decode.lightfield.fourier_refocus import Spectrum4D, difference
+    from dappled.decode.lightfield.refocus import (
+        StereoPair,
+        all_in_focus,
+        anaglyph,
+        focal_stack,
+        magnified,
+        side_by_side,
+    )
+    from dappled.products.exports import prints
+    from dappled.products.maps.georeference import Survey
+    from dappled.products.opened import OpenedLightField
+    from dappled.products.survey import stereo_pair, synthetic_aperture
+
+    Picture = NDArray[np.float32]
 
 _MOST_PICTURES = 500  # of a stack, all held in memory at once
 _STEP_PX = 0.25  # from plane to plane, of the outermost views
-Picture = NDArray[np.float32]
 
 
 class Note(NamedTuple):
@@ -90,7 +100,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
     )  # fmt: skip
     combine: str | None = option(
         "--combine", "of a flight: mean, or median, which drops what hides the ground in fewer than half of the frames",
-        None, choices=WAYS, otherwise="mean",
+        None, choices=("mean", "median"), otherwise="mean",
     )  # fmt: skip
     output: Path = option("-o --output", ".png, .jpg, .tif or .npy")
 

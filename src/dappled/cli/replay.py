@@ -12,26 +12,28 @@ from typing import Any
 
 from dappled import codec
 from dappled.cli import sealing
-from dappled.cli.terminal import frame_line, frame_values
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
 from dappled.clock import TimeOfDayClock
-from dappled.config import profiles
 from dappled.config import settings as configuration
-from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.replay import playback, replay, runs
-from dappled.daemon.replay.playback import FlownWith
-from dappled.daemon.replay.replay import ReplayProgress
-from dappled.daemon.replay.runs import Run, RunWriter
-from dappled.daemon.replay.vehicle_choice import VehicleError
-from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
-from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, counted
 from dappled.findings import Finding, first_of_each, in_order, text
-from dappled.flight import LIVE, TimeSource, layout
-from dappled.flight.checks import flight_check
+
+if not words_only:
+    from dappled.cli.terminal import frame_line, frame_values
+    from dappled.config import profiles
+    from dappled.daemon.navigation import BodyLatency
+    from dappled.daemon.pipeline import recipes
+    from dappled.daemon.pipeline.recipes import Names
+    from dappled.daemon.replay import playback, replay, runs
+    from dappled.daemon.replay.playback import FlownWith
+    from dappled.daemon.replay.replay import ReplayProgress
+    from dappled.daemon.replay.runs import Run, RunWriter
+    from dappled.daemon.replay.vehicle_choice import VehicleError
+    from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
+    from dappled.drivers.raw.darkroom import Recipe
+    from dappled.flight import LIVE, TimeSource, layout
+    from dappled.flight.checks import flight_check
 
 _OF_FOLDERS = ("telemetry", "vehicle", "match", "start", "interval")
 _LATEST_S = 4_102_444_800  # 2100
@@ -143,7 +145,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         recording = self._recording()
         found: list[Finding] = list(recording.findings)
         flown = self._as_recorded(facts, recipe)
-        progress = PrintedProgress(output)
+        progress = ReplayProgress(lambda shot: output.row(frame_values(shot), frame_line(shot)))
         with ExitStack() as stack:
             keep: RunWriter | None = None
             if self._is_flight and recipe and (self.run_name or any(self._given.values())) and not self.verify:
@@ -242,15 +244,3 @@ def _same(writer: ReplayVerifier) -> str:
         f"equal within {MOST_SHARE:g} of each frame's largest value, root mean square{worst}; "
         f"poses and tags within 1e-9; recorded on {writer.elsewhere}"
     )
-
-
-class PrintedProgress(ReplayProgress):
-    """Prints a line for each shot that has ended."""
-
-    def __init__(self, output: Output) -> None:
-        super().__init__()
-        self._output = output
-
-    def tell(self, pending: PendingShot) -> None:
-        """Print the line of a shot that has ended."""
-        self._output.row(frame_values(pending), frame_line(pending))

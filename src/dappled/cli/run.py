@@ -15,20 +15,23 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dappled import durable
-from dappled.cli.stop_condition import Asker, StopCondition
-from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, SettingsArgument, Verb, flag, option
 from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.schema import ConfigError, refuse
 from dappled.config.settings import Settings
-from dappled.daemon import settings_check
-from dappled.daemon.flight_handover import FlightHandover, flights
-from dappled.daemon.grounded import answer_meanwhile
 from dappled.daemon.health.systemd import Notifier
-from dappled.daemon.service import Service
 from dappled.errors import DappledError, sentence
-from dappled.flight import FlightError
+
+if not words_only:
+    from dappled.cli.stop_condition import Asker, StopCondition
+    from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
+    from dappled.daemon import settings_check
+    from dappled.daemon.flight_handover import FlightHandover, flights
+    from dappled.daemon.grounded import answer_meanwhile
+    from dappled.daemon.service import Service
+    from dappled.flight import FlightError
 
 if TYPE_CHECKING:
     from dappled.mocks.simulation import Simulation

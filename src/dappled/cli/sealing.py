@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dappled.cli.table import words_only
 from dappled.config import settings
-from dappled.flight import seal_key
-from dappled.flight.seal_key import SealKey
+
+if not words_only:
+    from dappled.flight import seal_key
+    from dappled.flight.seal_key import SealKey
 
 
 def key_of(config: Path | None, given: Path | None = None) -> SealKey | None:

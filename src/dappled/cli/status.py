@@ -12,15 +12,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, argument, flag, option
 from dappled.config import settings
 from dappled.daemon.health.go_no_go import state
-from dappled.daemon.health.record import four_numbers
-from dappled.daemon.health.standing import ALL_IS_WELL, in_record
-from dappled.daemon.stream.subscriber import Subscriber
-from dappled.daemon.stream.wire import WireError
 from dappled.errors import DappledError
 from dappled.findings import above_note, told
+
+if not words_only:
+    from dappled.daemon.health.record import four_numbers
+    from dappled.daemon.health.standing import ALL_IS_WELL, in_record
+    from dappled.daemon.stream.subscriber import Subscriber
+    from dappled.daemon.stream.wire import WireError
 
 SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+# Nothing but --help or a completion was asked for: verbs' modules leave out what only their work needs. Set before one
+# of them is loaded, in a process of its own.
+words_only = False
+
 # What actions belong to, and its line in --help.
 GROUPS: dict[str, str] = {
     "keys": "make keys for subscribers on the network, and the console's token",

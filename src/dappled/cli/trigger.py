@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.cli.terminal import waiting_for
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import settings
-from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
-from dappled.daemon.pipeline.spacing import MOST_M
-from dappled.drivers.mavlink import LinkError, parse
+
+if not words_only:
+    from dappled.cli.terminal import waiting_for
+    from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
+    from dappled.daemon.pipeline.spacing import MOST_M
+    from dappled.drivers.mavlink import LinkError, parse
 
 DEFAULT_URL = "udpout:127.0.0.1:14550"
 _CALLED_AT = {"udpin": "udpout", "tcpin": "tcp"}

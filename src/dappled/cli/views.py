@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, doubts, opened_field, views_words
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
-from dappled.decode.depth.evidence import of_light_field
-from dappled.decode.depth.stereo import shifts_from_middle
-from dappled.decode.lightfield import ViewStack
-from dappled.decode.lightfield.light_field import slice_mosaic
-from dappled.products.exports import epi, prints
-from dappled.products.opened import OpenedLightField, OpenError
+
+if not words_only:
+    import numpy as np
+
+    from dappled.decode.depth.evidence import of_light_field
+    from dappled.decode.depth.stereo import shifts_from_middle
+    from dappled.decode.lightfield import ViewStack
+    from dappled.decode.lightfield.light_field import slice_mosaic
+    from dappled.products.exports import epi, prints
+    from dappled.products.opened import OpenedLightField, OpenError
 
 _LONGEST = 2400  # px
 

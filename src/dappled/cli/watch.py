@@ -7,14 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.cli.status import stream_endpoint
-from dappled.cli.terminal import waiting_for
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option
 from dappled.clock import SystemClock
-from dappled.daemon.stream import watch
-from dappled.daemon.stream.curve import ClientKeys, load_own, load_public
-from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
-from dappled.daemon.stream.wire import Message
 from dappled.errors import counted
+
+if not words_only:
+    from dappled.cli.terminal import waiting_for
+    from dappled.daemon.stream import watch
+    from dappled.daemon.stream.curve import ClientKeys, load_own, load_public
+    from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
+    from dappled.daemon.stream.wire import Message
 
 
 @dataclass(frozen=True, kw_only=True)

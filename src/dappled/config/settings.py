@@ -13,6 +13,7 @@ from typing import Any
 from dappled import codec
 from dappled.config.schema import BadSetting, Rule, TomlSource, examine, read_toml, refuse, setting
 
+LAW_NAMES = ("fd", "geometric")
 DEPTH_METHODS = ("contrast", "combined")
 SIMULATED_FLIGHTS = Path("flights")  # where `dappled run --simulate` records without a file
 SOCKET_MODES = ("0600", "0660", "0666")
@@ -211,7 +212,7 @@ class PoseSettings:
 @dataclass(frozen=True, slots=True)
 class DecodeSettings:
     enabled: bool = setting(True, "Decode in flight; recorded frames can also be decoded later")
-    law: str = setting("", "Carrier law; empty: the camera profile's", choices=("", "fd", "geometric"))
+    law: str = setting("", "Carrier law; empty: the camera profile's", choices=("", *LAW_NAMES))
     calibration: str = setting(
         "", "File written by dappled calibrate; empty: carriers are predicted from the profiles alone"
     )

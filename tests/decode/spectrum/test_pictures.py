@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+from typing import get_args
+
 import numpy as np
 import pytest
 
 from dappled.decode.optics.carriers import Lattice
 from dappled.decode.spectrum.peaks import measure
-from dappled.decode.spectrum.pictures import LOOKS, Look, around, spectrum_boxes
+from dappled.decode.spectrum.pictures import Look, around, spectrum_boxes
 from dappled.decode.spectrum.transform import transform
 
 
@@ -35,7 +37,7 @@ def test_boxes_and_markers_stand_on_the_carriers(shape: tuple[int, int]) -> None
     assert max(small.shape) <= 90
 
 
-@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("look", get_args(Look))
 def test_a_carrier_is_the_brightest_in_every_look(look: Look) -> None:
     picture = spectrum_boxes(_wave((200, 260), 0.2, 0.1), [], (0.1, 0.1), look=look).max(axis=2)
     assert min(picture[140, 156], picture[60, 104]) > 200

@@ -9,7 +9,7 @@ import pytest
 
 from dappled.products.batch import batch
 from dappled.products.geotags import geotags
-from dappled.products.handover import forms
+from dappled.products.handover import FORMS, forms
 from dappled.products.maps.earth import Geoid
 from dappled.products.maps.georeference import Options
 from dappled.products.mounting import Mounting
@@ -21,7 +21,7 @@ from tests.products.handover.handed import NAMES, UNDULATION_M
 def handed(short_flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of the flight in all forms, each frame decoded once."""
     output = tmp_path_factory.mktemp("forms")
-    kinds = [*forms.FORMS] if _has("mcap_ros2") else [form for form in forms.FORMS if form != "mcap"]
+    kinds = [*FORMS] if _has("mcap_ros2") else [form for form in FORMS if form != "mcap"]
     placed, _ = geotags.read(short_flight.folder, Mounting(), Geoid(offset_m=UNDULATION_M))
     by_index = {one.frame.index: replace(one, utc_ns=one.tag.utc_ns) for one in placed}
     jobs = batch.plan(short_flight.folder, short_flight.recipe, Options(view="ground"), kinds, output, placed=by_index)

@@ -14,9 +14,8 @@ import pytest
 
 from dappled.errors import DappledError
 from dappled.products.batch import batch, workers
-from dappled.products.batch.batch import KINDS, Done, Job
-from dappled.products.handover import forms
-from dappled.products.handover.forms import FORMS
+from dappled.products.batch.batch import Done, Job
+from dappled.products.handover import FORMS, KINDS, forms
 from dappled.products.maps.georeference import Options
 from tests.products.flown import START_NS, Flown
 

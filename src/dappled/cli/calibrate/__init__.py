@@ -9,14 +9,17 @@ from pathlib import Path
 from dappled.cli.calibrate import kit, lens, target
 from dappled.cli.calibrate.frames import CalibrationView, Given, fit_views, views_of
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments, frames
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.config import profiles
-from dappled.decode.calibration import Calibration, report
-from dappled.decode.calibration.law_choice import CALIBRATION
-from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, finding, told
+
+if not words_only:
+    from dappled.config import profiles
+    from dappled.decode.calibration import Calibration, report
+    from dappled.decode.calibration.law_choice import CALIBRATION
+    from dappled.drivers.raw import calibration_files
+    from dappled.drivers.raw.darkroom import Darkroom
 
 
 @dataclass(frozen=True, kw_only=True)

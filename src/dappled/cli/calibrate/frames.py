@@ -8,16 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from dappled.config import profiles
-from dappled.config.profiles import CameraProfile
-from dappled.decode.calibration import Calibration
-from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
-from dappled.decode.calibration.lattice_fit import FrameLattice
-from dappled.decode.optics import MaskedOptics
-from dappled.drivers.raw.darkroom import Darkroom
-from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
+from dappled.cli.table import words_only
 from dappled.errors import DappledError
 from dappled.findings import Finding, Subject, told
+
+if not words_only:
+    from dappled.config import profiles
+    from dappled.config.profiles import CameraProfile
+    from dappled.decode.calibration import Calibration
+    from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
+    from dappled.decode.calibration.lattice_fit import FrameLattice
+    from dappled.decode.optics import MaskedOptics
+    from dappled.drivers.raw.darkroom import Darkroom
+    from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,22 +8,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from dappled import codec
 from dappled.cli.calibrate.frames import Given, fit_views, view_of, views_of
 from dappled.cli.frame_arguments import frames
 from dappled.cli.mask.kit import KIT
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report
 from dappled.config.schema import read_toml
-from dappled.decode.calibration import Calibration, report
-from dappled.decode.calibration.law_choice import CALIBRATION, EXPLAINED_BINS, LawFit
 from dappled.decode.errors import NoCarriers
-from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.drivers.raw.raw_file import exposure
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, Finding, Level, Subject, finding
+
+if not words_only:
+    import numpy as np
+
+    from dappled.decode.calibration import Calibration, report
+    from dappled.decode.calibration.law_choice import CALIBRATION, EXPLAINED_BINS, LawFit
+    from dappled.drivers.raw import calibration_files
+    from dappled.drivers.raw.darkroom import Darkroom, Recipe
+    from dappled.drivers.raw.raw_file import exposure
 
 BARE = Subject("bare frames")
 _MASKS = ("diagonal", "full")

@@ -5,16 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import tomli_w
-from numpy.typing import NDArray
-
 from dappled import durable
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, flag, option
-from dappled.config import profiles
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, counted
-from dappled.products import chessboard
+
+if not words_only:
+    import numpy as np
+    import tomli_w
+    from numpy.typing import NDArray
+
+    from dappled.config import profiles
+    from dappled.drivers.raw.darkroom import Darkroom, Recipe
+    from dappled.products import chessboard
 
 
 def board_size(text: str) -> tuple[int, int]:

@@ -6,18 +6,21 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import tomli_w
-
 from dappled import codec, durable
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report
-from dappled.config import profiles
-from dappled.decode.depth import RANGING, Ranging
-from dappled.decode.depth.ranging import Target, fit_targets, target_shift
-from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.errors import DappledError, counted
-from dappled.products import opened
-from dappled.products.opened import OpenedLightField
+
+if not words_only:
+    import tomli_w
+
+    from dappled.config import profiles
+    from dappled.decode.depth import RANGING, Ranging
+    from dappled.decode.depth.ranging import Target, fit_targets, target_shift
+    from dappled.drivers.raw import calibration_files
+    from dappled.drivers.raw.darkroom import Darkroom, Recipe
+    from dappled.products import opened
+    from dappled.products.opened import OpenedLightField
 
 
 def calibrated(

@@ -7,13 +7,16 @@ from pathlib import Path
 
 from dappled import codec
 from dappled.cli import sealing
-from dappled.cli.flight import lines as flight_lines
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
 from dappled.clock import SystemClock
-from dappled.flight import flight_report, offload, owner_seal
-from dappled.flight.checks import flight_check
-from dappled.flight.checks.flight_check import CheckReport
+
+if not words_only:
+    from dappled.cli.flight import lines as flight_lines
+    from dappled.flight import flight_report, offload, owner_seal
+    from dappled.flight.checks import flight_check
+    from dappled.flight.checks.flight_check import CheckReport
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, SettingsArgument, argument
 from dappled.config import settings
 from dappled.errors import counted
-from dappled.flight import FlightError, index, layout
+
+if not words_only:
+    from dappled.flight import FlightError, index, layout
 
 EXAMPLE = "~/flights/20261121T101503Z-0a1b2c3d"
 

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from dappled import codec
-from dappled.daemon.replay import three_books
-from dappled.daemon.replay.three_books import ThreeBooks
+from dappled.cli.table import words_only
 from dappled.errors import counted
 from dappled.findings import Finding
+
+if not words_only:
+    from dappled.daemon.replay import three_books
+    from dappled.daemon.replay.three_books import ThreeBooks
 
 
 @dataclass(frozen=True, slots=True)

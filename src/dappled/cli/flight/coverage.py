@@ -7,12 +7,15 @@ from pathlib import Path
 
 from dappled import codec
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
-from dappled.decode.geometry import area as areas
 from dappled.errors import counted
 from dappled.findings import told
-from dappled.products.maps import coverage, coverage_files
-from dappled.products.maps import refly as reflying
+
+if not words_only:
+    from dappled.decode.geometry import area as areas
+    from dappled.products.maps import coverage, coverage_files
+    from dappled.products.maps import refly as reflying
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,7 +37,7 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         otherwise="the flight's usual one",
     )  # fmt: skip
     slowest: float = option(
-        "--slowest", "of the mission: the vehicle's lowest speed", reflying.SLOWEST_M_S, unit="m/s", above=0.0,
+        "--slowest", "of the mission: the vehicle's lowest speed", 0.5, unit="m/s", above=0.0,
     )  # fmt: skip
     output: Path | None = option(
         "-o --output", "write coverage.tif, .geojson and .png into this folder", None, metavar="DIR",

@@ -8,12 +8,15 @@ from pathlib import Path
 
 from dappled import codec, durable
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
+from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, option
-from dappled.drivers.gnss import recorded
 from dappled.drivers.gnss.ubx import RXM_RAWX, TIM_TM2, UbxStream
 from dappled.errors import counted
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight import FlightError, disk_error, layout, log_reading
+
+if not words_only:
+    from dappled.drivers.gnss import recorded
+    from dappled.flight import FlightError, disk_error, layout, log_reading
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,13 +9,16 @@ from typing import Any
 from dappled import codec, findings
 from dappled.cli import sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, flag, option
 from dappled.clock import TimeOfDayClock
-from dappled.daemon.replay import pickup
-from dappled.daemon.replay.pickup import Choice, Picked, Proposal
-from dappled.drivers.wired.ptp_source import PtpSource
-from dappled.drivers.wired.sources import FolderSource, parse_source
 from dappled.errors import counted
+
+if not words_only:
+    from dappled.daemon.replay import pickup
+    from dappled.daemon.replay.pickup import Choice, Picked, Proposal
+    from dappled.drivers.wired.ptp_source import PtpSource
+    from dappled.drivers.wired.sources import FolderSource, parse_source
 
 
 def _pair(text: str) -> tuple[int, str]:

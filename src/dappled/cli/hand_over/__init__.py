@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from dappled import durable
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, option
-from dappled.daemon.stream.curve import read_private
 from dappled.errors import DappledError, counted
-from dappled.flight import disk_error
-from dappled.products.handover import nodeodm
-from dappled.products.handover.nodeodm import NodeOdm, NodeOdmError
+
+if not words_only:
+    from dappled.daemon.stream.curve import read_private
+    from dappled.flight import disk_error
+    from dappled.products.handover import nodeodm
+    from dappled.products.handover.nodeodm import NodeOdm, NodeOdmError
 
 TOKEN_VARIABLE = "DAPPLED_NODEODM_TOKEN"  # noqa: S105  # a name
 

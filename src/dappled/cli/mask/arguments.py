@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from dappled.cli.table import words_only
 from dappled.cli.verb import option
-from dappled.config import profiles
-from dappled.config.profiles import CameraProfile
 from dappled.config.schema import ConfigError
-from dappled.decode.optics import LAWS, MaskedOptics, Sensor, lenses
+from dappled.config.settings import LAW_NAMES
+
+if not words_only:
+    from dappled.config import profiles
+    from dappled.config.profiles import CameraProfile
+    from dappled.decode.optics import MaskedOptics, Sensor, lenses
+
+FILM_NAMES = ("4k", "8k", "16k")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +36,7 @@ class SensorArguments:
 class InstallationArguments(SensorArguments):
     """--law and --mask-distance."""
 
-    law: str = option("--law", "carrier law", "", choices=tuple(LAWS), otherwise="the camera's")
+    law: str = option("--law", "carrier law", "", choices=LAW_NAMES, otherwise="the camera's")
     mask_distance: float | None = option(
         "--mask-distance", "distance from mask to sensor", None, metavar="MM", otherwise="the camera's",
     )  # fmt: skip

@@ -6,18 +6,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from PIL import Image
-
 from dappled import codec
-from dappled.cli.mask.arguments import AltitudeArguments, InstallationArguments, out_of_reach
+from dappled.cli.mask.arguments import FILM_NAMES, AltitudeArguments, InstallationArguments, out_of_reach
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, option
-from dappled.config import profiles
-from dappled.decode.optics import MaskedOptics, carrier_tables
-from dappled.decode.optics.film import FILMS
-from dappled.decode.optics.lenses import SHIFT_SIGMA_PX
-from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
-from dappled.decode.spectrum import pictures
+
+if not words_only:
+    import numpy as np
+    from PIL import Image
+
+    from dappled.config import profiles
+    from dappled.decode.optics import MaskedOptics, carrier_tables
+    from dappled.decode.optics.film import FILMS
+    from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
+    from dappled.decode.spectrum import pictures
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +32,7 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
 
     f_number: float = option("--f-number", "f-number of the lens", 5.6, above=0.0)
     views: int = option("--views", "views per axis, odd", 5, low=1)
-    film: str = option("--film", "film to print it on", "4k", choices=tuple(FILMS))
+    film: str = option("--film", "film to print it on", "4k", choices=FILM_NAMES)
     mask_distance: float | None = option(
         "--mask-distance", "distance from mask to sensor", None, metavar="MM",
         otherwise="free; with --mask the camera's",
@@ -39,7 +41,7 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         "--room", "largest distance of the mask from the sensor", None, metavar="MM", otherwise="10",
     )  # fmt: skip
     wavelength: float = option("--wavelength", "wavelength of the light", 550.0, unit="nm")
-    shift_error: float = option("--shift-error", "σ of a measured shift between views", SHIFT_SIGMA_PX, unit="px")
+    shift_error: float = option("--shift-error", "σ of a measured shift between views", 0.02, unit="px")
     mask: str | None = option("--mask", "print the best focal length of this installed mask instead", None)
     picture: Path | None = option("--picture", "draw the carriers on the spectrum", None, metavar="FILE.png")
 

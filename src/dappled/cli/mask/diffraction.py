@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-from PIL import Image
-
 from dappled import codec
 from dappled.cli.mask import make
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, option
-from dappled.config import profiles
-from dappled.config.profiles import MaskProfile
-from dappled.decode.optics import laser_bench
-from dappled.decode.optics.film import FILMS, MaskImage
-from dappled.products.exports import mask_files
+
+if not words_only:
+    import numpy as np
+    from PIL import Image
+
+    from dappled.config import profiles
+    from dappled.config.profiles import MaskProfile
+    from dappled.decode.optics import laser_bench
+    from dappled.decode.optics.film import FILMS, MaskImage
+    from dappled.products.exports import mask_files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,8 +28,8 @@ class PredictDiffraction(Overwriting, Verb):
     examples = ("dappled mask diffraction --mask mask-1 --measured bench.csv",)
 
     mask: str = option("--mask", "mask profile or TOML file")
-    wavelength: float = option("--wavelength", "wavelength of the laser", laser_bench.THESIS_WAVELENGTH_NM, unit="nm")
-    distance: float = option("--distance", "distance from mask to wall", laser_bench.THESIS_DISTANCE_M, unit="m")
+    wavelength: float = option("--wavelength", "wavelength of the laser", 532.0, unit="nm")
+    distance: float = option("--distance", "distance from mask to wall", 0.5842, unit="m")
     measured: Path | None = option("--measured", "x_mm,y_mm of the measured spots", None, metavar="CSV", there=True)
     tolerance: float = option("--tolerance", "tolerance of the measurement", 0.5, unit="mm")
     picture: Path | None = option("--picture", "draw what the wall should show", None, metavar="FILE.png")

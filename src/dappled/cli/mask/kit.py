@@ -6,18 +6,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-import tomli_w
-from numpy.typing import NDArray
-from PIL import Image
-
+from dappled.cli.mask.arguments import FILM_NAMES
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.config import profiles
-from dappled.config.profiles import CameraProfile
-from dappled.decode.optics import Mask, film
-from dappled.decode.optics.carriers import Pattern
-from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
-from dappled.products.exports import mask_files
+
+if not words_only:
+    import numpy as np
+    import tomli_w
+    from numpy.typing import NDArray
+    from PIL import Image
+
+    from dappled.config import profiles
+    from dappled.config.profiles import CameraProfile
+    from dappled.decode.optics import Mask, film
+    from dappled.decode.optics.carriers import Pattern
+    from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
+    from dappled.products.exports import mask_files
 
 _WEDGE_STEPS = 21
 _PAGE_MM, _PAGE_PX_PER_MM = (297.0, 210.0), 12.0  # A4
@@ -36,7 +40,7 @@ class WriteTestKit(Overwriting, Verb):
 
     folder: Path = argument("FOLDER", "folder to write, made where it is missing")
     camera: str = option("--camera", "camera profile or TOML file")
-    film: str = option("--film", "film of the mask", "8k", choices=tuple(FILMS))
+    film: str = option("--film", "film of the mask", "8k", choices=FILM_NAMES)
     frequency: float = option(
         "--frequency", "fundamental frequency of both masks", 11.38, metavar="1/MM", above=0.0,
         otherwise="Mask 2's 11.38",

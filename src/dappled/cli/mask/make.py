@@ -6,18 +6,20 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, Literal
 
 from dappled import codec
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.config import profiles
-from dappled.config.profiles import MaskProfile
-from dappled.decode.optics import Mask, film
-from dappled.decode.optics.carriers import Harmonics, Pattern
-from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
-from dappled.products.exports import mask_files
+
+if not words_only:
+    import numpy as np
+
+    from dappled.config import profiles
+    from dappled.config.profiles import MaskProfile
+    from dappled.decode.optics import Mask, film
+    from dappled.decode.optics.film import FILMS, Film, MaskImage, period_on
+    from dappled.products.exports import mask_files
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,11 +43,11 @@ class MakeMask(Overwriting, Verb):
         "--frequency", "fundamental frequency, instead of --period", None, metavar="1/MM", low=1e-3, high=1e5,
     )  # fmt: skip
     p: int | None = option("--p", "number of harmonics", None, low=1, high=20, otherwise="the profile's, else 2")
-    pattern: Pattern | None = option(
+    pattern: Literal["full", "diagonal"] | None = option(
         "--pattern", "Eq 11's product, or Fig 14's diagonals", None, choices=("full", "diagonal"),
         otherwise="the profile's, else full",
     )  # fmt: skip
-    harmonics: Harmonics | None = option(
+    harmonics: Literal["linear", "octave"] | None = option(
         "--harmonics", "1, 2, 3 … or 1, 2, 4 …", None, choices=("linear", "octave"),
         otherwise="the profile's, else linear",
     )  # fmt: skip

@@ -8,12 +8,15 @@ from dataclasses import dataclass
 
 from dappled import codec
 from dappled.cli.mask.arguments import AltitudeArguments, out_of_reach
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, flag, option
-from dappled.config import profiles
-from dappled.config.profiles import CameraProfile
-from dappled.decode.optics import MaskedOptics, carrier_tables, lenses
-from dappled.decode.optics.lenses import SingleFrameDepth, SurveyPlan
-from dappled.decode.optics.mask_design import SMALL_VIEW_PX
+
+if not words_only:
+    from dappled.config import profiles
+    from dappled.config.profiles import CameraProfile
+    from dappled.decode.optics import MaskedOptics, carrier_tables, lenses
+    from dappled.decode.optics.lenses import SingleFrameDepth, SurveyPlan
+    from dappled.decode.optics.mask_design import SMALL_VIEW_PX
 
 _SHALLOW = 0.05  # of the altitude: a house is no higher
 

@@ -9,9 +9,12 @@ from typing import Any
 
 from dappled import codec
 from dappled.cli.mask.arguments import InstallationArguments, only_length
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, flag, option
-from dappled.decode.optics import MaskedOptics, carrier_tables
-from dappled.decode.optics.visibility import order_strengths
+
+if not words_only:
+    from dappled.decode.optics import MaskedOptics, carrier_tables
+    from dappled.decode.optics.visibility import order_strengths
 
 THESIS_FOCAL_LENGTHS_MM = (6, 8, 10, 11, 12, 13, 15, 19, 25, 29, 33, 39, 52)  # Table 11
 

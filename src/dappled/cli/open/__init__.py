@@ -9,19 +9,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled.cli.open import example
+from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, argument, flag, option
-from dappled.config.settings import ConsoleSettings
-from dappled.daemon.console import offline, process
-from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFieldFrames
-from dappled.daemon.pipeline.decode_process import DecodeProcess
-from dappled.decode.optics import LAWS
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.config.settings import LAW_NAMES, ConsoleSettings
 from dappled.errors import DappledError, counted
-from dappled.flight import layout
-from dappled.products import opened
-from dappled.products.mounting import Mounting
 from dappled.workers import Loop
+
+if not words_only:
+    from dappled.cli.open import example
+    from dappled.daemon.console import offline, process
+    from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFieldFrames
+    from dappled.daemon.pipeline.decode_process import DecodeProcess
+    from dappled.drivers.raw.darkroom import Recipe
+    from dappled.flight import layout
+    from dappled.products import opened
+    from dappled.products.mounting import Mounting
 
 _GIVEN = ("camera", "mask", "law", "calibration", "white", "dark")
 _OWN = "the flight's"
@@ -50,7 +52,7 @@ class OpenInBrowser(Verb):
     no_browser: bool = flag("--no-browser", "only print the address")
     camera: str | None = option("--camera", "camera profile of raw frames", None, otherwise=_OWN)
     mask: str | None = option("--mask", "mask profile, or lenslet, of raw frames", None, otherwise=_OWN)
-    law: str | None = option("--law", "carrier law of raw frames", None, choices=tuple(LAWS), otherwise=_OWN)
+    law: str | None = option("--law", "carrier law of raw frames", None, choices=LAW_NAMES, otherwise=_OWN)
     calibration: str | None = option(
         "--calibration", "calibration of raw frames", None, metavar="FILE", there=True, otherwise=_OWN,
     )  # fmt: skip

@@ -9,12 +9,15 @@ from typing import Any
 
 from dappled import codec, durable, findings
 from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
-from dappled.cli.picture import places
+from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, flag, option
-from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import counted
 from dappled.findings import Finding
-from dappled.products.handover import picture_files
+
+if not words_only:
+    from dappled.cli.picture import places
+    from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
+    from dappled.products.handover import picture_files
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -363,20 +363,19 @@ class RecordedTelemetry:
 
 
 class ReplayProgress(Observer):
-    """Counts the shots of a replay that have come to their end: frames, and frames with a problem."""
+    """Counts the shots of a replay that have ended: frames, and frames with a problem. `tell` is told of each."""
 
-    def __init__(self) -> None:
+    def __init__(self, tell: Callable[[PendingShot], object] = lambda _: None) -> None:
+        """`tell` may raise OSError, which ends the replay."""
+        self._tell = tell
         self._ended = threading.Semaphore(0)
         self._untold: OSError | None = None
         self.frames = self.bad = 0
 
-    def tell(self, pending: PendingShot) -> None:
-        """Tell of a shot that has ended. May raise OSError, which ends the replay."""
-
     def finished(self, pending: PendingShot) -> None:
         """Nothing more is expected of a shot."""
         try:
-            self.tell(pending)
+            self._tell(pending)
         except OSError as error:  # whom it is told has gone
             self._untold = error
         self.frames += pending.frame is not None

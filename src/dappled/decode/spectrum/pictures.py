@@ -6,7 +6,7 @@ Phases are yellow at 0 and red at π: the ends of the thesis' colours, which it 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from dappled.decode.optics import Carrier
 from dappled.decode.spectrum.peaks import Measured
 
 Look = Literal["magnitude", "phase", "laplacian"]
-LOOKS: tuple[Look, ...] = get_args(Look)
 Colour = NDArray[np.uint8]
 _RED, _GREEN, _YELLOW, _BLUE = (230, 30, 30), (60, 220, 60), (250, 220, 40), (70, 130, 255)  # sRGB, 8 bits
 

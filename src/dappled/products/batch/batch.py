@@ -28,23 +28,14 @@ from dappled.flight import Frame, Tag
 from dappled.products.exports import light_files
 from dappled.products.extras import need
 from dappled.products.geotags.geotags import Placed
-from dappled.products.handover import forms, photo_files
-from dappled.products.handover.forms import FORMS, HandedFrame
+from dappled.products.handover import FORMS, KINDS, forms, photo_files
+from dappled.products.handover.forms import HandedFrame
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
 from dappled.products.maps.laboratory import FlightFrame, Laboratory
 from dappled.products.maps.photographs import Photograph, Station
 
-KINDS = {
-    "npz": ".npz",
-    "zarr": ".zarr",
-    "h5": ".h5",
-    "cog": ".tif",
-    "kmz": ".kmz",
-    "photos": "",
-    **dict.fromkeys(FORMS, ""),
-}
 MAPS = ("cog", "kmz")
 PLACED = (*MAPS, "photos", *FORMS)  # what needs a full pose
 MANIFEST = "manifest.jsonl"

@@ -16,7 +16,6 @@ from dappled.products.maps.georeference import Options
 from dappled.products.maps.laboratory import MEAN, FlightFrame
 from dappled.products.maps.photographs import Station
 
-FORMS = ("colmap", "nerfstudio", "stac", "mcap")
 MAPPED = ("stac",)  # what needs the height of the ground
 _RIGS = ("colmap", "nerfstudio")
 

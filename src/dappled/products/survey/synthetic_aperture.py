@@ -23,7 +23,6 @@ from dappled.products.maps.ground import Flat, Ground, Raster
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.photographs import Photograph
 
-WAYS = ("mean", "median")
 _TILE = 6_000_000  # values of all frames that are in memory at a time
 _BLURRED = 3.0  # cells: poses that blur more make no picture of the ground's detail
 
