@@ -1,7 +1,6 @@
-"""Threads: `Loop` runs one function, `Worker` works off a bounded queue, `each` and `share` split work among several,
-`one_blas_thread` keeps OpenBLAS from doing so.
+"""Threads: `Loop` runs one function, `Worker` works off a bounded queue, `each` and `share` split work among several.
 
-What `each` and `share` compute is the same for any number of threads.
+What `each` and `share` compute is the same for any number of threads. `one_blas_thread` keeps OpenBLAS from it.
 """
 
 from __future__ import annotations
