@@ -9,7 +9,18 @@ from dappled import codec
 from dappled.cli import sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
+from dappled.cli.verb import (
+    CallError,
+    Doubtable,
+    Output,
+    Overwriting,
+    Report,
+    SettingsArgument,
+    Verb,
+    argument,
+    flag,
+    option,
+)
 from dappled.clock import SystemClock
 
 if not words_only:
@@ -93,15 +104,30 @@ def _of_check(found: CheckReport, *, signed: bool) -> Report:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ReportFlight(FlightArgument, Verb):
+class ReportFlight(Overwriting, FlightArgument, Verb):
     """Count which requests became frames."""
 
-    examples = ("dappled flight report", f"dappled flight report {EXAMPLE} --log 00000012.BIN")
+    examples = (
+        "dappled flight report",
+        f"dappled flight report {EXAMPLE} --log 00000012.BIN",
+        "dappled flight report --page quality.html --page quality.pdf",
+    )
 
     log: tuple[Path, ...] = option(
         "--log", "compare with the autopilot's own log (.bin, .ulg); again for each of its starts in the flight", (),
         append=True, metavar="FILE", there=True,
     )  # fmt: skip
+    page: tuple[Path, ...] = option(
+        "--page", "write the flight's quality on a page (.html for a phone, .pdf): counts, coverage, ground "
+        "resolution, overlap, blur, poses, doubts; again for both", (), append=True, metavar="FILE",
+    )  # fmt: skip
+
+    def check(self) -> None:
+        """Refuse a call that is wrong by itself."""
+        for path in self.page:
+            if path.suffix not in (".html", ".pdf"):
+                raise CallError(f"--page {path}: a page is .html or .pdf")
+        self.refuse_existing(*self.page)
 
     def run(self, output: Output) -> Report:
         """Count which requests became frames."""
@@ -119,6 +145,13 @@ class ReportFlight(FlightArgument, Verb):
             third = books.compared(flight, self.log)
             values["log"], said, agree = third.values, [*said, *third.lines], agree and third.balanced
             doubts += third.findings
+        if self.page:
+            from dappled.products.survey import flight_quality  # noqa: PLC0415  # only pages need the maps' libraries
+
+            made = flight_quality.of_flight(flight)
+            for path in self.page:
+                flight_quality.write(made, path)
+            said, values["pages"] = [*said, *map(str, self.page)], [str(path) for path in self.page]
         return Report(values, said, findings=doubts, failed=not agree)
 
 
