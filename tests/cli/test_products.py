@@ -86,6 +86,27 @@ def test_views_as_one_picture(field: str, of: str, tmp_path: Path, capsys: pytes
     assert "5 × 5 views of 80 × 60 px" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("kind", ["parallax", "focus"])
+def test_an_animation_goes_round_the_aperture_or_through_the_scene(field: str, kind: str, tmp_path: Path) -> None:
+    assert main(["views", field, "--animate", kind, "-o", str(tmp_path / "a.webp")]) == 0
+    with Image.open(tmp_path / "a.webp") as made:
+        assert made.size == (640, 480)
+        count = getattr(made, "n_frames", 1)
+        assert count >= 4
+        shown = []
+        for number in range(count):
+            made.seek(number)
+            shown.append(np.asarray(made.convert("L"), dtype=np.float64))
+    assert np.abs(shown[0] - shown[count // 2]).mean() > 0.5, "something moves"
+    cv2 = pytest.importorskip("cv2", reason="films need OpenCV, an extra")
+    assert main(["views", field, "--animate", kind, "-o", str(tmp_path / "a.mp4")]) == 0
+    film = cv2.VideoCapture(str(tmp_path / "a.mp4"))
+    assert (int(film.get(cv2.CAP_PROP_FRAME_WIDTH)), int(film.get(cv2.CAP_PROP_FRAME_HEIGHT))) == (640, 480)
+    film.release()
+    assert main(["views", field, "--animate", kind, "-o", str(tmp_path / "a.gif")]) == 2
+    assert main(["views", field, "--animate", kind, "--of", "slices", "-o", str(tmp_path / "b.webp")]) == 2
+
+
 @pytest.mark.parametrize(("sigma", "told"), [([0.01, 0.02, 0.03], False), ([0.66, 1.63, 2.95], True), (None, False)])
 def test_a_depth_map_without_relief_says_so(sigma: list[float] | None, told: bool) -> None:
     quartiles = None if sigma is None else [-0.03, -0.001, 0.02]

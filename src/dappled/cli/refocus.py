@@ -234,7 +234,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         if self.disparity:
             return [(f"{d:g} px/view", d) for d in self.disparity]
         if self._sharpest:
-            return [(f"{d:.3g} px/view", float(d)) for d in _through_scene(found)]
+            return [(f"{d:.3g} px/view", float(d)) for d in through_scene(found)]
         return [("as taken", 0.0)]
 
     def _sharp(self, found: OpenedLightField, planes: NDArray[np.float64]) -> tuple[Picture, Note]:
@@ -252,7 +252,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
 CLASSES = {"refocus": RefocusLightField}
 
 
-def _through_scene(found: OpenedLightField) -> NDArray[np.float64]:
+def through_scene(found: OpenedLightField) -> NDArray[np.float64]:
     """Disparities of planes through the scene, so close that the outermost views move by a quarter of a pixel."""
     low, high = disparity_range(replace(found.evidence, filled=None), workers=found.workers)
     count = math.ceil((high - low) * found.stack.reach / _STEP_PX) + 1

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, doubts, opened_field, views_words
+from dappled.cli.refocus import through_scene
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
 
@@ -17,7 +19,8 @@ if not words_only:
     from dappled.decode.depth.stereo import shifts_from_middle
     from dappled.decode.lightfield import ViewStack
     from dappled.decode.lightfield.light_field import slice_mosaic
-    from dappled.products.exports import epi, prints
+    from dappled.decode.lightfield.refocus import focal_stack
+    from dappled.products.exports import animations, epi, prints
     from dappled.products.opened import OpenedLightField, OpenError
 
 _LONGEST = 2400  # px
@@ -31,6 +34,7 @@ class DrawViews(Overwriting, FieldArguments, Verb):
         "dappled views frame.zarr -o views.png",
         "dappled views frame.zarr --of slices -o slices.png",
         "dappled views frame.zarr --of shifts -o shifts.png",
+        "dappled views frame.zarr --animate parallax -o parallax.webp",
     )
 
     of: str = option(
@@ -40,24 +44,37 @@ class DrawViews(Overwriting, FieldArguments, Verb):
     )  # fmt: skip
     row: int | None = option("--row", "of epi: row of the picture", None, otherwise="the middle one")
     column: int | None = option("--column", "of epi: column of the picture", None)
-    output: Path = option("-o --output", "picture to write")
+    animate: str | None = option(
+        "--animate", "an animation instead (.webp, or .mp4 with OpenCV): parallax, the eye goes round in the aperture; "
+        "focus, from the nearest to the farthest plane of the scene and back", None, choices=("parallax", "focus"),
+    )  # fmt: skip
+    output: Path = option("-o --output", "picture or animation to write")
 
     def check(self) -> None:
         """Refuse a call that is wrong by itself."""
         if self.of != "epi" and (self.row, self.column) != (None, None):
             raise CallError(f"--row and --column are of --of epi: leave them out of {self.of}")
+        if self.animate and self.of != "views":
+            raise CallError(f"--animate doesn't go with --of {self.of}")
+        if self.animate and self.output.suffix not in (".webp", ".mp4"):
+            raise CallError(f"-o {self.output}: an animation is .webp or .mp4")
         self.refuse_existing(self.output)
 
     def run(self, output: Output) -> Report:
         """Draw views, slices or shifts as one picture."""
         found = opened_field(self.field)
-        if self.of == "epi":
+        if self.animate:
+            pictures = _parallax(found) if self.animate == "parallax" else _focus(found)
+            animations.save(self.output, pictures)
+            note = f"{len(pictures)} pictures: {self.animate}"
+        elif self.of == "epi":
             made, note = epi.drawn(found.stack, self.row, self.column), ""
         else:
             draw = {"views": _views, "slices": _slices, "shifts": _shifts, "slice-shifts": _slice_shifts}[self.of]
             made, note = draw(found)
             made = _small(made)
-        prints.save(self.output, made)
+        if not self.animate:
+            prints.save(self.output, made)
         count_v, count_u, height, width = found.views.shape[:4]
         note = "; ".join(words for words in (note, views_words(found.field)) if words)
         facts = {"file": str(self.output), "of": self.of, "views": list(found.views.shape[:4])}
@@ -70,6 +87,26 @@ class DrawViews(Overwriting, FieldArguments, Verb):
 
 
 CLASSES = {"views": DrawViews}
+
+
+def _parallax(found: OpenedLightField) -> list[prints.Bytes]:
+    """The views around the middle one, half-way to the aperture's edge, once round."""
+    views = found.stack.views
+    middle_v, middle_u = (side // 2 for side in views.shape[:2])
+    out_v, out_u = ((side // 2 + 1) // 2 for side in views.shape[:2])
+    count = 4 * (out_v + out_u)
+    around = [2 * math.pi * n / count for n in range(count)]
+    at = [(middle_v + round(out_v * math.sin(a)), middle_u + round(out_u * math.cos(a))) for a in around]
+    white = prints.white_of([views])
+    return [prints.toned(views[place], white) for place in dict.fromkeys(at)]
+
+
+def _focus(found: OpenedLightField) -> list[prints.Bytes]:
+    """Pictures focused on planes through the scene, there and back."""
+    pictures = focal_stack(found.stack, through_scene(found), workers=found.workers).pictures
+    white = prints.white_of([*pictures])
+    drawn = [prints.toned(one, white) for one in pictures]
+    return [*drawn, *drawn[-2:0:-1]]
 
 
 def _views(found: OpenedLightField) -> tuple[prints.Bytes, str]:
