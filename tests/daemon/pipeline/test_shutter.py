@@ -391,6 +391,22 @@ def test_a_flood_of_refused_requests_is_a_few_events_that_count_each_one() -> No
     assert sum(one.number("times") for one in rig.sink.refusals) == rig.shutter.statistics().refused == 5000
 
 
+def test_what_was_only_counted_is_looked_for_as_often_as_the_report_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A power cut takes it: with no other request after it, it was written a minute later."""
+    waits: list[float] = []
+    rig = Rig()
+
+    def wait(event: threading.Event, timeout_s: float) -> bool:
+        waits.append(timeout_s)
+        return event.wait(60)
+
+    monkeypatch.setattr(rig.clock, "wait", wait)
+    rig.shutter.start()
+    eventually(lambda: waits, "the thread's first wait")
+    rig.shutter.stop()
+    assert max(waits) <= SHOTS_INTERVAL_S
+
+
 def test_a_flood_from_any_number_of_senders_is_a_few_events_too() -> None:
     rig = Rig()
     rig.sink.problem = NO_CAMERA

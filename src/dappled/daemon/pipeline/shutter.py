@@ -375,4 +375,4 @@ class Shutter:
             except Exception as error:  # noqa: BLE001  # noting or firing failed: the interval goes on
                 report(log, "interval", error)
                 wait_s = _AGAIN_S
-            self._clock.wait(self._wake, wait_s)
+            self._clock.wait(self._wake, min(wait_s, SHOTS_INTERVAL_S))
