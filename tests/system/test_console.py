@@ -456,8 +456,8 @@ def test_the_first_screen_has_verdict_shutter_instruments_and_picture(
         }""",
         [
             "decoding: 3 frames in a row can't be decoded: the carriers are nowhere near the calibration's; " * 3,
-            text(forbidden),
-            remedy(forbidden),
+            str(text(forbidden)),
+            str(remedy(forbidden)),
         ],
     )
     assert cut <= 0, "what to do is not cut off"

@@ -165,7 +165,7 @@ def test_a_flight_s_frames_are_its_tags_and_verdicts_and_slices_are_decoded_when
     shown: Sequence[ShownFrame] = source.frames()
     assert [(one.header["frame"], one.verdict) for one in shown] == [
         (0, None),
-        (1, {"state": "usable", "reasons": [text(BLACK)]}),
+        (1, {"state": "usable", "reasons": [str(text(BLACK))]}),
     ]
     served = Served(source)
     mean, bad, state = served.asked("/api/frames/0/mean.jpg", "/api/frames/1/mean.jpg", "/api/state")
@@ -174,7 +174,7 @@ def test_a_flight_s_frames_are_its_tags_and_verdicts_and_slices_are_decoded_when
     assert bad.json()["error"].endswith("frames/000001.cr2 is damaged")
     assert state.json()["newest"] == 0
     assert served.feed.frames[0].thumb is not None
-    assert served.feed.frames[1].verdict == {"state": "usable", "reasons": [text(BLACK)]}
+    assert served.feed.frames[1].verdict == {"state": "usable", "reasons": [str(text(BLACK))]}
 
 
 def test_all_frames_get_their_small_pictures_and_a_bad_one_stops_none(
