@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup everything peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow test-long both long mutations soak faults bench lock deb deb-trial arm64 install uninstall clean
+.PHONY: help setup everything peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow test-long both long machine mutations soak faults bench lock deb deb-trial arm64 install uninstall clean
 PREFIX ?= /usr/local
 # Tests start hundreds of processes: where no bytecode may be kept, each of them compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -71,6 +71,9 @@ both:
 
 long: ## what is too long for each change: the long tests, arm64, the README in both bare roots; as root
 	@.ci/run arm64 test-long mutations clean-room
+
+machine: everything ## the package in a whole machine: systemd as PID 1, 512 MB, a read-only disk; as root
+	@$(BIN)/pytest -v --no-header -m machine --durations=0 tests/machine
 
 mutations: setup ## break the code in one place at a time: the default tests must catch each; ONE=word for some
 	@$(BIN)/python tools/mutations.py $(ONE)

@@ -52,7 +52,7 @@ class BodyOptions:
     000001.json). `delay_s`: how long a pattern or
     file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
     body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has. `real`: as
-    `reference_camera` has it. `usbip`: an address of this machine at which it answers over USB/IP, not PTP/IP.
+    `reference_camera` has it. `bind`: where on this machine it answers; `usbip`: over USB/IP, not PTP/IP.
     """
 
     picture: str = "simulated"
@@ -71,7 +71,8 @@ class BodyOptions:
     pairs: bool = False
     addresses: int = 1
     real: bool = False
-    usbip: str = ""
+    bind: str = "127.0.0.1"
+    usbip: bool = False
     faults: tuple[str, ...] = ()
 
     def arguments(self) -> list[str]:
@@ -91,18 +92,19 @@ class BodyOptions:
             "--card-bytes": self.card_bytes,
             "--clock-offset": self.clock_offset_s,
             "--addresses": self.addresses,
-            "--usbip": self.usbip or None,
+            "--bind": self.bind,
         }
         given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
-        given += ["--pairs"] * self.pairs + ["--real"] * self.real
+        given += ["--pairs"] * self.pairs + ["--real"] * self.real + ["--usbip"] * self.usbip
         return [*given, *(text for fault in self.faults for text in ("--fault", fault))]
 
 
 class SimulatedBody:
     """A running body. `start` returns once it listens; use it as a context manager or call `stop`."""
 
-    def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, ports: list[int]) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, ports: list[int], host: str) -> None:
         self._process = process
+        self._host = host
         self._lines = lines
         self.tcp_ports = ports
 
@@ -121,12 +123,12 @@ class SimulatedBody:
         except BaseException:  # interrupted: the process must not be left behind
             _end(process)
             raise
-        return cls(process, lines, ports)
+        return cls(process, lines, ports, (options or BodyOptions()).bind)
 
     @property
     def port(self) -> str:
         """The body's port as libgphoto2 names it; of several addresses all, with commas between."""
-        return ",".join(f"ptpip:127.0.0.1:{port}:{port}" for port in self.tcp_ports)
+        return ",".join(f"ptpip:{self._host}:{port}:{port}" for port in self.tcp_ports)
 
     @property
     def releases(self) -> int:
@@ -326,7 +328,8 @@ def _options(arguments: Sequence[str] | None) -> BodyOptions:
     parser.add_argument("--clock-offset", dest="clock_offset_s", type=float, default=0.0, help="s the body is wrong by")
     parser.add_argument("--pairs", action="store_true", help="raw and JPEG of each picture")
     parser.add_argument("--addresses", type=int, default=1, help="ports that it can be moved between")
-    parser.add_argument("--usbip", default="", help="answer over USB/IP at this address")
+    parser.add_argument("--bind", default="127.0.0.1", help="address of this machine at which it answers")
+    parser.add_argument("--usbip", action="store_true", help="answer over USB/IP, not PTP/IP")
     parser.add_argument("--real", action="store_true", help="a round stop, a print error, detail beyond a slice's band")
     parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
     found = vars(parser.parse_args(arguments))
@@ -357,9 +360,9 @@ def serve(options: BodyOptions, lines: Iterable[str]) -> None:
         exposure_s=source.exposure_s,
     )
     responder = (
-        UsbIpResponder(eos, faults, (options.usbip, 0))
+        UsbIpResponder(eos, faults, (options.bind, 0))
         if options.usbip
-        else Responder(eos, faults, addresses=options.addresses)
+        else Responder(eos, faults, options.bind, addresses=options.addresses)
     )
     _say(f"port {' '.join(map(str, responder.ports))}")
     for line in lines:

@@ -1,0 +1,191 @@
+"""A whole machine as a process of this one: its start, its shell, its plug; and a ground station outside of it."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import socket
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dappled.drivers.mavlink import mavlink
+from dappled.workers import Loop
+
+HERE, THERE = "192.168.77.1", "192.168.77.2"
+STATION_PORT = 14550
+_CLONE_NEWNET = 0x40000000
+_BOOT_S = 240.0
+
+
+@contextlib.contextmanager
+def own_network() -> Iterator[None]:
+    """This thread, and what it starts, in a network of its own, with a wire to the machine; nothing else is touched."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    before = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
+    try:
+        if libc.unshare(_CLONE_NEWNET):
+            raise OSError(ctypes.get_errno(), "unshare")
+        for words in (
+            "link set lo up", "tuntap add dev tap0 mode tap", f"addr add {HERE}/24 dev tap0", "link set tap0 up",
+        ):  # fmt: skip
+            subprocess.run(["/usr/sbin/ip", *words.split()], check=True)
+        yield
+    finally:
+        libc.setns(before, 0)
+        os.close(before)
+
+
+class Machine:
+    """One machine. `built` is the folder that tools/machine/build.py made, `disk` what it starts from."""
+
+    def __init__(self, built: Path, disk: Path, log: Path, memory_mb: int = 1024) -> None:
+        self._built, self._disk, self._log, self._memory_mb = built, disk, log, memory_mb
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self) -> float:
+        """Switch it on; seconds until its shell answers."""
+        assert self._process is None or self._process.poll() is not None, "it is on, and holds its disk"
+        began = time.monotonic()
+        words = f"mem={self._memory_mb}M ubd0={self._disk} root=/dev/ubda rw con=null con0=null,fd:1 ssl=null"
+        with open(self._log, "ab") as log:
+            self._process = subprocess.Popen(
+                [self._built / "linux", *words.split(), "eth0=tuntap,tap0"],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                env={**os.environ, "LD_PRELOAD": str(self._built / "xstate.so"), "TMPDIR": "/dev/shm"},
+            )  # fmt: skip
+        while time.monotonic() < began + _BOOT_S:
+            with contextlib.suppress(subprocess.SubprocessError):
+                self.run("true", timeout_s=10)
+                return time.monotonic() - began
+            assert self._process.poll() is None, self._log.read_text(errors="replace")[-2000:]
+            time.sleep(0.5)
+        raise TimeoutError(self._log.read_text(errors="replace")[-2000:])
+
+    def run(self, command: str, *, timeout_s: float = 120, check: bool = True) -> str:
+        """What a command prints there, as root. Raises subprocess.SubprocessError."""
+        options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "LogLevel=ERROR", "ConnectTimeout=5"]
+        words = ["ssh", "-i", str(self._built / "key"), *(word for one in options for word in ("-o", one))]
+        done = subprocess.run(
+            [*words, f"root@{THERE}", command], capture_output=True, text=True, timeout=timeout_s, check=False
+        )
+        if check and done.returncode:
+            raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr + done.stdout)
+        return done.stdout
+
+    def put(self, path: str, data: bytes) -> None:
+        """Write a file there."""
+        options = ["-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null", "-o", "LogLevel=ERROR"]
+        words = ["ssh", "-i", str(self._built / "key"), *options, f"root@{THERE}", f"cat >{path}"]
+        subprocess.run(words, input=data, check=True, timeout=120)
+
+    def cut(self) -> None:
+        """Pull its plug."""
+        if self._process is not None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait(30)
+
+    def off(self) -> None:
+        """Switch it off in order."""
+        assert self._process is not None
+        self.run("systemctl poweroff", check=False)
+        self._process.wait(120)
+        self.cut()
+
+
+def copy(disk: Path, to: Path) -> Path:
+    """Copy a disk without its holes."""
+    subprocess.run(["/bin/cp", "--sparse=always", disk, to], check=True)
+    return to
+
+
+@dataclass
+class Station:
+    """Hears on the wire's outer end, and writes down what it heard: acknowledgements by result, and images."""
+
+    accepted_s: list[float] = field(default_factory=list)
+    refused_s: list[float] = field(default_factory=list)
+    captured: dict[int, Any] = field(default_factory=dict)
+    camera: tuple[int, int] | None = None
+    heartbeats: int = 0
+    texts: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind((HERE, STATION_PORT))
+        self._socket.settimeout(0.2)
+        self._mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._mav.robust_parsing = True
+        self._peer: tuple[str, int] | None = None
+        self._lock = threading.Condition()
+        self._sequence = 0
+        self._ended = threading.Event()
+        self._loop = Loop("station", self._hear, self._ended)
+        self._loop.start()
+
+    def close(self) -> None:
+        self._ended.set()
+        self._loop.stop(5)
+        self._socket.close()
+
+    def _hear(self) -> None:
+        while not self._ended.is_set():
+            try:
+                data, self._peer = self._socket.recvfrom(2048)
+            except TimeoutError:
+                continue
+            with self._lock:
+                for message in self._mav.parse_buffer(data) or ():
+                    self._take(message)
+                self._lock.notify_all()
+
+    def _take(self, message: Any) -> None:
+        kind = message.get_type()
+        if kind == "HEARTBEAT":
+            self.camera = message.get_srcSystem(), message.get_srcComponent()
+            self.heartbeats += 1
+        elif kind == "COMMAND_ACK" and message.command == mavlink.MAV_CMD_IMAGE_START_CAPTURE:
+            taken = message.result == mavlink.MAV_RESULT_ACCEPTED
+            (self.accepted_s if taken else self.refused_s).append(time.monotonic())
+        elif kind == "CAMERA_IMAGE_CAPTURED":
+            if message.capture_result == 1:
+                self.captured[message.image_index] = message
+        elif kind == "STATUSTEXT":
+            self.texts.append(message.text)
+
+    def until(self, found: Any, what: str, timeout_s: float = 120) -> None:
+        with self._lock:
+            assert self._lock.wait_for(lambda: found(self), timeout_s), f"{what}: {self}"
+
+    def request(self) -> None:
+        """Ask for one photograph, and don't wait."""
+        self.until(lambda it: it.camera is not None, "a camera's heartbeat")
+        assert self.camera is not None
+        assert self._peer is not None
+        self._sequence += 1
+        name = mavlink.MAV_CMD_IMAGE_START_CAPTURE
+        asked = mavlink.MAVLink_command_long_message(*self.camera, name, 0, 0, 0, 1, self._sequence, 0, 0, 0)
+        self._socket.sendto(asked.pack(self._mav), self._peer)
+
+    def shoot(self) -> None:
+        """One photograph, to its announcement."""
+        known = len(self.captured)
+        self.request()
+        self.until(lambda it: len(it.captured) > known, "an announced image")
+
+
+@contextlib.contextmanager
+def station() -> Iterator[Station]:
+    """A ground station."""
+    made = Station()
+    try:
+        yield made
+    finally:
+        made.close()
