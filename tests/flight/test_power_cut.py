@@ -115,7 +115,7 @@ def put_in_order(flights: Path, told: Told) -> None:
     """The next flight begins on what is left; nothing acknowledged is lost, and every flight is whole."""
     after = recording.begin(flights, RecordedClock(1_795_256_104_000_000_000))
     try:
-        assert after.next_index > max(told.noted, default=-1)
+        assert after.next_index > max(told.noted, default=-1), "an accepted shot is lost"
         for index in told.noted:
             assert after.index.lookup(index) is not None, f"shot {index} is lost"
         for index, sha256 in told.safe.items():
