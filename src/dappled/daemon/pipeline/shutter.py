@@ -25,6 +25,7 @@ _LONGEST_S = 86400
 _IDLE_S = 60.0
 _SHORTEST_S = 0.05
 _AGAIN_S = 1.0
+_SETTLE_S = 0.5  # how often refusals are looked for that were only counted
 OWN_KINDS = ("interval", "distance")  # of requests that are made here: none of them is another one's repeat
 IntervalEnd = Literal["stopped", "none ran", "began later"]
 
@@ -375,4 +376,4 @@ class Shutter:
             except Exception as error:  # noqa: BLE001  # noting or firing failed: the interval goes on
                 report(log, "interval", error)
                 wait_s = _AGAIN_S
-            self._clock.wait(self._wake, min(wait_s, SHOTS_INTERVAL_S))
+            self._clock.wait(self._wake, min(wait_s, _SETTLE_S))
