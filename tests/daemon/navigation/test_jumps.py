@@ -111,10 +111,12 @@ def test_a_doubt_of_the_position_outlives_steps_of_the_clock_and_ends_when_it_is
     assert sigma_m(telemetry, AT_S + 42) < 1
 
 
-def test_a_position_that_comes_to_where_the_receiver_stayed_is_in_doubt_no_longer() -> None:
-    """An estimator that was set anew to its receiver: those before the jump are in doubt."""
+@pytest.mark.parametrize("above_m", [0.0, 12.0])
+def test_a_position_that_comes_to_where_the_receiver_stayed_is_in_doubt_no_longer(above_m: float) -> None:
+    """An estimator that was set anew to its receiver: those before the jump are in doubt. Its height is by a
+    barometer, which may have drifted by more than the place is apart."""
     telemetry = Telemetry()
-    there = messages(PATH, lambda _, pose: moved(pose, 12.0), 5.0, AT_S + 10)
+    there = messages(PATH, lambda _, pose: moved(pose, 12.0, above_m), 5.0, AT_S + 10)
     both = zip(messages(PATH, stepped(12.0), 5.0, AT_S + 10), there, strict=True)
     for number, ((t_s, estimated), (_, true)) in enumerate(both):
         message = true if true.get_type() == "GPS_RAW_INT" else estimated

@@ -95,9 +95,10 @@ class ReceiverTrack:
     def __init__(self) -> None:
         self._finder, self._compared = JumpFinder(), -1
 
-    def confirms(self, heard: GnssSample, estimate: PositionSample, first: int, begun: int) -> bool:
+    def confirms(self, heard: GnssSample, estimate: PositionSample, first: int, begun: int, doubt_m: Vector3) -> bool:
         """Take the receiver's place with a fix, once for each position. Whether it has not jumped since before packet
-        `begun`, and the last position is there as well."""
+        `begun`, and the last position is there as well: in the plane, in height, or both, as far as it is in doubt. A
+        barometer's height may be metres from a receiver's."""
         if estimate.number == self._compared:
             return False
         self._compared = estimate.number
@@ -111,9 +112,13 @@ class ReceiverTrack:
             altitude_msl_m=altitude_m,
         )
         self._finder.jump(there, first)
-        apart_m = norm(displacement(there, estimate))
+        (*across_m, upright_m), (*own_m, own_upright_m) = displacement(there, estimate), self._finder.standing_m
         near_m = _APART_M + _APART_S * norm(estimate.velocity_ned_m_s)
-        return self._finder.since < begun and self._finder.standing_m == _NONE and apart_m <= near_m
+        if any(doubt_m[:2]) and (any(own_m) or math.hypot(*across_m) > near_m):
+            return False
+        if doubt_m[2] and (own_upright_m or abs(upright_m) > near_m):
+            return False
+        return self._finder.since < begun
 
 
 def _unexplained(a: PositionSample, b: PositionSample) -> tuple[Vector3, float]:

@@ -318,8 +318,8 @@ class VehicleHistory:
         """A doubt of the position is over where a receiver that has not jumped is."""
         if abs(heard.stamp_ns - estimate.stamp_ns) > _COMPARED_NS:
             return
-        first = self.time.boot_first(heard.number + 1)
-        if self._receiver_track.confirms(heard, estimate, first, self._finder.begun) and self.displaced:
+        first, doubt_m = self.time.boot_first(heard.number + 1), self._finder.standing_m
+        if self._receiver_track.confirms(heard, estimate, first, self._finder.begun, doubt_m) and self.displaced:
             keep(self._jumps, self._finder.over(estimate, heard.number, heard.stamp_ns))
 
     def _height(self, number: int, stamp_ns: int, message: MavlinkMessage) -> None:
