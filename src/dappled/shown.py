@@ -4,7 +4,25 @@ from __future__ import annotations
 
 import logging
 import sys
+from collections.abc import Iterable, Iterator
 from typing import Any, TextIO, cast
+
+_ALIKE = 8
+
+
+def few(lines: Iterable[str]) -> Iterator[str]:
+    """Of lines that say the same of one thing after another the first eight, and how many more there are.
+
+    >>> list(few(f"frame {index} has no mark" for index in range(3000)))[-2:]
+    ['frame 7 has no mark', '… and 2992 more']
+    """
+    more = 0
+    for count, line in enumerate(lines):
+        more = max(0, count - _ALIKE + 1)
+        if not more:
+            yield line
+    if more:
+        yield f"… and {more} more"
 
 
 def printable(text: str) -> str:

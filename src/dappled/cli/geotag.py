@@ -29,6 +29,7 @@ from dappled.config.settings import PoseSettings
 from dappled.decode.geometry import Vector3
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.shown import few
 
 if not words_only:
     from dappled.daemon.replay import late_tags
@@ -144,13 +145,14 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         without_copy = {name: reason for name, reason in made.items() if isinstance(reason, str)}
         for text in marks.sentences(marked) if marked else ():
             output.remark(text)
-        for name in written.without_position:
-            output.remark(f"no position is known for {name}")
-        for name in written.without_tag:
-            output.remark(f"{name} was never tagged")
-        for name, reason in without_copy.items():
-            if name not in (*written.without_position, *written.without_tag):
-                output.remark(f"no copy of {name}: {reason}")
+        told = {*written.without_position, *written.without_tag}
+        for said in (
+            few(f"no position is known for {name}" for name in written.without_position),
+            few(f"{name} was never tagged" for name in written.without_tag),
+            few(f"no copy of {name}: {reason}" for name, reason in without_copy.items() if name not in told),
+        ):
+            for text in said:
+                output.remark(text)
         values = {
             "files": [str(path) for path in written.files],
             "placed": written.placed,

@@ -16,7 +16,7 @@ from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import camera_pose, from_euler, metres_per_radian
 from dappled.errors import DappledError
-from dappled.findings import Code, text, told
+from dappled.findings import Code, Subject, finding, text, told
 from dappled.flight import LedgerReader, TimeSource, recording
 from dappled.flight.layout import FlightFolder
 from dappled.products.geotags import geotags, marks, pos_file
@@ -280,6 +280,16 @@ def test_a_contact_that_bounces_counts_once(tmp_path: Path) -> None:
     found = find(fly(tmp_path), [line(at_s) for at_s in sorted([*TIMES_S, TIMES_S[2] + 0.01])])
     assert sorted(found.marks) == list(range(6))
     assert [str(told(one)) for one in found.extra] == ["mark 4: it is 10 ms after mark 3: it was left out"]
+
+
+def test_what_is_told_of_thousands_of_marks_is_a_few_lines(tmp_path: Path) -> None:
+    """A contact that trembles gave a line for each, and so did each frame without a mark."""
+    marked = replace(find(fly(tmp_path), [line(at_s) for at_s in TIMES_S]), lost=tuple(range(3000)))
+    extra = [finding(Code.MARK_BOUNCED, Subject("mark", n), after_ms=1.0, before=1) for n in range(2, 3002)]
+    lines = marks.sentences(replace(marked, extra=(*extra, finding(Code.MARK_OF_NO_FRAME, Subject("mark", 1), shot=7))))
+    assert len(lines) < 25
+    assert lines.count("… and 2992 more") == 2
+    assert lines[-1] == "mark 1: it is of shot 7, which left no frame"
 
 
 def test_the_marks_antenna_has_a_lever_arm_of_its_own(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from dappled.products.geotags import pos_file
 from dappled.products.geotags.mark_matching import MarkPairs, TimedShot, pair
 from dappled.products.geotags.pos_file import Mark
 from dappled.products.maps.earth import Geoid
+from dappled.shown import few
 
 _CONTACT_SIGMA_NS = 1_000_000  # contact bounce and shutter: as for the autopilot's hot shoe
 _BOUNCE_NS = 50_000_000
@@ -112,8 +113,10 @@ def sentences(marked: Marked) -> list[str]:
     if marked.shift_m:
         north, east, up = marked.shift_m
         lines.append(f"marks less autopilot (median): {north:+.2f} m north, {east:+.2f} m east, {up:+.2f} m up")
-    lost = [f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost]
-    return [*lines, *lost, *(str(told(one)) for one in marked.extra)]
+    lines += few(f"frame {index} has no mark: it keeps the autopilot's position" for index in marked.lost)
+    for code in dict.fromkeys(one.code for one in marked.extra):
+        lines += few(str(told(one)) for one in marked.extra if one.code is code)
+    return lines
 
 
 def _mark(mark: Mark) -> Subject:
