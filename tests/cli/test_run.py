@@ -20,8 +20,12 @@ import pytest
 from dappled.cli import main
 from dappled.cli import run as verb
 from dappled.cli.command_line import parser
+from dappled.config import settings as configuration
 from dappled.daemon.camera_protocol.ground_client import GroundClient, Outcome
-from dappled.flight import LedgerReader, flight_report
+from dappled.daemon.grounded import answer_meanwhile
+from dappled.drivers.mavlink import make_key
+from dappled.errors import DappledError
+from dappled.flight import FlightsLock, LedgerReader, flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.simulation import free_port
 from tests.system.conftest import dappled
@@ -146,6 +150,42 @@ def test_a_run_that_goes_well_tells_of_no_problem(tmp_path: Path, burning: int) 
 def test_time_that_runs_out_before_the_frames_is_a_failure(config: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["run", "--config", str(config), "--frames", "1", "--for", "0"]) == 1
     assert "0 shots" in capsys.readouterr().err
+
+
+def _grounded(config: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The reasons that a service of these settings answers on its links with, until it is ended."""
+    reasons: list[str] = []
+
+    def answer(_settings: object, reason: str, _until: object) -> None:
+        reasons.append(reason)
+        raise DappledError("it was ended")
+
+    monkeypatch.setenv("NOTIFY_SOCKET", "@dappled-nobody-listens")
+    monkeypatch.setattr(verb, "answer_meanwhile", answer)
+    assert main(["run", "--config", str(config), "--for", "0"]) == 1
+    return reasons
+
+
+def test_a_service_waits_for_work_in_its_flights_and_leaves_the_links_to_who_records_there(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two cameras at one address the second would refuse what the first one takes."""
+    with FlightsLock(tmp_path / "flights"):
+        assert _grounded(config, monkeypatch) == []
+    with FlightsLock(tmp_path / "flights", "geotags flights in"):
+        assert [" geotags flights in " in one for one in _grounded(config, monkeypatch)] == [True]
+
+
+def test_a_service_whose_signing_times_can_t_be_kept_answers_too(
+    config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are beside the flights."""
+    make_key(tmp_path / "link.key")
+    (tmp_path / "flights").symlink_to("/proc/there-is-none")
+    text = config.read_text().replace("[mavlink]\n", f'[mavlink]\nkeys = "{tmp_path}/link.key"\n')
+    config.write_text(text)
+    assert len(_grounded(config, monkeypatch)) == 1
+    answer_meanwhile(configuration.load(config), "the disk is gone", lambda: True)
 
 
 @pytest.fixture

@@ -31,7 +31,9 @@ if not words_only:
     from dappled.daemon.flight_handover import FlightHandover, flights
     from dappled.daemon.grounded import answer_meanwhile
     from dappled.daemon.service import Service
+    from dappled.drivers.mavlink import SigningError
     from dappled.flight import FlightError
+    from dappled.flight.layout import LockHeldError
 
 if TYPE_CHECKING:
     from dappled.mocks.simulation import Simulation
@@ -201,15 +203,19 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
 def _begun(make: Callable[[], Service], flown: Settings, manager: Notifier, asked: threading.Event) -> Service | None:
     """Begin a flight. A service whose flights can't be recorded says so on its links until they can, or until it is
     stopped (None): ending would be silence, and restarts would not mend a disk. Raises DappledError."""
+    said = ""
     while not asked.is_set():
         service = make()
         try:
             service.start()
-        except FlightError as error:
-            if not manager.listens or not flown.mavlink.url:
+        except (FlightError, SigningError) as error:  # signing times are kept beside the flights
+            answered = isinstance(error, LockHeldError) and error.records  # by the daemon that records there
+            if answered or not manager.listens or not flown.mavlink.url:
                 raise
             reason = sentence(error)
-            remark(f"no photographs: {reason}")
+            if reason != said:
+                remark(f"no photographs: {reason}")
+            said = reason
             manager.ready(time.monotonic_ns())
             manager.status(f"no photographs: {reason}")
             answer_meanwhile(flown, reason, _FlightsDisk(Path(flown.record.directory), manager, asked).may_do)

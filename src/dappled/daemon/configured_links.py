@@ -13,8 +13,11 @@ from dappled.drivers.mavlink import MavlinkLinks, Signing, Transport, Unsigned, 
 SIGNING_TIME_FILE = ".mavlink-signing"
 
 
-def configured_links(settings: Settings, clock: Clock, transport: Transport | None = None) -> MavlinkLinks:
-    """All MAVLink links of the settings, not open yet. Without a `transport`: over the machine's sockets.
+def configured_links(
+    settings: Settings, clock: Clock, transport: Transport | None = None, *, times: Path | None = None
+) -> MavlinkLinks:
+    """All MAVLink links of the settings, not open yet. Without a `transport`: over the machine's sockets. `times` is
+    the folder of the signing times, where it is not that of the flights.
 
     Raises ConfigError, LinkError, SigningError."""
     wanted = settings.mavlink
@@ -23,17 +26,16 @@ def configured_links(settings: Settings, clock: Clock, transport: Transport | No
         system_id=wanted.system_id,
         component_id=wanted.component_id,
         clock=clock,
-        signing=_signing(settings, clock),
+        signing=_signing(settings, clock, times or Path(settings.record.directory)),
         transport=transport,
     )
 
 
-def _signing(settings: Settings, clock: Clock) -> Signing | None:
+def _signing(settings: Settings, clock: Clock, times: Path) -> Signing | None:
     keys, links = settings.mavlink.keys, len(settings.mavlink.url)
     if len(keys) not in (0, 1, links):
         raise ConfigError(
             f'[mavlink] keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
         )
     files = [Path(key) if key else None for key in settings.mavlink.link_keys]
-    time_file = Path(settings.record.directory) / SIGNING_TIME_FILE
-    return open_signing(files, time_file, clock, cast(Unsigned, settings.mavlink.unsigned))
+    return open_signing(files, times / SIGNING_TIME_FILE, clock, cast(Unsigned, settings.mavlink.unsigned))

@@ -5,8 +5,10 @@ The disk may be read-only, full or gone. Whoever flies is to hear that, not sile
 
 from __future__ import annotations
 
+import tempfile
 import threading
 from collections.abc import Callable
+from pathlib import Path
 
 from dappled.clock import Clock, SystemClock
 from dappled.config.settings import Settings
@@ -27,18 +29,22 @@ def answer_meanwhile(
     clock: Clock | None = None,
     transport: Transport | None = None,
 ) -> None:
-    """Answer on the links of the settings, and say the reason, until that holds. Raises LinkError."""
+    """Answer on the links of the settings, and say the reason, until that holds. Raises LinkError, SigningError.
+
+    Signing times can't be kept either. A packet that is replayed here is refused like any other.
+    """
     clock = clock or SystemClock()
-    links = configured_links(settings, clock, transport)
-    camera = _GroundedCamera(links.sender, settings, reason, clock)
-    turn = threading.Event()
-    links.start(camera, camera)
-    try:
-        while not until():
-            camera.tick()
-            clock.wait(turn, _TURN_S)
-    finally:
-        links.stop()
+    with tempfile.TemporaryDirectory(prefix="dappled-") as times:
+        links = configured_links(settings, clock, transport, times=Path(times))
+        camera = _GroundedCamera(links.sender, settings, reason, clock)
+        turn = threading.Event()
+        links.start(camera, camera)
+        try:
+            while not until():
+                camera.tick()
+                clock.wait(turn, _TURN_S)
+        finally:
+            links.stop()
 
 
 class _GroundedCamera:

@@ -265,7 +265,11 @@ def read_facts(folder: FlightFolder) -> dict[str, Any]:
 
 
 class LockHeldError(FlightError):
-    """Another process holds the lock of a flights folder."""
+    """Another process holds the lock of a flights folder; `records`: it records flights there."""
+
+    def __init__(self, text: str, *, records: bool) -> None:
+        super().__init__(text)
+        self.records = records
 
 
 class FlightsLock:
@@ -299,7 +303,7 @@ class FlightsLock:
                 other = "set record.directory to another folder" if doing == RECORDS else "work on a copy of the flight"
                 what = f"stop it, or {other}"
             raise LockHeldError(
-                f"another dappled (process {holder or 'unknown'}) {does or RECORDS} {root}; {what}"
+                f"another dappled (process {holder or 'unknown'}) {does or RECORDS} {root}; {what}", records=records
             ) from error
         except OSError as error:
             os.close(self._fd)
