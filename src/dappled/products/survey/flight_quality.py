@@ -18,7 +18,7 @@ import numpy as np
 
 from dappled import durable
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, in_order, told
+from dappled.findings import Finding, Level, above_note, in_order, told
 from dappled.flight import flight_report
 from dappled.flight.flight_report import Balance
 from dappled.products.extras import need
@@ -49,9 +49,11 @@ class FlightQuality:
     """A flight's quality; `picture` is a PNG of how many frames saw the ground, None where nobody knows."""
 
     flight: str
-    agrees: bool  # the counts
+    counts: str  # whether they agree
+    agrees: bool
     parts: tuple[QualityPart, ...]
     doubts: tuple[Finding, ...]
+    notes: tuple[Finding, ...]
     picture: bytes | None
 
 
@@ -59,15 +61,15 @@ def of_flight(flight: Path) -> FlightQuality:
     """Judge a recorded flight, by its ledger alone: nothing is decoded. Raises FlightError."""
     found, contents = flight_report.balance(flight), flight_report.show(flight)
     tags = [line.tag for line in contents.lines if line.tag is not None]
-    doubts: list[Finding] = [*found.doubts, *filter(None, [found.cut_short]), *found.bad, *found.unknown, *found.card]
-    doubts += [one.finding for one in found.stood]
-    doubts += [one for tag in tags for one in tag.doubts]
+    said: list[Finding] = [*found.doubts, *filter(None, [found.cut_short]), *found.bad, *found.unknown, *found.card]
+    said += [*found.lost_triggers, *(one.finding for one in found.stood)]
+    said += [one for tag in tags for one in tag.doubts]
     parts, picture = [_counts(found)], None
     try:
         seen = coverage.of_flight(flight)
         ground, picture = _ground(seen)
         parts.append(ground)
-        doubts += seen.left
+        said += seen.left
     except DappledError as error:
         parts.append(QualityPart("Ground", (("not known", str(error)),)))
     verdicts = [line.result.verdict for line in contents.lines if line.result and line.result.verdict]
@@ -79,17 +81,31 @@ def of_flight(flight: Path) -> FlightQuality:
     placed = tuple((f"position {source}", counted(count, "frame")) for source, count in sources.most_common())
     parts.append(QualityPart("Poses", (*placed, ("standard deviation of position", _spread(sigmas, "m")))))
     agrees = found.balanced and found.wishes > 0
-    return FlightQuality(found.flight, agrees, tuple(parts), tuple(in_order(doubts)), picture)
+    counts = "no shot was taken" if found.balanced else "the counts do not agree"
+    notes = [one for one in said if one.level <= Level.NOTE]
+    return FlightQuality(
+        found.flight,
+        "the counts agree" if agrees else counts,
+        agrees,
+        tuple(parts),
+        tuple(in_order(above_note(said))),
+        tuple(in_order(notes)),
+        picture,
+    )
 
 
 def _verdict(made: FlightQuality) -> str:
-    doubts = counted(len(_said(made.doubts)), "doubt") if made.doubts else "nothing is in doubt"
-    return f"the counts {'agree' if made.agrees else 'do not agree'}; {doubts}"
+    doubts = counted(len(_told(made.doubts)), "doubt") if made.doubts else "nothing is in doubt"
+    return f"{made.counts}; {doubts}"
 
 
-def _said(doubts: Sequence[Finding]) -> list[str]:
-    """What is in doubt, each once."""
-    return list(dict.fromkeys(str(told(one)) for one in doubts))
+def _told(found: Sequence[Finding]) -> list[str]:
+    """What was found, each once."""
+    return list(dict.fromkeys(str(told(one)) for one in found))
+
+
+def _lists(made: FlightQuality) -> list[tuple[str, list[str]]]:
+    return [(title, _told(found)) for title, found in (("Doubts", made.doubts), ("Notes", made.notes)) if found]
 
 
 def _counts(found: Balance) -> QualityPart:
@@ -161,8 +177,9 @@ def _html(made: FlightQuality) -> str:
     if made.picture is not None:
         data = base64.b64encode(made.picture).decode()
         drawn = f'<h2>Coverage</h2><img alt="how many frames saw the ground" src="data:image/png;base64,{data}">'
-    doubts = "".join(f"<li>{text(one)}</li>" for one in _said(made.doubts))
-    listed = f"<h2>Doubts</h2><ul>{doubts}</ul>" if doubts else ""
+    listed = "".join(
+        f"<h2>{title}</h2><ul>{''.join(f'<li>{text(one)}</li>' for one in said)}</ul>" for title, said in _lists(made)
+    )
     state = "good" if made.agrees and not made.doubts else "doubt"
     return (
         f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
@@ -176,7 +193,8 @@ def _pdf(made: FlightQuality) -> bytes:
     lines = [made.flight, _verdict(made)]
     for part in made.parts:
         lines += ["", part.title.upper(), *(f"{name}: {value}" for name, value in part.values)]
-    lines += ["", "DOUBTS", *_said(made.doubts)] if made.doubts else []
+    for title, said in _lists(made):
+        lines += ["", title.upper(), *said]
     lines = [piece for line in lines for piece in textwrap.wrap(line, _WIDE, subsequent_indent="    ") or [""]]
     file = io.BytesIO()
     with pages.PdfPages(file) as pdf:
