@@ -107,6 +107,22 @@ def test_an_animation_goes_round_the_aperture_or_through_the_scene(field: str, k
     assert main(["views", field, "--animate", kind, "--of", "slices", "-o", str(tmp_path / "b.webp")]) == 2
 
 
+@pytest.mark.parametrize(("side", "count"), [(1, 0), (2, 4), (3, 8)])
+def test_few_views_are_animated_once_round_and_one_is_refused(
+    side: int, count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for number in range(side * side):
+        Image.new("L", (31, 21), 20 + 20 * number).save(tmp_path / f"{number}.png")
+    code = main(["views", str(tmp_path), "--animate", "parallax", "-o", str(tmp_path / "a.webp")])
+    said = capsys.readouterr()
+    if not count:
+        assert (code, "an animation of parallax needs views from several places" in said.err) == (1, True)
+        return
+    assert code == 0
+    with Image.open(tmp_path / "a.webp") as made:
+        assert (getattr(made, "n_frames", 1), made.size) == (count, (682, 462))
+
+
 @pytest.mark.parametrize(("sigma", "told"), [([0.01, 0.02, 0.03], False), ([0.66, 1.63, 2.95], True), (None, False)])
 def test_a_depth_map_without_relief_says_so(sigma: list[float] | None, told: bool) -> None:
     quartiles = None if sigma is None else [-0.03, -0.001, 0.02]

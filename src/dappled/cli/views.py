@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ if not words_only:
     from dappled.decode.depth.evidence import of_light_field
     from dappled.decode.depth.stereo import shifts_from_middle
     from dappled.decode.lightfield import ViewStack
-    from dappled.decode.lightfield.light_field import slice_mosaic
+    from dappled.decode.lightfield.light_field import needs_parallax, slice_mosaic
     from dappled.decode.lightfield.refocus import focal_stack
     from dappled.products.exports import animations, epi, prints
     from dappled.products.opened import OpenedLightField, OpenError
@@ -90,15 +91,18 @@ CLASSES = {"views": DrawViews}
 
 
 def _parallax(found: OpenedLightField) -> list[prints.Bytes]:
-    """The views around the middle one, half-way to the aperture's edge, once round."""
+    """The views around the middle one, half-way to the aperture's edge, once round. Raises DecodeError for one view."""
+    needs_parallax(found.stack, "an animation of parallax")
     views = found.stack.views
-    middle_v, middle_u = (side // 2 for side in views.shape[:2])
-    out_v, out_u = ((side // 2 + 1) // 2 for side in views.shape[:2])
+    rows, columns = views.shape[:2]
+    out_v, out_u = (rows // 2 + 1) // 2, (columns // 2 + 1) // 2
     count = 4 * (out_v + out_u)
-    around = [2 * math.pi * n / count for n in range(count)]
-    at = [(middle_v + round(out_v * math.sin(a)), middle_u + round(out_u * math.cos(a))) for a in around]
+    at = []
+    for angle in (2 * math.pi * n / count for n in range(count)):
+        v, u = rows // 2 + round(out_v * math.sin(angle)), columns // 2 + round(out_u * math.cos(angle))
+        at.append((min(v, rows - 1), min(u, columns - 1)))  # of 2 views the middle one is the last
     white = prints.white_of([views])
-    return [prints.toned(views[place], white) for place in dict.fromkeys(at)]
+    return [prints.toned(views[place], white) for place, _ in itertools.groupby(at)]
 
 
 def _focus(found: OpenedLightField) -> list[prints.Bytes]:
