@@ -57,6 +57,8 @@ CALLS: dict[str, list[str]] = {
     "flight pickup": ["none", "--from", "card"],
     "geotag": ["none"],
     "georeference": ["none"],
+    "terrain volume": ["none", "none"],
+    "terrain contours": ["none", "-o", "c.geojson"],
     "batch": ["none", "-o", "out"],
     "hand-over": ["odm", "http://127.0.0.1:9", "none"],
     "config check": ["none.toml"],

@@ -68,6 +68,8 @@ ELSEWHERE = {
     "--refine neighbours": "tests/products/maps/test_georeference.py",  # frames that overlap
     "--as terrain --gsd": "tests/products/maps/test_georeference.py",  # as above
     "--together": "tests/products/survey/test_flight_sweep.py",  # frames that overlap
+    "dappled terrain volume": "tests/products/maps/test_volumes.py",  # two flights over one place
+    "dappled terrain contours": "tests/products/maps/test_contours.py",  # a flight with heights
     "maps/ground.tif": "tests/products/maps/test_georeference.py",  # what comes of them
     "dappled open": "tests/cli/test_open.py",  # serves pages until Ctrl-C
     "--scheduler tcp:": "tests/products/batch/test_batch.py",  # a Dask cluster

@@ -12,6 +12,7 @@ GROUPS: dict[str, str] = {
     "mavlink": "make keys for signed MAVLink links",
     "mask": "the printed mask: make, table, diffraction, design, and plan a flight with it",
     "flight": "recorded flights: list, show, check, report, coverage, offload, pickup",
+    "terrain": "what the heights of maps tell: volumes between two flights, contours",
     "config": "check or show settings",
 }
 
@@ -70,6 +71,11 @@ VERBS: dict[str, tuple[str, str]] = {
     ),
     "geotag": ("geotag", "write positions and attitudes for other programs: XMP, geo.txt, CSV, GeoJSON"),
     "georeference": ("georeference", "make maps of a flight: KMZ overlay, GeoTIFF, footprints, terrain"),
+    "terrain volume": (
+        "terrain.volume",
+        "measure how much was filled and cut between two flights, with its uncertainty",
+    ),
+    "terrain contours": ("terrain.contours", "draw lines of equal height (GeoJSON)"),
     "batch": ("batch", "process whole flights frame by frame, on all cores or a Dask cluster"),
     "hand-over": ("hand_over", "give pictures to OpenDroneMap (NodeODM), and fetch the model"),
     "config check": ("config", "check a settings file"),

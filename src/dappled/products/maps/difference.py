@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
-from dappled.products.maps import cog, map_grid
+from dappled.products.maps import cog, heights, map_grid
 from dappled.products.maps.georeference import Survey
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.terrain import TerrainModel
@@ -85,13 +85,7 @@ def of_heights(first: TerrainModel, second: TerrainModel) -> MapDifference:
     a, b = first.surface, second.surface
     if a.grid.crs != b.grid.crs:
         raise DifferenceError(f"heights on {a.grid.crs} and {b.grid.crs} can't be compared: give both the same --crs")
-    x, y = a.grid.axes()
-    columns = np.round((x - b.grid.west) / b.grid.step_x - 0.5).astype(np.intp)
-    rows = np.round((b.grid.north - y) / b.grid.step_y - 0.5).astype(np.intp)
-    inside_c, inside_r = (columns >= 0) & (columns < b.grid.shape[1]), (rows >= 0) & (rows < b.grid.shape[0])
-    to, at = np.ix_(inside_r, inside_c), np.ix_(rows[inside_r], columns[inside_c])
-    other, theirs = (np.full(a.grid.shape, np.nan, dtype=np.float32) for _ in range(2))
-    other[to], theirs[to] = b.height_m[at], b.sigma_m[at]
+    other, theirs = (heights.resampled(one, b.grid, a.grid) for one in (b.height_m, b.sigma_m))
     values = (other - a.height_m).astype(np.float32)
     known = np.isfinite(values)
     if not known.any():

@@ -21,6 +21,7 @@ from dappled.products.maps.earth import Projection
 from dappled.products.maps.map_grid import MapGrid, sample
 from dappled.products.maps.photographs import Photograph
 
+WINDOW = 9  # cells on a side, of a match: heights nearer to each other have their errors in common
 LEAST_OVERLAP = 0.2  # of a frame, for a pair
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _STEP_PX = 0.7  # of parallax between heights
@@ -56,7 +57,7 @@ def surface(
     *,
     lowest_m: float,
     highest_m: float,
-    window: int = 9,
+    window: int = WINDOW,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> Surface:
     """Find the ground between two heights, from every frame against those that overlap it.

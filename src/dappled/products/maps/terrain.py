@@ -75,7 +75,10 @@ def write_raster(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     if terrain.difference_m is not None:
         bands.append(terrain.difference_m)
         names.append("difference to the given terrain, m")
-    tags = {**made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{surface.level_sigma_m:.3f}"}
+    tags = {
+        **made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{surface.level_sigma_m:.3f}",
+        "DAPPLED_CORRELATED_M": f"{hyperstereo.WINDOW * surface.grid.step_x:.4g}",
+    }  # fmt: skip
     cog.write(path, surface.grid, np.stack(bands, axis=-1), tags, tuple(names))
     return path
 

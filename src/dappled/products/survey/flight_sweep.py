@@ -17,7 +17,7 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.products.maps import map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat
-from dappled.products.maps.hyperstereo import HyperstereoError, Surface, peaks
+from dappled.products.maps.hyperstereo import WINDOW, HyperstereoError, Surface, peaks
 from dappled.products.maps.map_grid import sample
 from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.terrain import CELL
@@ -37,7 +37,7 @@ def surface(
     *,
     between: tuple[float, float] | None = None,
     cell_m: float | None = None,
-    window: int = 9,
+    window: int = WINDOW,
 ) -> Surface:
     """The heights above sea level where all frames agree, searched `between` two (None: around the given ground).
 

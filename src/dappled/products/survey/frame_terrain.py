@@ -49,7 +49,8 @@ class FrameTerrain:
     `sigma_m` is one standard deviation of each by itself, `single_sigma_m` that of the best single frame there (Eq 5),
     `frames` how many frames told the height, `difference_m` the height above the given terrain (None without one).
     `level_sigma_m` is the error that all heights have in common, from poses and the scale of distances. `level_m` is
-    how far they lie above the given ground as a whole (median), `focus_m` the focus that would put them on it.
+    how far they lie above the given ground as a whole (median), `focus_m` the focus that would put them on it. Heights
+    within `window_m` have their errors in common.
     """
 
     grid: MapGrid
@@ -62,6 +63,7 @@ class FrameTerrain:
     level_m: float
     focus_m: float
     source: str
+    window_m: float
 
 
 def of(
@@ -104,6 +106,7 @@ def of(
         grid, height, sigma, single, frames, None if isinstance(made.ground, Flat) else above,
         float(np.median([_level_sigma(one, depth, _level(one, made)) for one, depth in seen])),
         float(np.nanmedian(above)), 1 / focus if focus > 0 else math.inf, seen[0][1].source,
+        CONTRAST_WINDOW * gsd_m,
     )  # fmt: skip
 
 
@@ -126,6 +129,7 @@ def write_raster(made: Survey, terrain: FrameTerrain, path: Path) -> Path:
         names.append("difference to the given terrain, m")
     tags = {
         **made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{terrain.level_sigma_m:.3f}", "DAPPLED_DISTANCES": terrain.source,
+        "DAPPLED_CORRELATED_M": f"{terrain.window_m:.4g}",
     }  # fmt: skip
     cog.write(path, terrain.grid, np.stack(bands, axis=-1), tags, tuple(names))
     return path

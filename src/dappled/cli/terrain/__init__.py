@@ -1,0 +1,1 @@
+"""`dappled terrain volume|contours`: what the heights of maps tell."""
