@@ -16,6 +16,7 @@ from dappled.daemon.replay import three_books
 from dappled.drivers.mavlink import dataflash, mavlink, pack, ulog
 from dappled.drivers.mavlink.log_packets import AutopilotLogError
 from dappled.errors import DappledError
+from dappled.findings import Code, Subject, finding, text
 from dappled.flight import Cause, Shot, recording
 from dappled.mocks.autopilot.path import FlightPath
 from tests.drivers.mavlink import logs_here
@@ -134,14 +135,14 @@ def test_each_trigger_that_is_not_in_all_three_is_named(
     code, said = report(capsys, flight, "--log", bin_log, "--json")
     assert code == 1
     log = json.loads("\n".join(said))["log"]
-    found = {(one["kind"], one["number"], tuple(one["shots"])) for one in log["imbalances"]}
+    found = {(one["kind"], one["number"], tuple(one["shots"]), one["reason"]["code"]) for one in log["imbalances"]}
     assert found == {
-        ("lost", 3, ()),
-        ("refused", 4, ()),
-        ("without a file", 5, (2,)),
-        ("doubled", 6, (3, 7)),
-        ("phantom", None, (4,)),
-        ("doubled", 8, ()),
+        ("lost", 3, (), "trigger.unheard"),
+        ("refused", 4, (), "trigger.no_shot"),
+        ("without a file", 5, (2,), "shot.failed"),
+        ("doubled", 6, (3, 7), "trigger.two_shots"),
+        ("phantom", None, (4,), "shot.no_trigger"),
+        ("doubled", 8, (), "trigger.twice"),
     }
     assert (log["triggers"], log["shots"], log["files"], log["balanced"]) == (8, 6, 5, False)
     true = FlightPath(5).pose(TIMES_S[3])
@@ -233,14 +234,16 @@ def test_requests_that_a_link_has_held_are_late_unless_the_autopilot_fires_the_c
     late = [line.split()[2] for line in said if line.startswith("late: trigger")]
     assert (code, late) == ((0, []) if fired_by else (1, ["3", "4", "5", "6", "7"]))
     if not fired_by:
-        assert any("its request came 3.1 s later" in line for line in said)
+        assert any("its request came 3.1 s late" in line for line in said)
         assert said[-1] == "THE THREE BOOKS DO NOT BALANCE: 5 late"
 
 
 def test_a_long_row_of_triggers_in_doubt_is_counted() -> None:
-    one = three_books.Imbalance("lost", 12, (), None, None, "no request", (9, 10, 11, 13, 14))
-    assert one.text() == "lost: trigger 12 or one of 5 others from 9 to 14: no request"
-    assert three_books.Imbalance("phantom", None, (4,), None, None, "none", (5,)).text() == "phantom: shot 4 or 5: none"
+    unheard = finding(Code.TRIGGER_UNHEARD, Subject("trigger", 12))
+    one = three_books.Imbalance("lost", 12, (), None, None, unheard, (9, 10, 11, 13, 14))
+    assert one.text() == f"lost: trigger 12 or one of 5 others from 9 to 14: {text(unheard)}"
+    one = three_books.Imbalance("phantom", None, (4,), None, None, unheard, (5,))
+    assert one.text() == f"phantom: shot 4 or 5: {text(unheard)}"
 
 
 def test_a_stations_request_that_the_autopilot_executed_is_its_trigger(fly: Callable[..., Path], bin_log: Path) -> None:

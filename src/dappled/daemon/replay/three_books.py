@@ -64,7 +64,7 @@ class Imbalance:
     shots: tuple[int, ...]
     utc_ns: int | None
     place: tuple[float, float] | None
-    reason: str
+    reason: Finding
     instead: tuple[int, ...] = ()
 
     def text(self) -> str:
@@ -75,7 +75,7 @@ class Imbalance:
             subject = f"trigger {self.number}{_or(self.instead)}" + (f" ({subject})" if self.shots else "")
         else:
             subject += _or(self.instead)
-        return f"{self.kind}: {subject}{_when(self.utc_ns)}{_where(self.place)}: {self.reason}"
+        return f"{self.kind}: {subject}{_when(self.utc_ns)}{_where(self.place)}: {text(self.reason)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -397,30 +397,30 @@ class _Comparison:
             if index not in made and index not in uncovered:
                 yield from self._of_shot(index)
         for stray in self.flight.strays:
-            why = "" if stray.reason is None else f": {text(stray.reason)}"
-            reason = f"{stray.name} belongs to no trigger{why}"
+            why = None if stray.reason is None else str(text(stray.reason))
+            reason = finding(Code.FILE_NO_TRIGGER, Subject("file", stray.name), file=stray.name, why=why)
             yield Imbalance("phantom", None, (), self.flight.utc_ns(stray.arrived_utc_ns), None, reason)
 
     def _of_trigger(self, place: int, one: _Trigger) -> Iterator[Imbalance]:
         number, at = one.logged.number, (one.utc_us * 1000, one.logged.place)
+        about = Subject("trigger", number)
         instead = self.pairs.instead.get(place, ())
         if place in self.pairs.repeated:
-            yield Imbalance("doubled", number, (), *at, "the log has this trigger twice")
+            yield Imbalance("doubled", number, (), *at, finding(Code.TRIGGER_TWICE, about))
         elif place not in self.pairs.shots:
             if self._reached(one):
-                reason = "it reached the camera, and made no shot (dappled flight show --json: events)"
-                yield Imbalance("refused", number, (), *at, reason)
+                yield Imbalance("refused", number, (), *at, finding(Code.TRIGGER_NO_SHOT, about))
             else:
-                yield Imbalance("lost", number, (), *at, "no request reached the camera", instead)
+                yield Imbalance("lost", number, (), *at, finding(Code.TRIGGER_UNHEARD, about), instead)
         elif self.pairs.shots[place] not in self.flight.files:
             row = self.flight.rows[self.pairs.shots[place]]
-            reason = str(text(row.reason)) if row.reason else f"the shot is {row.state}"
+            reason = row.reason or finding(Code.SHOT_OPEN, Subject("shot", row.shot.index), state=row.state)
             yield Imbalance("without a file", number, (row.shot.index,), *at, reason, instead)
         elif not self.outside:
             index = self.pairs.shots[place]
             late_us = self.flight.at_us(index) - one.at_us
             if late_us > _HELD_US:
-                reason = f"its request came {late_us / 1e6:.1f} s later, and the photograph shows what was there then"
+                reason = finding(Code.FRAME_REQUEST_LATE, Subject("frame", index), late_s=late_us / 1e6)
                 yield Imbalance("late", number, (index,), *at, reason, instead)
 
     def _reached(self, one: _Trigger) -> bool:
@@ -438,19 +438,13 @@ class _Comparison:
             away_us = abs(flight.at_us(index) - one.at_us - delay_us)
             same = _number(flight, index, one.numbered) == one.logged.number and away_us <= _NUMBERED_US
             if same or away_us <= _BROADCAST_US:
-                at = (one.utc_us * 1000, one.logged.place)
-                yield Imbalance(
-                    "doubled",
-                    one.logged.number,
-                    (other, index),
-                    *at,
-                    "one trigger made both",
-                    self.pairs.instead.get(place, ()),
-                )
+                at, number = (one.utc_us * 1000, one.logged.place), one.logged.number
+                reason = finding(Code.TRIGGER_TWO_SHOTS, Subject("trigger", number))
+                yield Imbalance("doubled", number, (other, index), *at, reason, self.pairs.instead.get(place, ()))
                 return
         if flight.of_autopilot(index):
-            number = "" if shot.cause.sequence is None else f", number {shot.cause.sequence}"
-            reason = f"requested by {shot.cause.source} ({shot.cause.kind}{number}); the log has no such trigger"
+            by, about = shot.cause, Subject("shot", index)
+            reason = finding(Code.SHOT_NO_TRIGGER, about, source=by.source, kind=by.kind, number=by.sequence)
             yield Imbalance(
                 "phantom", None, (index,), flight.utc_ns(shot.wished_utc_ns), flight.place(index), reason, beside
             )
@@ -460,11 +454,13 @@ def _passed_over(one: _Trigger, known: set[int]) -> Iterator[Imbalance]:
     """Numbers before a trigger that neither its log nor a shot has."""
     number, at = one.logged.number, (one.utc_us * 1000, one.logged.place)
     if len(one.passed_over) > _MOST_PASSED_OVER:
-        reason = f"the log passes over {len(one.passed_over)} numbers before it, or its counter was set"
-        yield Imbalance("lost", number, (), *at, reason)
+        set_back = finding(Code.TRIGGER_COUNTER_SET, Subject("trigger", number), numbers=len(one.passed_over))
+        yield Imbalance("lost", number, (), *at, set_back)
         return
-    reason = f"neither a shot nor in the log, which passes over it before trigger {number}"
-    yield from (Imbalance("lost", missing, (), *at, reason) for missing in one.passed_over if missing not in known)
+    for missing in one.passed_over:
+        if missing not in known:
+            reason = finding(Code.TRIGGER_PASSED_OVER, Subject("trigger", missing), before=number)
+            yield Imbalance("lost", missing, (), *at, reason)
 
 
 def _or(others: tuple[int, ...]) -> str:
