@@ -17,7 +17,7 @@ from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgum
 from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, first_of_each, in_order, text
+from dappled.findings import Finding, first_of_each, in_order, named
 
 if not words_only:
     from dappled.cli.terminal import frame_line, frame_values
@@ -139,7 +139,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
     def run(self, output: Output) -> Report:
         """Run a recorded flight."""
         settings = configuration.load(self.config)
-        problems = [str(text(one)) for one in flight_check.check(self.flight).problems] if self.verify else []
+        problems = [*flight_check.check(self.flight).problems] if self.verify else []
         facts = layout.read_facts(layout.open_folder(self.flight)) if self._is_flight else {}
         recipe = self._recipe(facts, settings)
         recording = self._recording()
@@ -173,13 +173,13 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
                 output.row({"findings": codec.plain(in_order(told))})
             return Report(findings=told, failed=bool(progress.bad))
         problems += writer.verdict(decoded=recipe is not None)
-        for said in problems:
-            output.remark(f"different: {said}")
+        for one in problems:
+            output.remark(f"different: {named(one)}")
         count = sum(one.frame is not None for one in recording.expected)
         undecoded = sum(one.frame is not None and one.left_undecoded for one in recording.expected)
         left = f" ({undecoded} left undecoded in flight)" if undecoded else ""
         verdict = counted(len(problems), "difference") if problems else _same(writer)
-        values = {"verified": count, "differences": problems, "left_undecoded": undecoded}
+        values = {"verified": count, "differences": codec.plain(problems), "left_undecoded": undecoded}
         values["findings"] = codec.plain(in_order(told))
         output.row(values, f"verified {counted(count, 'frame')}: {verdict}{left}")
         return Report(findings=told, failed=bool(problems))
@@ -193,8 +193,8 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
             return recipes.of_flight(self.flight, facts, self._given)
         if not self.mask:
             return None
-        named = {name: value for name, value in self._given.items() if value is not None}
-        given: dict[str, Any] = {"camera": settings.camera.profile, "workers": settings.decode.workers, **named}
+        set_here = {name: value for name, value in self._given.items() if value is not None}
+        given: dict[str, Any] = {"camera": settings.camera.profile, "workers": settings.decode.workers, **set_here}
         return Recipe(**given)
 
     def _recording(self) -> replay.RecordedFlight:

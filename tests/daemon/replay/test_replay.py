@@ -21,7 +21,7 @@ from dappled.daemon.replay.replay import RecordedTelemetry, ReplayProgress
 from dappled.drivers.camera import Arrival, CameraEvent, Fired, Identity, Noticed, ShotFailed, StateChanged
 from dappled.drivers.replay import ReplayCamera
 from dappled.errors import DappledError
-from dappled.findings import Code, Subject, finding, told
+from dappled.findings import Code, Subject, finding, named, told
 from dappled.flight import Cause, FlightError, Shot, TimeSource
 from tests.daemon.fakes import FakeCamera, FakeDecoder, failed, fired, good, rig
 from tests.drivers.mavlink import logs_here
@@ -72,7 +72,8 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     finally:
         pipeline.stop(5)
     assert len(ended) == len(recording.shots)
-    return [text for text in verifier.verdict() if "unreadable" not in text]  # the fake's frames are no raw files
+    # the fake's frames are no raw files
+    return [str(named(one)) for one in verifier.verdict() if one.facts.get("kind") != "unreadable"]
 
 
 def test_the_same_flight_gives_the_same(tmp_path: Path) -> None:

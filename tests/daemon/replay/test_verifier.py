@@ -11,6 +11,7 @@ import pytest
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
+from dappled.findings import named
 from dappled.flight import Cause, Frame, Result, Shot, ShotRow, Tag, TimeSource, digest
 from tests.daemon.fakes import no_pose
 from tests.standing import failure
@@ -48,7 +49,11 @@ def play(verifier: ReplayVerifier, frame: Frame, data: bytes = DATA, slices: str
     blob.close()
     verifier.tagged(tag(frame))
     verifier.decoded(Result(0, slices, 1, 1, "geometric", "predicted", 1.0, "replay"))
-    return verifier.verdict()
+    return said(verifier)
+
+
+def said(verifier: ReplayVerifier) -> list[str]:
+    return [str(named(one)) for one in verifier.verdict()]
 
 
 def test_the_same_again_has_no_differences(tmp_path: Path) -> None:
@@ -79,16 +84,16 @@ def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path
     recorded_again = Blob.of(DATA)
     verifier.record(0, "IMG_0001.DNG", recorded_again)
     verifier.tagged(tag(frame))
-    assert verifier.verdict() == []  # nor can the replay
+    assert said(verifier) == []  # nor can the replay
     verifier, frame = replay(tmp_path, events=frozenset({"not decoded"}))
     verifier.tagged(tag(frame))
-    assert verifier.verdict() == ["frame 0: the replay made no slices"]  # somebody decoded it after all
+    assert said(verifier) == ["frame 0: the replay made no slices"]  # somebody decoded it after all
 
 
 def test_what_did_not_come_is_a_difference(tmp_path: Path) -> None:
     verifier, _ = replay(tmp_path)
     verifier.failed(0, failure("can't be read"))
-    text = "\n".join(verifier.verdict())
+    text = "\n".join(said(verifier))
     for word in ("frame 0: can't be read", "made no pose", "made no tag", "made no slices"):
         assert word in text
     with pytest.raises(DappledError, match="no recorded frame"):
@@ -108,18 +113,18 @@ def elsewhere(tmp_path: Path, frame_tag: Tag | None, share: float | None) -> tup
     verifier.tagged(tag(frame))
     found = {**RECORDED, "sums": [1.0] * 63 + [1.0 + 2.0 * (share or 0.0)]}
     verifier.decoded(Result(0, "5" * 64, 1, 1, "geometric", "predicted", 1.0, "replay", {"fingerprint": found}))
-    return verifier.verdict(), verifier
+    return said(verifier), verifier
 
 
 def test_rounding_of_another_machine_is_no_difference(tmp_path: Path) -> None:
-    said, verifier = elsewhere(tmp_path, None, 2e-7)
-    assert said == []
+    told, verifier = elsewhere(tmp_path, None, 2e-7)
+    assert told == []
     assert (verifier.close, verifier.furthest) == (3, (pytest.approx(2e-7), 0))
 
 
 def test_more_than_rounding_is_a_difference_also_elsewhere(tmp_path: Path) -> None:
-    said, _ = elsewhere(tmp_path, None, 3e-6)
-    assert said == ["frame 0: the slices differ by 3.0e-06 of the frame's largest value, recorded on aarch64"]
+    told, _ = elsewhere(tmp_path, None, 3e-6)
+    assert told == ["frame 0: the slices differ by 3.0e-06 of the frame's largest value, recorded on aarch64"]
     _, frame = replay(tmp_path)
     for change, fine in (
         ({"utc_ns": 2}, True),
@@ -135,5 +140,5 @@ def test_more_than_rounding_is_a_difference_also_elsewhere(tmp_path: Path) -> No
 
 
 def test_an_older_flight_can_t_be_compared_elsewhere(tmp_path: Path) -> None:
-    (said,) = elsewhere(tmp_path, None, None)[0]
-    assert "recorded elsewhere (aarch64), without the numbers that could be compared" in said
+    (told,) = elsewhere(tmp_path, None, None)[0]
+    assert "recorded elsewhere (aarch64), without the numbers that could be compared" in told

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,7 +13,7 @@ from dappled.decode.lightfield.light_field import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
-from dappled.findings import Finding, text
+from dappled.findings import Code, Finding, Subject, Value, finding
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
 MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platform does to slices, with room
@@ -48,7 +48,7 @@ class ResultWriter(Protocol):
 
 
 class ReplayVerifier:
-    """Compares what the pipeline produces with what was recorded. `differences` are sentences.
+    """Compares what the pipeline produces with what was recorded.
 
     `keep`, where given, takes the results of another recipe, which are not compared; else nothing is written.
     `elsewhere` says where the flight was recorded, if that is another platform or other versions: numbers are then
@@ -70,7 +70,7 @@ class ReplayVerifier:
         self._tags: dict[int, Tag] = {}
         self._expected = {one.row.shot.index: one for one in expected}
         self._seen: dict[int, set[str]] = {index: set() for index in self._expected}
-        self.differences: list[str] = []
+        self._differences: list[Finding] = []
 
     def frame(self, index: int) -> Frame | None:
         """A frame that is safe."""
@@ -90,7 +90,7 @@ class ReplayVerifier:
     def failed(self, index: int, why: Finding) -> None:
         """A shot will bring no frame."""
         if self._expected[index].frame is not None:
-            self.differences.append(f"frame {index}: {text(why)}")
+            self._differences.append(replace(why, subject=Subject("frame", index)))
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
         """Make a file safe; when this returns it is. The file is where it was; its bytes are hashed again."""
@@ -99,7 +99,7 @@ class ReplayVerifier:
             raise DappledError(f"{name} belongs to no recorded frame")
         found = durable.hash_descriptor(blob.fd, blob.size)
         if (found, blob.size) != (frame.sha256, frame.size):
-            self.differences.append(f"frame {index}: {frame.name} is not the file that was recorded")
+            self._differ(Code.REPLAY_OTHER_FILE, index, file=frame.name)
         return frame
 
     def follows(self, index: int, why: Finding) -> None:
@@ -143,20 +143,20 @@ class ReplayVerifier:
         """Something happened. An event of a kind that the flight has for this shot too is no difference."""
         if index is not None and kind in self._expected[index].events:
             return
-        self.differences.append(f"frame {index}: {kind}: {text}" if index is not None else f"{kind}: {text}")
+        self._differ(Code.REPLAY_OTHER_EVENT, "" if index is None else index, kind=kind, text=text)
 
-    def verdict(self, *, decoded: bool = True) -> list[str]:
+    def verdict(self, *, decoded: bool = True) -> list[Finding]:
         """All differences, and what the replay did not come to compare. `decoded`: whether the flight was decoded as it
         flew; if not, only frames with recorded slices must have some again. Nor must those that it left undecoded."""
         missing = [
-            f"frame {index}: the replay made no {what}"
+            finding(Code.REPLAY_NOT_MADE, Subject("frame", index), what=what)
             for index, one in self._expected.items()
             if one.frame is not None
             for what in ("pose", "tag", "slices")
             if what not in self._seen[index]
             and (what != "slices" or one.slices_sha256 or (decoded and not one.left_undecoded))
         ]
-        return self.differences + missing
+        return self._differences + missing
 
     def _share(self, one: Expected, result: Result) -> float | None:
         """How far the slices are from the recorded ones, as a share of the largest value; None where that is not
@@ -171,24 +171,25 @@ class ReplayVerifier:
         self._seen[index].add(what)
         recorded, found = hashes
         if recorded is None:
-            self.differences.append(f"frame {index}: the record holds no hash of its {what}")
+            self._differ(Code.REPLAY_NO_HASH, index, what=what)
         elif recorded == found:
             return
         elif self.elsewhere is None:
-            self.differences.append(f"frame {index}: the {what} came out different")
+            self._differ(Code.REPLAY_DIFFERENT, index, what=what)
         elif near or (share is not None and share <= MOST_SHARE):
             self.close += 1
             self.furthest = max(self.furthest, (share or 0.0, index))
         elif what != "slices":
-            self.differences.append(f"frame {index}: the {what} differs by more than 1e-9")
+            self._differ(Code.REPLAY_NUMBERS_DIFFER, index, what=what)
         elif share is None:
-            self.differences.append(
-                f"frame {index}: the slices were recorded elsewhere ({self.elsewhere}), without the numbers that could "
-                "be compared: verify them there"
-            )
+            self._differ(Code.REPLAY_NUMBERS_LACKING, index, elsewhere=self.elsewhere)
+        elif share < math.inf:
+            self._differ(Code.REPLAY_SLICES_DIFFER, index, share=share, elsewhere=self.elsewhere)
         else:
-            by = f"by {share:.1e} of the frame's largest value" if share < math.inf else "in size"
-            self.differences.append(f"frame {index}: the slices differ {by}, recorded on {self.elsewhere}")
+            self._differ(Code.REPLAY_OTHER_SHAPE, index, elsewhere=self.elsewhere)
+
+    def _differ(self, code: Code, index: int | str, **facts: Value) -> None:
+        self._differences.append(finding(code, Subject("frame", index)).with_facts(**facts))
 
 
 def _near(recorded: Any, found: Any) -> bool:
