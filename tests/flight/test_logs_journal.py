@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.clock import SystemClock
+from dappled.findings import Code, text
 from dappled.flight import Cause, FlightError, Shot, log_reading, logs
 from dappled.flight.logs import Flusher
 from tests.flight.makers import shot, words_of
@@ -180,7 +181,8 @@ def test_a_flush_that_fails_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     journal.note(shot(3))
     journal.close()
     assert journal.problem is not None
-    assert "input/output error" in journal.problem
+    assert journal.problem.code is Code.LOG_UNWRITTEN
+    assert "input/output error" in str(text(journal.problem))
 
 
 def test_a_note_survives_the_process(tmp_path: Path) -> None:

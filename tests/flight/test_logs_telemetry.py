@@ -226,4 +226,5 @@ def test_a_log_that_could_not_be_flushed_has_no_blocks(tmp_path: Path, monkeypat
         pass
     log.close()
     assert log.problem is not None
+    assert log.problem.code is Code.LOG_UNWRITTEN
     assert log.blocks(0) == []

@@ -21,6 +21,7 @@ from pathlib import Path
 
 from dappled.clock import Clock, SystemClock
 from dappled.codec import canonical
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.records import Shot
 from dappled.workers import Loop
@@ -71,10 +72,12 @@ class AppendedFile:
             raise disk_error(doing, self.path, error) from error
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Finding | None:
         """Why written bytes may not survive a power cut; None where they do."""
-        error = self._flusher.error
-        return None if error is None else str(disk_error(f"flush {self._what}", self.path, error))
+        if self._flusher.error is None:
+            return None
+        why = str(disk_error(f"flush {self._what}", self.path, self._flusher.error))
+        return finding(Code.LOG_UNWRITTEN, Subject("flight"), why=why)
 
     @property
     def synced(self) -> int:
@@ -172,7 +175,7 @@ class ShotJournal:
             )
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Finding | None:
         """Why noted shots may not survive a power cut; None where they do."""
         return self._file.problem
 
@@ -267,7 +270,7 @@ class TelemetryLog:
             return [block for block in self._blocks[after:] if block.end <= self._file.synced]
 
     @property
-    def problem(self) -> str | None:
+    def problem(self) -> Finding | None:
         """Why logged packets may not survive a power cut; None where they do."""
         return self._file.problem
 

@@ -242,8 +242,7 @@ class Recording:
             stack.callback(self.recorder.close)
             self.journal.close()
             telemetry = self.telemetry.close()
-            whys = (self.journal.problem, self.telemetry.problem)
-            report = [finding(Code.LOG_UNWRITTEN, Subject("flight"), why=why) for why in whys if why is not None]
+            report = [one for one in (self.journal.problem, self.telemetry.problem) if one is not None]
             recovery.close_ledger(self.folder, self.ledger, self._clock.utc_ns(), telemetry, report)
             report += recovery.recover_flight(self.folder, self._clock)
             self.ledger.close()
