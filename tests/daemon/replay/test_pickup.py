@@ -42,6 +42,7 @@ def test_a_file_is_no_frame_of_a_shot_that_never_fired(tmp_path: Path) -> None:
         pickup.propose(flight.folder.path, source, Choice(pairs={1: "DSCF0001.RAF"}))
     proposal = pickup.propose(flight.folder.path, source, Choice(pairs={0: "DSCF0001.RAF"}))
     assert [index for index, _ in proposal.pairs] == [0]
+    assert proposal.reasons[0].code is Code.PICKUP_AS_TOLD
 
 
 T0_S = 1_700_000_000

@@ -87,7 +87,7 @@ def _lines(flight: str, proposal: Proposal, picked: Picked | None) -> list[str]:
     lines = []
     for index, group in proposal.pairs:
         others = "".join(f" and {other.base}" for other in group.companions)
-        lines.append(f"shot {index:6d}  {word} {group.main.name}{others}  {proposal.reasons[index]}")
+        lines.append(f"shot {index:6d}  {word} {group.main.name}{others}  {findings.text(proposal.reasons[index])}")
     lines += [f"shot {index:6d}  has no file" for index in proposal.missing]
     if proposal.strangers:
         count = counted(len(proposal.strangers), "file")
@@ -109,7 +109,7 @@ def _values(flight: str, proposal: Proposal, picked: Picked | None) -> dict[str,
                 "index": index,
                 "file": group.main.name,
                 "companions": [other.name for other in group.companions],
-                "reason": proposal.reasons[index],
+                "reason": codec.plain(proposal.reasons[index]),
             }
             for index, group in proposal.pairs
         ],

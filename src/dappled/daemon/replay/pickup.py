@@ -66,7 +66,7 @@ class Proposal:
     """
 
     pairs: tuple[tuple[int, FileGroup], ...]
-    reasons: Mapping[int, str]
+    reasons: Mapping[int, Finding]
     findings: tuple[Finding, ...]
     missing: tuple[int, ...]
     strangers: tuple[str, ...]
@@ -122,8 +122,9 @@ def propose(
     matched = _matched(shots, left, choice, offset_s)
     by_name = {group.main.name: group for group in fresh}
     pairs = [(index, by_name[name]) for index, name in matched.pairs] + list(chosen.items())
-    reason = _reason(choice, matched)
-    reasons = {index: "as you said" if index in chosen else reason for index, _ in pairs}
+    by = Code.PICKUP_BY_ORDER if choice.by_order else Code.PICKUP_BY_TIME
+    reasons = {index: finding(by, Subject("frame", index), offset_s=matched.offset_s) for index, _ in matched.pairs}
+    reasons |= {index: finding(Code.PICKUP_AS_TOLD, Subject("frame", index)) for index in chosen}
     doubtful = {one.subject.which for one in matched.doubts}
     nobodys = [name for name in matched.files if name not in doubtful]
     known_s, offset_s = offset_s, matched.offset_s if matched.offset_s is not None else offset_s
@@ -182,7 +183,7 @@ def bring(
                 ledger.add_event(NOTICED, json_text(one))
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
-            ledger.add_event("picked up", f"{group.main.name}: {proposal.reasons[number]}", number)
+            ledger.add_event("picked up", f"{group.main.name}: {text(proposal.reasons[number])}", number)
             doubt = next((one for one in proposal.doubts if one.subject == Subject("frame", number)), None)
             if doubt is not None:
                 ledger.add_event(DOUBT, json_text(doubt), number)
@@ -317,12 +318,6 @@ def _against(files: list[DatedFile]) -> list[Finding]:
         return []
     before, name, earlier_s = against
     return [finding(Code.PICTURE_NAMES_DISAGREE, Subject("picture", name), before=before, earlier_s=earlier_s)]
-
-
-def _reason(choice: Choice, matched: Matching) -> str:
-    if choice.by_order:
-        return "by order and count alone"
-    return f"by order, count and time (the camera's clock is {matched.offset_s or 0.0:+.1f} s from UTC)"
 
 
 def _record(recorder: Recorder, source: FileSource, index: int, found: FoundFile, utc_ns: int) -> Frame:
