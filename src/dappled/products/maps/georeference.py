@@ -15,7 +15,7 @@ import numpy as np
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
-from dappled.findings import Finding, first_by_name
+from dappled.findings import Finding, first_by_name, text
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
@@ -221,8 +221,11 @@ def refined(
     facts = {
         one.name: {**made.facts.get(one.name, {}), **said.facts()} for one, said in zip(photos, judged, strict=True)
     }
-    kept = [f"frame {one.name} keeps its recorded pose: {said.why}" for one, said in zip(photos, judged, strict=True)
-            if said.why is not None]  # fmt: skip
+    kept = [
+        f"frame {one.name} keeps its recorded pose: {text(said.why)}"
+        for one, said in zip(photos, judged, strict=True)
+        if said.why is not None
+    ]
     return replace(made, photographs=tuple(photos), facts=facts, notes=(*made.notes, *unseen, *kept))
 
 

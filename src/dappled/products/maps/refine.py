@@ -15,6 +15,7 @@ import numpy as np
 from dappled import codec
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, Finding, finding
 from dappled.products.maps import matching
 from dappled.products.maps.adjust import Marks, Solution, Ties, adjust
 from dappled.products.maps.eye import Eye
@@ -46,7 +47,7 @@ class Refinement:
     shift_m: float
     turn_deg: float
     position_sigma_m: float | None
-    why: str | None
+    why: Finding | None
 
     def facts(self) -> dict[str, Any]:
         """The values for reports."""
@@ -259,11 +260,11 @@ def _judge(
     residual = max(residuals) if residuals else None
     why = None
     if not given:
-        why = "nothing that it shows was found in the base map or its neighbours" if tried else "it overlaps nothing"
+        why = finding(Code.POSE_UNMATCHED if tried else Code.POSE_NO_OVERLAP, FRAME)
     elif not clicked and inliers < LEAST_INLIERS:
-        why = f"only {inliers} points agree, {LEAST_INLIERS} are needed"
+        why = finding(Code.POSE_FEW_POINTS, FRAME, inliers=inliers, needed=LEAST_INLIERS)
     elif not clicked and inliers < LEAST_SHARE * given:
-        why = f"only {inliers} of {given} points agree"
+        why = finding(Code.POSE_POINTS_DISAGREE, FRAME, inliers=inliers, given=given)
     elif (np.abs(change) > _FARTHEST * doubts[number]).any():
-        why = f"it would move by {shift:.1f} m and turn by {turned:.1f}°, which its telemetry rules out"
+        why = finding(Code.POSE_RULED_OUT, FRAME, shift_m=shift, turn_deg=turned)
     return Refinement(tried, inliers, residual, shift, turned, sigma, why)
