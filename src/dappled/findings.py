@@ -288,6 +288,7 @@ class Code(StrEnum):
     MASK_NAMED = "mask.named"
     MASK_SHIFTED = "mask.shifted"
     MASK_TURNED = "mask.turned"
+    MASK_UNMAKABLE = "mask.unmakable"
     PEER_DISPLACED = "peer.displaced"
     PEER_GUESS_BY_PAGE = "peer.guess_by_page"
     PEER_GUESS_WRONG = "peer.guess_wrong"

@@ -10,6 +10,7 @@ from dappled import codec
 from dappled.cli.mask.arguments import FILM_NAMES, AltitudeArguments, InstallationArguments, out_of_reach
 from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, option
+from dappled.findings import told
 
 if not words_only:
     import numpy as np
@@ -141,7 +142,7 @@ def _lines(made: Design, instead: Design | None) -> list[str]:
     lines.append(f"film       {', '.join(made.films) or 'none of Table 2'} can print it")
     lines += [f"warning    {warning}" for warning in made.warnings]
     if made.problem:
-        lines.append(made.problem)
+        lines.append(str(told(made.problem)))
         lines.append(_instead(instead))
     elif made.depth_sigma_m > wanted.altitude_m / 2:
         lines.append(

@@ -21,6 +21,7 @@ from dappled.decode.optics.carrier_tables import beyond_mask, fresnel_number, la
 from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Sensor
 from dappled.decode.optics.film import FILMS, Film
 from dappled.decode.optics.lenses import SHIFT_SIGMA_PX, depth_sigma_m, ground_sample_m, image_distance_mm, within
+from dappled.findings import Code, Finding, Subject, finding
 
 FRESNEL_LIMIT = 0.25  # of λ·d·(p·f_m)²: diffraction then leaves cos(π/4) = 0.71 of the contrast
 LEAST_VIEW_PX, SMALL_VIEW_PX = 16, 64  # a side: below the first a view is no picture, below the second a poor one
@@ -106,7 +107,7 @@ class Condition:
 
 @dataclass(frozen=True, slots=True)
 class Design:
-    """A mask for the requirements `wanted`. `problem` is None if it meets them, else a sentence that says why not.
+    """A mask for the requirements `wanted`. `problem` says why it doesn't meet them; None if it does.
 
     `view_shape` (rows, columns) of one view, `bandwidth_per_mm` (±, on the sensor) of one view, `spectrum_used` the
     share of the frame's spectrum that slices cover, `baseline_mm` between neighbouring views on the aperture,
@@ -128,7 +129,7 @@ class Design:
     picture_sample_m: float
     film_period_px: float
     films: tuple[str, ...]
-    problem: str | None
+    problem: Finding | None
     warnings: tuple[str, ...] = ()
 
     @property
@@ -218,10 +219,9 @@ def _finish(wanted: DesignRequirements, law: str, mask: Mask, distance_mm: float
         failed.append(f"views of {shape[1]} × {shape[0]} px, fewer than {LEAST_VIEW_PX} per side")
     problem = None
     if failed:
-        problem = (
-            f"no mask of {wanted.views} × {wanted.views} views meets every condition at "
-            f"{distance_mm:.3g} mm from the sensor: {'; '.join(failed)}. "
-            "Take fewer views, another f-number, finer film, or another distance of the mask"
+        unmet = "; ".join(failed)
+        problem = finding(
+            Code.MASK_UNMAKABLE, Subject("mask"), views=wanted.views, distance_mm=distance_mm, conditions=unmet
         )
     pitch_mm = wanted.sensor.size_mm[1] / max(shape[1], 1)
     baseline = wanted.aperture_mm / wanted.views
