@@ -273,7 +273,7 @@ def _mapped(fd: int) -> mmap.mmap:
 
 
 def _decoded(answer: ChannelMessage) -> DecodedFrame:
-    facts = dict(answer.body)
+    facts = answer.body
     body_fd, preview_fd = answer.fds
     try:
         body = _mapped(body_fd)
@@ -281,25 +281,13 @@ def _decoded(answer: ChannelMessage) -> DecodedFrame:
     finally:
         os.close(body_fd)
         os.close(preview_fd)
-    return DecodedFrame(
-        body=body,
-        sha256=facts["sha256"],
-        arrays=facts["arrays"],
-        carriers=facts["carriers"],
-        carriers_from=facts["carriers_from"],
-        carriers_found=facts["carriers_found"],
-        carriers_predicted=facts["carriers_predicted"],
-        law=facts["law"],
-        grid=facts["grid"],
-        preview=preview,
-        preview_size=(facts["preview_size"][0], facts["preview_size"][1]),
-        ms=facts["ms"],
-        seen=facts["seen"],
-        doubts=codec.read(tuple[Finding, ...], facts["doubts"]),
-        decision=facts["decision"] and codec.read(LawDecision, facts["decision"]),
-        fingerprint=facts["fingerprint"],
-        picture=_picture(facts["picture"]),
-    )
+    width, height = facts["preview_size"]
+    records: dict[str, Any] = {
+        "doubts": codec.read(tuple[Finding, ...], facts["doubts"]),
+        "decision": facts["decision"] and codec.read(LawDecision, facts["decision"]),
+        "picture": _picture(facts["picture"]),
+    }
+    return DecodedFrame(body=body, preview=preview, **{**facts, "preview_size": (width, height), **records})
 
 
 def _picture(values: Mapping[str, Any] | None) -> PictureFacts | None:
