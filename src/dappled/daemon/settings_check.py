@@ -25,6 +25,7 @@ from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.errors import DappledError
+from dappled.findings import told
 from dappled.flight import seal_key
 
 _KEY = re.compile(rf"\b({'|'.join(TABLES)})\.([a-z_]+)\b")
@@ -191,7 +192,7 @@ def _calibration(settings: Settings) -> None:
         )
     )
     if wrong is not None:
-        raise ConfigError(wrong)
+        raise ConfigError(str(told(wrong)))
 
 
 def _white(settings: Settings) -> None:

@@ -18,7 +18,7 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
-from dappled.findings import text
+from dappled.findings import text, told
 from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
@@ -118,7 +118,7 @@ class ShotEvents(Observer):
             try:
                 found = calibration_files.misfit(self._recipe, model)
                 # the flight's own copy is read: a pilot on the field has no use for its long name
-                self.misfit = found.replace(self._recipe.calibration, "the calibration") if found else ""
+                self.misfit = str(told(found.with_facts(file="the calibration"))) if found else ""
             except DappledError as error:
                 self.misfit = str(error)
 

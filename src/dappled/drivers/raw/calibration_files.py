@@ -17,8 +17,10 @@ from dappled.config.schema import ConfigError, read_toml
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
 from dappled.errors import first_line
+from dappled.findings import Code, Finding, Subject, finding
 
 _TEXT = "calibration_toml"
+_RECIPE = Subject("recipe")
 
 
 def save(path: Path, found: Calibration, more: dict[str, Any] | None = None) -> tuple[Path, Path]:
@@ -87,8 +89,8 @@ class Calibrated(Protocol):
     def calibration(self) -> str: ...
 
 
-def misfit(recipe: Calibrated, model: str = "") -> str | None:
-    """Why the calibration can't be used, in a sentence: it is for another mask, law or frame size. None where it can,
+def misfit(recipe: Calibrated, model: str = "") -> Finding | None:
+    """Why the calibration (fact `file`) can't be used: it is for another mask, law or frame size. None where it can,
     or there is none.
 
     The frame size is judged where the camera is known: by its profile, or by the body's `model`. Raises ConfigError
@@ -99,13 +101,12 @@ def misfit(recipe: Calibrated, model: str = "") -> str | None:
         return None
     known, mask = load(Path(path)), profiles.mask(recipe.mask)
     if known.mask != mask.mask:
-        return f"{path} was made with another mask than {mask.name}: calibrate again, or choose its mask"
+        return finding(Code.CALIBRATION_OTHER_MASK, _RECIPE, file=path, mask=mask.name)
     if recipe.law and known.law != recipe.law:
-        return f"{path} was made by the law {known.law}, not {recipe.law}: calibrate again, or choose its law"
+        return finding(Code.CALIBRATION_OTHER_LAW, _RECIPE, file=path, made_by=known.law, law=recipe.law)
     camera = profiles.camera_for_model(model) if recipe.camera == "auto" else profiles.camera(recipe.camera)
     if camera is None or known.shape in camera.shapes():
         return None
     height, width = known.shape
-    return (
-        f"{path} is for frames of {height} × {width} px, which {camera.name} doesn't make: calibrate with that camera"
-    )
+    code = Code.CALIBRATION_OTHER_SIZE
+    return finding(code, _RECIPE, file=path, camera=camera.name, height_px=height, width_px=width)

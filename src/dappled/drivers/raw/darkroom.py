@@ -39,7 +39,7 @@ from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, ex
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
 from dappled.errors import DappledError
-from dappled.findings import Finding, Subject
+from dappled.findings import Finding, Subject, told
 
 Painter = Callable[[LightField], NDArray[np.float32]]  # views in colour of a light field with grey ones
 
@@ -185,7 +185,7 @@ class Darkroom:
         if self.recipe.mask != profiles.LENSLET:
             profiles.mask(self.recipe.mask)
         if (wrong := calibration_files.misfit(self.recipe)) is not None:
-            raise DappledError(wrong)
+            raise DappledError(str(told(wrong)))
         if self.recipe.taper and self.recipe.mask == profiles.LENSLET:
             raise DappledError(
                 "a taper is for the bands of a printed mask; the bands of lenslets fill the whole spectrum"
