@@ -17,6 +17,7 @@ BESIDE = ("README.md", "ARCHITECTURE.md", "CHANGELOG.md", "CONTRIBUTING.md")
 FETCHED = re.compile(
     r"""<(?:script|img|iframe|source)\b[^>]*\bsrc=["']?(?:https?:)?//[^>]*>|<link\b[^>]*\bhref=["']?(?:https?:)?//[^>]*>"""
 )
+EXAMPLE = re.compile(r"^(```\w+\n)(examples/\S+)\n(?=```)", re.MULTILINE)
 IDLE = re.compile(r'<link\b[^>]*\brel="?(?:canonical|prev|next)\b')  # these name a page and fetch nothing
 
 
@@ -32,7 +33,9 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Point links that lead out of docs/ to the added pages. Links elsewhere stay, and end a strict build."""
+    """Point links that lead out of docs/ to the added pages. Links elsewhere stay, and end a strict build. A block of
+    code that names a file of examples/ gets its text."""
+    markdown = EXAMPLE.sub(lambda found: found[1] + (ROOT / found[2]).read_text(encoding="utf-8"), markdown)
     return re.sub(rf"\]\(\.\./({'|'.join(map(re.escape, BESIDE))})(#[^)]*)?\)", r"](\1\2)", markdown)
 
 
