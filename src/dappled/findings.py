@@ -616,11 +616,7 @@ def first_by_name(frames: Iterable[tuple[str, Iterable[Finding]]]) -> list[Findi
     return list(first.values())
 
 
-def _words() -> Mapping[Code, Wording]:
-    table = tomllib.loads(resources.files("dappled").joinpath("findings.toml").read_text("utf-8"))
-    return MappingProxyType(
-        {Code(code): Wording(Level[row.pop("level").upper()], **row) for code, row in table.items()}
-    )
-
-
-WORDS: Mapping[Code, Wording] = _words()
+_TABLE = tomllib.loads(resources.files("dappled").joinpath("findings.toml").read_text("utf-8"))
+WORDS: Mapping[Code, Wording] = MappingProxyType(
+    {Code(code): Wording(Level[row.pop("level").upper()], **row) for code, row in _TABLE.items()}
+)
