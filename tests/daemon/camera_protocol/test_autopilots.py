@@ -585,6 +585,66 @@ def test_a_shot_that_could_not_be_fired_is_not_told_as_a_lost_trigger(monkeypatc
     assert rig.lost_triggers == []
 
 
+@pytest.mark.parametrize("triggered", [True, False])
+@pytest.mark.parametrize("links", [1, 2])
+def test_each_contact_that_px4_reports_is_one_shot_whether_a_trigger_has_told_of_it_or_not(
+    links: int, *, triggered: bool
+) -> None:
+    """With CAM_CAP_FBACK: with TRIG_MODE 0 nothing else comes, and six exposures were six strays."""
+    rig, px4 = px4_rig(fires=False), CameraTriggers("px4", (CameraPort("wire", pin=True),))
+    fly(rig, BOOT_US / 1e6, 1.0)
+    for number in range(6):
+        rig.tick(1.0)
+        at_us = BOOT_US + (20 + 18 * number) * 100_000
+        parts = (px4.trigger(at_us) if triggered else [], px4.contact(at_us + 400_000))
+        for part in parts:
+            for _ in range(links):
+                hear(rig, part)
+            rig.tick(0.4)
+        if number == 3:
+            px4.trigger(at_us + 500_000)
+            px4.contact(at_us + 900_000)  # nothing of it arrives
+        assert len(rig.fired) == number + 1
+    rig.tick(5)
+    assert named(rig) == [(5, 5) if triggered else (4, 4)]
+
+
+def test_a_report_of_px4s_own_trigger_is_that_photograph_and_stands_in_for_it() -> None:
+    """Without CAM_CAP_FBACK both have one number and one time; here the third CAMERA_TRIGGER is lost, and the fifth
+    comes last. A camera that is fired from here, and another camera's report, are left alone."""
+    rig, px4 = px4_rig(fires=False), CameraTriggers("px4", (CameraPort("wire"),))
+    fires = px4_rig()
+
+    def captured(number: int, at_us: int, result: int = 1) -> MavlinkMessage:
+        at = at_us // 1000, 0, 1, 0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0)
+        return mavlink.MAVLink_camera_image_captured_message(*at, number, result, b"")
+
+    for number in range(1, 7):
+        rig.tick(1.0)
+        at_us = BOOT_US + number * 10**6
+        both = [*px4.trigger(at_us), captured(number, at_us)]
+        hear(rig, both[1:] if number == 3 else both[::-1] if number == 5 else both)
+        rig.hear(captured(number, at_us), (1, 101))
+        hear(rig, [captured(100 + number, at_us, result=0)])
+        fires.hear(captured(number, at_us), AUTOPILOT)
+        assert len(rig.fired) == number
+    rig.tick(5)
+    assert rig.lost_triggers == []
+    assert fires.fired == []
+
+
+def test_a_contact_of_px4s_that_is_reported_late_is_no_shot_and_is_named() -> None:
+    rig, px4 = px4_rig(fires=False), CameraTriggers("px4", (CameraPort("wire", pin=True),))
+    fly(rig, BOOT_US / 1e6, 1.0)
+    hear(rig, px4.contact(BOOT_US + 10**6))
+    held = px4.contact(BOOT_US + 2 * 10**6)
+    fly(rig, BOOT_US / 1e6 + 1.0, 7.0)
+    hear(rig, held)
+    fly(rig, BOOT_US / 1e6 + 8.0, 4.0)
+    assert len(rig.fired) == 1
+    assert named(rig) == [(1, 1)]
+
+
 def test_a_list_of_photographs_that_always_asks_for_the_first_one_ends() -> None:
     """MAVSDK through ArduPilot: p2 = 0 without end, 60 times in 30 s."""
     rig = rig_of()

@@ -69,8 +69,8 @@ class Vehicle:
 @pytest.mark.parametrize("hz", [0.25, 5.0])
 @pytest.mark.parametrize(
     ("personality", "port"),
-    [("ardupilot", WIRED), ("ardupilot", CameraPort("wire")), ("px4", CameraPort("wire"))],
-    ids=["ardupilot, pin", "ardupilot, no pin", "px4"],
+    [("ardupilot", WIRED), ("ardupilot", CameraPort("wire")), ("px4", CameraPort("wire")), ("px4", WIRED)],
+    ids=["ardupilot, pin", "ardupilot, no pin", "px4", "px4, contact"],
 )
 @pytest.mark.parametrize("booted_s", [41.7, 2**32 / 1e6 - 10.1, 2**33 / 1e6 + 300], ids=["early", "wrapping", "late"])
 def test_each_shot_has_its_own_time(personality: str, port: CameraPort, hz: float, booted_s: float) -> None:
@@ -92,6 +92,27 @@ def test_each_shot_has_its_own_time(personality: str, port: CameraPort, hz: floa
         assert pose.boot_us is not None
         assert pose.boot_us == pytest.approx(vehicle.boot.ns(8 + number / hz + 0.061) / 1e3, abs=1000)
         assert exposure.sigma_ns < (6 if port.pin else 12) * MS
+
+
+@pytest.mark.parametrize("of_contact", [True, False])
+def test_px4s_own_report_of_a_photograph_has_the_time_of_the_contact_or_of_the_trigger(*, of_contact: bool) -> None:
+    """With CAM_CAP_FBACK nothing else need come; without it CAMERA_TRIGGER has the same time, and may come later."""
+    vehicle = Vehicle(BootTime(drift=0.0), (WIRED,), "px4")
+    vehicle.fly(0, 8)
+    for number in range(5):
+        boot_us, heard_ns = vehicle.boot.ns(8 + number) // 1000, START_NS + round((8.005 + number) * 1e9)
+        (captured,) = vehicle.autopilot.contact(boot_us + 60_000 * of_contact)
+        vehicle.say(captured, heard_ns + 60 * MS * of_contact)
+        if not of_contact:
+            vehicle.say(mavlink.MAVLink_camera_trigger_message(boot_us, number), heard_ns)
+        vehicle.fly(8.1 + number, 9 + number)
+    for number in range(5):
+        heard_ns = START_NS + round((8.005 + number + 0.06 * of_contact) * 1e9)
+        shot = Shot(number, Cause("mavlink:1/1", "CAMERA_IMAGE_CAPTURED", number), heard_ns, heard_ns)
+        expected = clocks.owned(clocks.mid_exposure(heard_ns, LATENCY, 0.002), shot, LATENCY)
+        exposure, _ = vehicle.telemetry.locate(expected)
+        assert abs(exposure.utc_ns - START_NS - round((8.061 + number) * 1e9)) < 3 * MS
+        assert exposure.source == (TimeSource.HOT_SHOE if of_contact else TimeSource.AUTOPILOT_TRIGGER)
 
 
 @pytest.mark.parametrize("hz", [0.25, 1.0, 5.0])

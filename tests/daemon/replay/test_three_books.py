@@ -284,6 +284,18 @@ def test_a_report_about_another_camera_is_no_request_to_this_one(
     assert [one["kind"] for one in json.loads("\n".join(said))["log"]["imbalances"]] == [kind]
 
 
+@pytest.mark.parametrize("removed", [None, 4])
+def test_the_log_of_px4_with_contacts_alone(fly: Callable[..., Path], tmp_path: Path, removed: int | None) -> None:
+    """TRIG_MODE 0 with CAM_CAP_FBACK: something else fires, and each contact is one photograph."""
+    pytest.importorskip("pyulog", reason="pyulog is part of the extra ground")
+    log = ulog_written(tmp_path)
+    add_px4_triggers(log, TIMES_S, contacts=True)
+    shots = requested({number: t_s for number, t_s in TIMES_S.items() if number != removed}, "CAMERA_IMAGE_CAPTURED")
+    found = three_books.reconcile(fly(shots, fired_by="outside"), [log])
+    assert [(one.kind, one.number) for one in found.imbalances] == ([("lost", removed)] if removed else [])
+    assert (found.triggers, found.contacts, found.shots) == (9, 9, 9 - bool(removed))
+
+
 @pytest.mark.parametrize("rewritten", [False, True])
 @pytest.mark.parametrize("removed", [None, 4])
 def test_the_log_of_px4(fly: Callable[..., Path], tmp_path: Path, removed: int | None, rewritten: bool) -> None:

@@ -31,6 +31,7 @@ from dappled.daemon.camera_protocol.ftp_server import FtpServer
 from dappled.daemon.camera_protocol.own_autopilot import LISTEN_NS, Links, OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters, ParameterServer
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
+from dappled.daemon.navigation.samples import CAPTURED, image_number, sent_us
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
@@ -314,15 +315,18 @@ class Component:
                 return
 
     def _trigger(self, packet: Packet) -> None:
-        """CAMERA_TRIGGER (112), and CAMERA_FEEDBACK (180) where the autopilot fires. Neither is acknowledged."""
+        """CAMERA_TRIGGER (112); where the autopilot fires, CAMERA_FEEDBACK (180) and the autopilot's own
+        CAMERA_IMAGE_CAPTURED (263). None is acknowledged."""
         message = packet.message
-        name = message.get_type()
+        name, of_autopilot = message.get_type(), message.get_srcComponent() == AUTOPILOT
+        if name == CAPTURED and (self._shutter.fires or not of_autopilot):
+            return
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
-        sequence = message.seq if name == "CAMERA_TRIGGER" else message.img_idx
-        sent_us = int(message.time_usec) if name == "CAMERA_TRIGGER" else 0  # a contact repeats ArduPilot's number
-        if message.get_srcComponent() != AUTOPILOT or self._autopilot.is_stale(sent_us):
-            sent_us = 0
+        sequence, time_us = image_number(message), sent_us(message)
+        clock_us = 0 if name == "CAMERA_FEEDBACK" else time_us  # a contact repeats ArduPilot's number
+        if not of_autopilot or self._autopilot.is_stale(clock_us):
+            clock_us = 0
         numbers, now_ns = self._autopilot.numbers[name], self._clock.monotonic_ns()
         if name == "CAMERA_FEEDBACK":
             ours = self._feedback.is_trigger(message, self._here)
@@ -330,8 +334,10 @@ class Component:
                 numbers.reported(sequence, now_ns, self._here)
             if not ours or self._shutter.fires:
                 return  # the hot shoe's time of a known shot: telemetry uses it
+        if name == CAPTURED and not self._feedback.is_capture(message, self._here):
+            return
         if self._autopilot.is_echo(packet, name):
-            numbers.heard(sequence, now_ns, self._here, time_us=sent_us)
+            numbers.heard(sequence, now_ns, self._here, time_us=clock_us)
             return
         request = CaptureRequest(
             f"mavlink:{message.get_srcSystem()}/{message.get_srcComponent()}",
@@ -340,7 +346,7 @@ class Component:
             0,
             packet.link,
             acknowledged=False,
-            time_us=int(message.time_usec),
+            time_us=time_us,
             autopilot=True,
             happened=not self._shutter.fires,
         )
@@ -349,7 +355,12 @@ class Component:
             decision = self._shutter.request(request)
             known = decision.outcome == "duplicate"
         finally:  # a shot that could not be fired is in the books as failed, and not lost
-            numbers.heard(sequence, now_ns, self._here, known=known, time_us=sent_us)
+            triggers = self._autopilot.numbers["CAMERA_TRIGGER"]
+            if name != CAPTURED or not triggers.begun:
+                numbers.heard(sequence, now_ns, self._here, known=known, time_us=clock_us)
+            elif not known:
+                triggers.unnumbered(now_ns)  # its CAMERA_TRIGGER was lost, or there was none
+            self._feedback.made_shot(name, known=known)
         if not decision.accepted:
             self.say(decision.words)
             self.state_changed()
@@ -520,6 +531,7 @@ _HANDLERS: dict[str, Callable[[Component, Packet], None]] = {
     "COMMAND_ACK": Component._command_result,
     "CAMERA_TRIGGER": Component._trigger,
     "CAMERA_FEEDBACK": Component._trigger,
+    "CAMERA_IMAGE_CAPTURED": Component._trigger,
     "PARAM_EXT_REQUEST_LIST": Component._parameter,
     "PARAM_EXT_REQUEST_READ": Component._parameter,
     "PARAM_EXT_SET": Component._parameter,

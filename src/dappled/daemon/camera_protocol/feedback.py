@@ -1,4 +1,4 @@
-"""Which CAMERA_FEEDBACK reports a trigger of this camera."""
+"""Which CAMERA_FEEDBACK, and which CAMERA_IMAGE_CAPTURED of an autopilot's, reports a trigger of this camera."""
 
 from __future__ import annotations
 
@@ -7,8 +7,10 @@ from collections.abc import Callable
 
 from dappled.clock import Clock
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
+from dappled.daemon.navigation.samples import CAPTURED, image_number, sent_us
 from dappled.drivers.mavlink import MavlinkMessage
 
+_CONTACT_NS = 2 * 10**9  # no body takes longer from the trigger to the contact
 _IMAGES = 2**16  # img_idx has 16 bits
 
 
@@ -22,6 +24,32 @@ class CameraFeedback:
         self._last: int | None = None
         self._restarts = autopilot.restarts
         self._stamps: deque[int] = deque(maxlen=64)
+        self._captured: deque[tuple[int, int]] = deque(maxlen=64)
+        self._triggered: deque[int] = deque(maxlen=64)  # CAMERA_TRIGGERs whose CAMERA_IMAGE_CAPTURED has not come yet
+
+    def made_shot(self, name: str, *, known: bool) -> None:
+        """A message of this type became a shot; `known`: another one had become it."""
+        if name == "CAMERA_TRIGGER" and not known:
+            self._triggered.append(self._clock.monotonic_ns())
+
+    def is_capture(self, captured: MavlinkMessage, where: Callable[[], str]) -> bool:
+        """Whether a CAMERA_IMAGE_CAPTURED of the autopilot's reports an exposure of which no CAMERA_TRIGGER has told.
+
+        PX4 sends one for each contact in the hot shoe (CAM_CAP_FBACK), whoever fired; without that one for each of its
+        triggers. ArduPilot sends none.
+        """
+        told, now_ns = (image_number(captured), sent_us(captured)), self._clock.monotonic_ns()
+        if captured.capture_result != 1 or told in self._captured:
+            return False
+        self._captured.append(told)
+        while self._triggered:
+            if now_ns - self._triggered.popleft() <= _CONTACT_NS:
+                return False
+        stale = bool(self._autopilot.is_stale(told[1]))
+        if stale:
+            numbers = self._autopilot.numbers[CAPTURED]
+            numbers.late(told[0], now_ns, lambda: f"reported more than 5 s late, {where()}")
+        return not stale
 
     def is_trigger(self, feedback: MavlinkMessage, where: Callable[[], str]) -> bool:
         """Whether it reports a trigger of our camera, and not another one's again. `where` says when and where that is

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dappled.clock import Clock
-from dappled.daemon.navigation.samples import EPOCH_US, NO_VEHICLES, WRAP_US
+from dappled.daemon.navigation.samples import CAPTURED, EPOCH_US, NO_VEHICLES, WRAP_US
 from dappled.daemon.pipeline.repeats import AutopilotCommands
 from dappled.daemon.vehicle_battery import BATTERY_STREAM, BatteryReports, VehicleBattery
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
@@ -292,6 +292,11 @@ class TriggerNumbers:
         # when messages without a number became shots whose number is not known
         self._unnumbered: deque[int] = deque(maxlen=MOST_LOST)
 
+    @property
+    def begun(self) -> bool:
+        """Whether numbers have come since the autopilot's last start."""
+        return bool(self._heard)
+
     def heard(
         self, number: int, now_ns: int, where: Callable[[], str], *, known: bool = False, time_us: int = 0
     ) -> None:
@@ -428,7 +433,7 @@ class OwnAutopilot:
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests((*STREAMS, GIMBAL_STREAM) if on_gimbal else STREAMS)
         self._now, self._battery = AutopilotNow(), BatteryReports()
-        self.numbers = {"CAMERA_FEEDBACK": TriggerNumbers(), "CAMERA_TRIGGER": TriggerNumbers()}
+        self.numbers = {kind: TriggerNumbers() for kind in ("CAMERA_FEEDBACK", "CAMERA_TRIGGER", CAPTURED)}
         self.restarts = 0  # of the autopilot, so far: its numbers begin again
 
     def fired_by(self, system_id: int) -> None:

@@ -4,9 +4,9 @@ The expected time is the trigger call's plus the body's latency. The autopilot's
 camera's own clock stands in where the trigger call is unknown. Pure functions of what was observed, so a replay gets
 the same numbers.
 
-Hot-shoe feedback is CAMERA_FEEDBACK with a time since boot (ArduPilot with a feedback pin). One with a GPS time, and
-CAMERA_TRIGGER (PX4), have the time of the command to fire. A contact counts if it is after our own trigger call:
-nothing exposes before that.
+Hot-shoe feedback is CAMERA_FEEDBACK with a time since boot (ArduPilot with a feedback pin), and CAMERA_IMAGE_CAPTURED
+(PX4 with CAM_CAP_FBACK). CAMERA_FEEDBACK with a GPS time, and CAMERA_TRIGGER (PX4), have the time of the command to
+fire. A contact counts if it is after our own trigger call: nothing exposes before that.
 
 Where the autopilot fires the body, its message comes before we know of the shot. Such a shot has the time of the
 message that created it (`TriggerMessage`). No other message is considered, and no call of ours is compared with it.
@@ -24,7 +24,7 @@ from typing import Literal, Self
 import numpy as np
 
 from dappled.config.settings import CameraSettings
-from dappled.daemon.navigation.samples import MARK, Feedback, UtcCorrection, UtcNotes
+from dappled.daemon.navigation.samples import CAPTURED, MARK, Feedback, UtcCorrection, UtcNotes
 from dappled.decode.array_types import Floats
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Shot, TimeSource
@@ -112,7 +112,8 @@ def asked(exposure: ExposureTime, shot: Shot) -> ExposureTime:
 def owned(exposure: ExposureTime, shot: Shot, latency: BodyLatency) -> ExposureTime:
     """The expected exposure with the autopilot's message that created the shot, where that message is about it."""
     cause = shot.cause
-    if not latency.fired_outside or cause.kind not in ("CAMERA_FEEDBACK", "CAMERA_TRIGGER") or cause.sequence is None:
+    kinds = ("CAMERA_FEEDBACK", "CAMERA_TRIGGER", CAPTURED)
+    if not latency.fired_outside or cause.kind not in kinds or cause.sequence is None:
         return exposure
     return replace(exposure, trigger=TriggerMessage(cause.kind, cause.sequence, shot.wished_utc_ns, latency))
 
@@ -357,8 +358,8 @@ def by_trigger(
     exposure: ExposureTime, trigger: TriggerMessage, event: Feedback, clock: BootClock, events: Sequence[Feedback] = ()
 ) -> tuple[ExposureTime, int, int]:
     """The exposure by the message that created its shot: the exposure, mid-exposure in time since boot, and 1 σ of the
-    latter alone. Where the message is no contact, a receiver's mark among `events` is; without one the body's latency
-    is added."""
+    latter alone. Where the message is no contact, a receiver's mark among `events` is, or PX4's report of one; without
+    them the body's latency is added."""
     if event.contact:
         return *refine(exposure, event, clock), event.sigma_ns
     start_boot_ns = event.boot_ns + round(trigger.latency.mean_ms * 1e6)
@@ -371,7 +372,7 @@ def by_trigger(
         source=TimeSource.AUTOPILOT_TRIGGER,
         called_utc_ns=clock.utc_ns(event.boot_ns),
     )
-    mark = choose_feedback([one for one in events if one.kind == MARK], better, clock)
+    mark = choose_feedback([one for one in events if one.kind in (MARK, CAPTURED)], better, clock)
     return (better, middle_boot_ns, own_ns) if mark is None else (*refine(better, mark, clock), mark.sigma_ns)
 
 

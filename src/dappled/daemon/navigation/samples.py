@@ -140,6 +140,7 @@ class GimbalSample:
     kind: str
 
 
+CAPTURED = "CAMERA_IMAGE_CAPTURED"
 MARK = "TIM-TM2"  # a time mark of a GNSS receiver of our own (see `drivers.gnss`)
 CONTACT_SIGMA_NS = 1_000_000  # interrupt and contact bounce; the best bodies were measured at 0.56 ms
 MARK_SIGMA_NS = 5_000_000  # SYSTEM_TIME relates the receiver's UTC to boot; how late an autopilot has it isn't measured
@@ -147,8 +148,8 @@ MARK_SIGMA_NS = 5_000_000  # SYSTEM_TIME relates the receiver's UTC to boot; how
 
 @dataclass(frozen=True, slots=True)
 class Feedback:
-    """One CAMERA_FEEDBACK or CAMERA_TRIGGER: its time since boot. `number` is its packet's in the log,
-    `image` the autopilot's number of it. `kind` is the message's type, or MARK.
+    """One CAMERA_FEEDBACK, CAMERA_TRIGGER or CAMERA_IMAGE_CAPTURED of the autopilot's: its time since boot. `number` is
+    its packet's in the log, `image` the autopilot's number of it. `kind` is the message's type, or MARK.
 
     `contact`: it is the time of a contact in the hot shoe. False: it may be that of the command to fire.
     """
@@ -174,6 +175,15 @@ class Feedback:
         """Whether it is the same contact: at one time, or timed by the autopilot and by a receiver of our own."""
         both = (self.kind == MARK) != (other.kind == MARK)
         return abs(self.boot_ns - other.boot_ns) <= (3 * MARK_SIGMA_NS if both else 0)
+
+
+def with_commands(events: Sequence[Feedback]) -> Sequence[Feedback]:
+    """PX4's CAMERA_IMAGE_CAPTURED have the times of contacts where a hot shoe is wired (CAM_CAP_FBACK), else those of
+    the commands to fire, which CAMERA_TRIGGER have too."""
+    captured = {one.boot_ns // 10**6 for one in events if one.kind == CAPTURED}
+    if not any(one.kind == "CAMERA_TRIGGER" and one.boot_ns // 10**6 in captured for one in events if captured):
+        return events
+    return [replace(one, contact=False) if one.kind == CAPTURED else one for one in events]
 
 
 def is_mark(message: MavlinkMessage, system_id: int | None) -> bool:
@@ -399,6 +409,19 @@ def _scaled(value: int, unknown: int, parts: int) -> float | None:
     return value / parts if 0 < value < unknown else None
 
 
+def image_number(message: MavlinkMessage) -> int:
+    """The autopilot's number of what a message about the shutter reports."""
+    places = {"CAMERA_FEEDBACK": "img_idx", "CAMERA_TRIGGER": "seq", CAPTURED: "image_index"}
+    return int(getattr(message, places[message.get_type()]))
+
+
+def sent_us(message: MavlinkMessage) -> int:
+    """The time that a message about the shutter has; CAMERA_IMAGE_CAPTURED has whole milliseconds, cut off."""
+    if message.get_type() != CAPTURED:
+        return int(message.time_usec)
+    return boot_ns(message) // 1000 if message.time_boot_ms else 0
+
+
 def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, now_boot_ns: int) -> int | None:
     """The message's time since boot. None for 0, which is no time, and for a GPS time before SYSTEM_TIME has given the
     offset.
@@ -406,7 +429,7 @@ def feedback_boot_ns(message: MavlinkMessage, unix_minus_boot_ns: int | None, no
     ArduPilot counts the microseconds of its feedback pin in 32 bits, which wrap every 71.6 minutes: the time next to
     `now_boot_ns` is meant.
     """
-    time_us = int(message.time_usec)
+    time_us = sent_us(message)
     if time_us <= 0:
         return None
     if time_us >= EPOCH_US:
@@ -432,10 +455,9 @@ def feedback(
     boot_ns = feedback_boot_ns(message, unix_minus_boot_ns, now_boot_ns)
     if boot_ns is None or abs(boot_ns - now_boot_ns) > NEAREST_NS:
         return None
-    by_pin, time_us = message.get_type() == "CAMERA_FEEDBACK", int(message.time_usec)
-    contact = mark or (by_pin and time_us < EPOCH_US)
-    image = message.img_idx if by_pin else message.seq
-    return Feedback(number, stamp_ns, boot_ns, MARK if mark else message.get_type(), image, contact, time_us)
+    kind, time_us = message.get_type(), sent_us(message)
+    contact = mark or kind == CAPTURED or (kind == "CAMERA_FEEDBACK" and time_us < EPOCH_US)
+    return Feedback(number, stamp_ns, boot_ns, MARK if mark else kind, image_number(message), contact, time_us)
 
 
 def keep(history: list[N], sample: N) -> None:

@@ -175,8 +175,8 @@ class VehicleHistory:
         those beside it too."""
         first, end = self.time.span(limit, utc_ns)
         if not beside:
-            return between(self._feedbacks, first, end)
-        known = between(self._feedbacks, self.time.boot_first(first + 1), limit)
+            return telemetry_samples.with_commands(between(self._feedbacks, first, end))
+        known = telemetry_samples.with_commands(between(self._feedbacks, self.time.boot_first(first + 1), limit))
         return [one for one in known if one.contact or first <= one.number < end]
 
     def has_fix(self) -> bool:
@@ -351,7 +351,7 @@ class VehicleHistory:
         if found is None:
             return
         told = self._feedbacks[-_REPEATS:]
-        if any(one.time_us == found.time_us and one.image != found.image for one in told):
+        if any((one.kind, one.time_us) == (found.kind, found.time_us) and one.image != found.image for one in told):
             return  # the report of another camera repeats this one's last time, with the number of a trigger to come
         self.counts.feedbacks += 1
         self.counts.marks += mark
@@ -420,5 +420,6 @@ _HANDLERS: dict[str, Callable[[VehicleHistory, int, int, MavlinkMessage], None]]
     "SYSTEM_TIME": VehicleHistory._system_time,
     "CAMERA_FEEDBACK": VehicleHistory._feedback,
     "CAMERA_TRIGGER": VehicleHistory._feedback,
+    "CAMERA_IMAGE_CAPTURED": VehicleHistory._feedback,
 }
 USED_MESSAGES = frozenset(_HANDLERS)

@@ -14,10 +14,11 @@
 4. Echo. An autopilot that we command to fire the camera (a servo, a relay, its own trigger) reports that:
    CAMERA_TRIGGER, CAMERA_FEEDBACK, or the command for cameras. One message of each kind on each link within 2 s of our
    command is its echo and not a request, else every shot would ask for the next (`AutopilotCommands`).
-5. Same instant. CAMERA_TRIGGER and CAMERA_FEEDBACK carry the autopilot's time in microseconds. One of the same source
-   with the same time (not 0) and number as one of the last 256 is that trigger, however late it comes: delayed on a
-   link, or replayed by somebody (`RecentRequests`). Commands carry no time, and their numbers start again with their
-   sender, so a command that comes again after the windows above can't be told from a new one.
+5. Same instant. CAMERA_TRIGGER and CAMERA_FEEDBACK carry the autopilot's time in microseconds, CAMERA_IMAGE_CAPTURED in
+   milliseconds. One of the same source with the same time (not 0) and number as one of the last 256 is that trigger,
+   however late it comes: delayed on a link, or replayed by somebody (`RecentRequests`). Commands carry no time, and
+   their numbers start again with their sender, so a command that comes again after the windows above can't be told
+   from a new one.
 
 6. Forwarded. A ground station's capture request to all components also reaches the autopilot, which executes it: its
    version follows, from another sender, with another number and often as another command. An autopilot's request within

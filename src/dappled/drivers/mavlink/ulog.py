@@ -69,7 +69,7 @@ def packets(
 
 def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
     """The camera's triggers: camera_trigger, of which some may be contacts of a feedback pin, or without it
-    camera_capture. Raises AutopilotLogError."""
+    camera_capture. Where nothing but contacts is logged, each of them is a trigger. Raises AutopilotLogError."""
     with _sound(path):
         log = _Topics.read(path, [_PLACES, _TRIGGERS, _CAPTURES])
         clock, _, _ = _clock(path, log, bounds)
@@ -81,9 +81,10 @@ def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
             told = log_evidence.in_time(at)
             back = given["feedback"] != 0 if "feedback" in given else np.zeros(len(at), dtype=bool)
             contacts = int((told & back).sum()) if back.any() else None
+            commanded = told & ~back
             found = [
                 LoggedTrigger(int(numbers[n]), int(at[n]), _place_at(log, int(at[n])))
-                for n in np.flatnonzero(told & ~back)
+                for n in np.flatnonzero(commanded if commanded.any() else told)
             ]
         all_us = np.concatenate([clock.boots_us, *(log.times(topic, "timestamp") for topic in topics.values())])
         all_us = all_us[log_evidence.in_time(all_us)]

@@ -51,7 +51,8 @@ class CameraTriggers:
 
     ArduPilot reports every camera at each trigger of one (CAMERA_FEEDBACK), with the time since boot in 32 bits where
     the camera has a pin, else that of its satellites, 0 without any. A pin sleeps until the autopilot itself has
-    triggered that camera once. PX4 sends CAMERA_TRIGGER, six IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL.
+    triggered that camera once. PX4 sends CAMERA_TRIGGER, six IMAGE_START_CAPTURE and DO_DIGICAM_CONTROL, and
+    CAMERA_IMAGE_CAPTURED for each contact of a pin (CAM_CAP_FBACK), with a counter of its own.
     """
 
     personality: str = "ardupilot"
@@ -61,6 +62,7 @@ class CameraTriggers:
     _stamps: list[int] = field(default_factory=list)
     _awake: set[int] = field(default_factory=set)
     _sequence: int = 0
+    _contacts: int = 0
     _interval: tuple[int, int, int] | None = None  # boot_us of the next trigger, its period, how many are left (0: ∞)
 
     def __post_init__(self) -> None:
@@ -74,8 +76,14 @@ class CameraTriggers:
         return [message for one in chosen for message in self._ardupilot(one, unix_us)]
 
     def contact(self, boot_us: int, camera: int = 0) -> list[MavlinkMessage]:
-        """The hot shoe of a camera closed. PX4's CAMERA_TRIGGER leaves contacts out."""
-        if self.personality == "px4" or not self.cameras[camera].pin or camera not in self._awake:
+        """The hot shoe of a camera closed."""
+        if not self.cameras[camera].pin:
+            return []
+        if self.personality == "px4":
+            self._contacts += 1
+            at = boot_us // 1000, 0, 1, 0, 0, 0, 0, (1.0, 0.0, 0.0, 0.0)
+            return [mavlink.MAVLink_camera_image_captured_message(*at, self._contacts - 1, 1, b"")]
+        if camera not in self._awake:
             return []
         self._stamps[camera] = boot_us % _PIN_WRAP_US
         return self._feedbacks()
