@@ -206,7 +206,9 @@ class Service:
             capacity=settings.camera.max_pending,
             fires=not settings.camera.fired_outside,
         )
-        self._autopilot = autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal)
+        cam_idx = settings.mavlink.cam_idx
+        autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal, cam_idx=cam_idx)
+        self._autopilot = autopilot
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
         survey = LiveSurvey(self.navigation, reported, shots)
@@ -223,7 +225,7 @@ class Service:
             model=self._control,
             earlier=IndexedOutcomes(recording.index),
             series=self._distance,
-            cam_idx=settings.mavlink.cam_idx,
+            cam_idx=cam_idx,
         )
         self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
         self._depth = None

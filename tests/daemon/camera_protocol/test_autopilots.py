@@ -548,6 +548,63 @@ def test_old_shots_without_a_number_and_those_of_others_cover_no_loss(sender: tu
     assert sum(one.number("triggers") for one in rig.lost_triggers) == 3
 
 
+@pytest.mark.parametrize(
+    ("kind", "named", "own", "fires"),
+    [(6, 0, 0, None), (6, 100, 0, None), (6, 0, 1, 101), (6, 42, 0, 42), (6, None, 0, None), (1, 42, 0, None)],
+)
+def test_a_component_that_is_not_this_one_in_ardupilots_parameters_is_told(
+    kind: int, named: int | None, own: int, fires: int | None
+) -> None:
+    """CAMn_COMPID is of ArduPilot 4.8; what is not answered is asked for three times."""
+    rig = Rig(cam_idx=own)
+    rig.hear(heartbeat(armed=False), AUTOPILOT)
+    asked: list[str] = []
+    for _ in range(60):
+        rig.tick(0.5)
+        for read in rig.of("PARAM_REQUEST_READ"):
+            assert (read.target_system, read.target_component, read.param_index) == (1, 1, -1)
+            asked.append(read.param_id)
+            value = kind if read.param_id == f"CAM{own + 1}_TYPE" else named
+            if value is not None:
+                rig.hear(mavlink.MAVLink_param_value_message(read.param_id.encode(), value, 2, 1, 9), AUTOPILOT)
+    assert asked == [f"CAM{own + 1}_TYPE", *[f"CAM{own + 1}_COMPID"] * (3 if named is None else 1)]
+    found = [one for one in rig.component.findings() if one.code is Code.LINK_OTHER_COMPONENT]
+    assert [one.number("named") for one in found] == ([] if fires is None else [fires])
+    rig.hear(mavlink.MAVLink_param_value_message(b"CAM%d_COMPID" % (own + 1), 100, 2, 1, 9), AUTOPILOT)
+    assert Code.LINK_OTHER_COMPONENT not in [one.code for one in rig.component.findings()]
+
+
+@pytest.mark.parametrize("attitude", ["ATTITUDE", "ATTITUDE_QUATERNION"])
+def test_telemetry_that_comes_too_seldom_is_named_with_its_rate_until_it_comes_as_requested(attitude: str) -> None:
+    """ArduPilot over TCP sends some messages at the rate of its SR1 parameters."""
+    rig = rig_of()
+    boot_ms = 10_000
+
+    def fly(seconds: float, position_hz: float, attitude_hz: float) -> None:
+        nonlocal boot_ms
+        for step in range(round(seconds * 10)):
+            for _ in range(round((step + 1) * position_hz / 10) - round(step * position_hz / 10)):
+                rig.hear(mavlink.MAVLink_global_position_int_message(boot_ms, 1, 1, 0, 0, 0, 0, 0, 0), AUTOPILOT)
+            for _ in range(round(attitude_hz / 10)):
+                zeros = (0,) * (6 if attitude == "ATTITUDE" else 7)
+                rig.hear(getattr(mavlink, f"MAVLink_{attitude.lower()}_message")(boot_ms, *zeros), AUTOPILOT)
+            boot_ms += 100
+            rig.tick(0.1)
+
+    def slow() -> list[tuple[object, ...]]:
+        found = [one for one in rig.component.findings() if one.code is Code.TELEMETRY_SLOW]
+        return [(one.subject.which, round(float(one.facts["seen_hz"] or 0)), one.facts["wanted_hz"]) for one in found]
+
+    fly(12, 50, 10)
+    assert slow() == [("ATTITUDE_QUATERNION", 10, 50)]
+    fly(16, 5, 50)
+    assert slow() == [("GLOBAL_POSITION_INT", 5, 50)]
+    fly(6, 50, 50)
+    assert slow() == []
+    fly(12, 0, 50)  # nothing at all is another finding
+    assert slow() == []
+
+
 @pytest.mark.parametrize("test_shot", [True, False])
 def test_a_test_shot_is_a_photograph_that_covers_no_lost_trigger(test_shot: bool) -> None:
     """Parameter 7 = 1: PX4 doesn't count it. Any other shot without a number may be the one whose number is missing."""

@@ -83,7 +83,7 @@ class Rig:
         self.shutter = Shutter(self.sink, self.clock, next_index=5, capacity=capacity, fires=fires)
         self.series = DistanceTrigger(self.shutter, Nowhere(), self.clock, mount=self.mount, configured=configured)
         parameters = Parameters(self.body, (self,))
-        self.autopilot = OwnAutopilot(self, self.clock, on_gimbal=on_gimbal)
+        self.autopilot = OwnAutopilot(self, self.clock, on_gimbal=on_gimbal, cam_idx=cam_idx)
         self.component = Component(
             self,
             self.autopilot,
@@ -1008,3 +1008,17 @@ def test_the_status_is_sent_twice_a_second_at_most_unless_it_is_asked_for() -> N
     assert 10 < len(sent) <= 20
     assert min(after - before for before, after in pairwise(sent)) >= 0.5
     assert last == 5 + 45
+
+
+@pytest.mark.parametrize("by", [(512, 262.0), (527, 1.0), (512, 259.0), (521, 1.0)])
+def test_a_station_that_asks_each_second_is_answered_each_time(by: tuple[float, float]) -> None:
+    """One that hears nothing for three seconds drops the camera; each change has just been told without being asked."""
+    rig = Rig()
+    rig.tick(4)
+    wanted = "CAMERA_CAPTURE_STATUS" if 262.0 in by or by[0] == 527 else "CAMERA_INFORMATION"
+    for _ in range(10):
+        rig.component.state_changed()
+        rig.tick(1.0)
+        for target in ((1, 100), (1, 0), (0, 0)):
+            assert rig.command(int(by[0]), by[1], target=target) == mavlink.MAV_RESULT_ACCEPTED
+            assert [m.get_type() for m in rig.sent] == ["COMMAND_ACK", wanted]

@@ -159,6 +159,18 @@ def test_a_driver_that_fails_as_it_begins_costs_no_other_finding(
     assert (found[0].level, "no such port" in str(text(found[0])), broken.stopped) == (Level.STOP, True, True)
 
 
+@pytest.mark.parametrize("shutter", ["outside", "relay:0"])
+def test_a_relay_that_is_switched_by_itself_is_no_shot_where_something_else_fires(
+    machine: Machine, shutter: str
+) -> None:
+    url = ("udpin:127.0.0.1:14550",)
+    camera = CameraSettings(driver="fujifilm", shutter=shutter)
+    found = host_checks.link(Settings(camera=camera, mavlink=MavlinkSettings(url=url)), machine)
+    untold = [one for one in found if one.code is Code.TRIGGER_UNREPORTED]
+    assert [one.level for one in untold] == [Level.NOTE] * (shutter == "outside")
+    assert all("DO_SET_RELAY" in str(text(one)) for one in untold)
+
+
 def test_the_disk_behind_a_closed_door(machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A folder in one that may not be looked into: as if it were not there yet."""
     closed = tmp_path / "closed"

@@ -196,7 +196,8 @@ class Component:
 
     def findings(self) -> list[Finding]:
         """That the camera may belong to the wrong system (see `SystemIdentity.doubt`); other vehicles on the links, and
-        other components that send with our own ids: who hears both can't tell them apart."""
+        other components that send with our own ids: who hears both can't tell them apart; and what the
+        autopilot does otherwise than the camera needs."""
         rivals, other = self._identity.rivals(), self._identity.doubt()
         now_ns = self._clock.monotonic_ns()
         system, component = self._links.system_id, self._links.component_id
@@ -207,6 +208,7 @@ class Component:
                 for link, (source, heard_ns) in sorted(self._same_ids.items())
                 if now_ns - heard_ns <= _SAME_IDS_NS
             ),
+            *self._autopilot.findings(),
         ]
         return same if rivals is None else [*same, rivals]
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dappled.clock import Clock
+from dappled.daemon.camera_protocol.named_component import NamedComponent
 from dappled.daemon.navigation.samples import CAPTURED, EPOCH_US, NO_VEHICLES, WRAP_US
 from dappled.daemon.pipeline.repeats import AutopilotCommands
 from dappled.daemon.vehicle_battery import BATTERY_STREAM, BatteryReports, VehicleBattery
@@ -36,6 +37,13 @@ STREAMS = (  # message, interval in microseconds
     (mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT, 1_000_000),
 )
 GIMBAL_STREAM = (mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS, 50_000)
+_ATTITUDE = mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION
+_OF_POSES = {  # what poses are interpolated from: any of these messages will do
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: (mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,),
+    _ATTITUDE: (_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION_COV),
+}
+_SLOW_SHARE = 0.25  # of 50 Hz: at 10 Hz a vehicle that turns by 30°/s turns by 3° from one message to the next
+_SLOW_TIMES = 2  # in a row: one stretch may hold a start, or a short silence
 LISTEN_NS = 3 * 10**9
 ALONE_NS = 1_200_000_000  # heartbeats come every second: a second autopilot would have shown by now
 
@@ -168,8 +176,37 @@ class AutopilotRequests:
 
     def __init__(self, streams: Sequence[tuple[int, int]] = STREAMS) -> None:
         self._streams = streams
-        self._heard: dict[int, int] = dict.fromkeys((message_id for message_id, _ in streams), 0)
+        counted = *(message_id for message_id, _ in streams), *(one for each in _OF_POSES.values() for one in each)
+        self._heard: dict[int, int] = dict.fromkeys(counted, 0)
         self._time_due_ns = self._streams_due_ns = 0
+        self._asked_ns: int | None = None
+        self._slow: dict[int, tuple[int, float]] = {}  # how often in a row, and what came a second
+
+    def slow(self) -> list[Finding]:
+        """What comes too seldom to interpolate poses. What doesn't come at all is another finding."""
+        known = self._slow  # any thread may ask
+        return [
+            finding(
+                Code.TELEMETRY_SLOW,
+                Subject("stream", mavlink.mavlink_map[message_id].msgname),
+                seen_hz=known[message_id][1],
+                wanted_hz=1e6 / interval_us,
+            )
+            for message_id, interval_us in self._streams
+            if message_id in known and known[message_id][0] >= _SLOW_TIMES
+        ]
+
+    def _judge(self, heard: Mapping[int, int], now_ns: int) -> None:
+        """Take what has come since the last requests."""
+        since_ns, self._asked_ns = self._asked_ns, now_ns
+        if since_ns is None:
+            return
+        before, slow = self._slow, {}
+        for message_id, interval_us in self._streams:
+            seen_hz = max((heard[one] for one in _OF_POSES.get(message_id, ())), default=0) * 1e9 / (now_ns - since_ns)
+            if 0 < seen_hz < _SLOW_SHARE * 1e6 / interval_us:
+                slow[message_id] = before.get(message_id, (0, 0.0))[0] + 1, seen_hz
+        self._slow = slow
 
     def heard(self, message_id: int) -> None:
         """Count a message of our autopilot."""
@@ -184,6 +221,7 @@ class AutopilotRequests:
         if now_ns >= self._streams_due_ns:
             self._streams_due_ns = now_ns + STREAMS_NS
             heard, self._heard = self._heard, dict.fromkeys(self._heard, 0)
+            self._judge(heard, now_ns)
             for message_id, interval_us in self._streams:
                 if heard[message_id] < STREAMS_NS / (interval_us * 1e3) / 2:
                     yield mavlink.MAVLink_command_long_message(
@@ -425,13 +463,15 @@ class OwnAutopilot:
     """The autopilot of the system that the camera belongs to, on the link that it was last heard on.
 
     `on_gimbal`: the camera needs the gimbal's attitude, which ArduPilot sends to a companion's port only on request.
+    `cam_idx`: its number at the autopilot, from 0.
     """
 
-    def __init__(self, links: Links, clock: Clock, *, on_gimbal: bool = False) -> None:
+    def __init__(self, links: Links, clock: Clock, *, on_gimbal: bool = False, cam_idx: int = 0) -> None:
         self._links, self._clock = links, clock
         self.identity = SystemIdentity(links.system_id, clock.monotonic_ns())
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests((*STREAMS, GIMBAL_STREAM) if on_gimbal else STREAMS)
+        self._cam_idx, self._named = cam_idx, NamedComponent(cam_idx, links.component_id)
         self._now, self._battery = AutopilotNow(), BatteryReports()
         self.numbers = {kind: TriggerNumbers() for kind in ("CAMERA_FEEDBACK", "CAMERA_TRIGGER", CAPTURED)}
         self.restarts = 0  # of the autopilot, so far: its numbers begin again
@@ -442,6 +482,7 @@ class OwnAutopilot:
         self.identity.fired_by(system_id)
         if self.identity.system_id != before:
             self._now, self._battery = AutopilotNow(), BatteryReports()
+            self._named = NamedComponent(self._cam_idx, self._links.component_id)
             self.numbers = {kind: TriggerNumbers() for kind in self.numbers}
 
     def heard(self, message: MavlinkMessage) -> None:
@@ -450,6 +491,8 @@ class OwnAutopilot:
         since_ns = self._now.heard(message, self._clock.monotonic_ns()) if message.get_srcComponent() == 1 else None
         if message.get_type() == "SYS_STATUS" and message.get_srcComponent() == 1:
             self._battery.heard(message, self._clock.monotonic_ns())
+        if message.get_type() == "PARAM_VALUE" and message.get_srcComponent() == 1:
+            self._named.heard(message)
         if since_ns is not None:
             self.restarts += 1
             for numbers in self.numbers.values():
@@ -466,6 +509,10 @@ class OwnAutopilot:
         now: more than `STALE_US` ago, or ahead. None where its clock is not known yet."""
         return self._now.is_stale(time_us, self._clock.monotonic_ns())
 
+    def findings(self) -> list[Finding]:
+        """What of its telemetry comes too seldom to interpolate poses; that it fires another component than ours."""
+        return [*self._requests.slow(), *self._named.findings()]
+
     def battery(self) -> VehicleBattery | None:
         """The vehicle's battery; None while the autopilot doesn't report it."""
         return self._battery.now(self._clock.monotonic_ns())
@@ -477,6 +524,9 @@ class OwnAutopilot:
             system, link = autopilot
             for message in self._requests.due(system, self._clock.monotonic_ns(), self._clock.utc_ns()):
                 self._links.send(message, link)
+            if self.identity.is_ardupilot():
+                for message in self._named.due(system, self._clock.monotonic_ns()):
+                    self._links.send(message, link)
 
     def command(self, number: int, parameters: Sequence[float]) -> str | None:
         """Send it a command (MAV_CMD, parameters from the first); a sentence where it can't be sent."""

@@ -162,14 +162,15 @@ def clock(settings: Settings, machine: Machine) -> list[Finding]:
 
 
 def link(settings: Settings, machine: Machine) -> list[Finding]:
-    """The links to the autopilot."""
+    """The links to the autopilot, and which triggers it doesn't report over them."""
     found = []
     for url in settings.mavlink.url:
         device = url.split(":")[0].split(",")[0]
         shut = device.startswith("/dev/") and not os.access(device, os.R_OK | os.W_OK)
         about = Subject("link", url)
         found.append(finding(Code.LINK_UNOPENED, about, device=device) if shut else finding(Code.LINK_NAMED, about))
-    return found or [finding(Code.LINK_NONE, Subject("link"))]
+    untold = [finding(Code.TRIGGER_UNREPORTED, Subject("trigger"))] if settings.camera.fired_outside else []
+    return [*(found or [finding(Code.LINK_NONE, Subject("link"))]), *untold]
 
 
 def mask(settings: Settings, machine: Machine) -> list[Finding]:
