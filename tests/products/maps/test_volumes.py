@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,14 @@ import pytest
 
 from dappled.cli import main
 from dappled.decode.array_types import Floats
-from dappled.products.maps import cog
+from dappled.products.maps import cog, terrain
 from dappled.products.maps.earth import Projection
+from dappled.products.maps.ground import Flat
+from dappled.products.maps.hyperstereo import Surface
 from dappled.products.maps.map_grid import MapGrid
+from dappled.products.maps.terrain import TerrainModel
+from tests.products.maps.test_eye import eye_at
+from tests.products.maps.test_map_grid import painted, photograph, survey
 
 pytest.importorskip("rasterio")
 GRID = MapGrid("EPSG:32615", 499_900.0, 4_600_100.0, 0.5, 0.5, (400, 400))  # 200 m a side, on the central meridian
@@ -142,6 +148,19 @@ def test_cells_of_another_size_are_interpolated(tmp_path: Path, capsys: pytest.C
     made = told(capsys, *pair)
     assert made["unknown_cells"] == 0
     assert abs(made["fill"]["volume_m3"]) < 1e-3 * made["net"]["area_m2"]
+
+
+def test_a_flight_s_terrain_brings_its_errors_along(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """As `georeference --as terrain` writes it: windows of 9 × 9 cells err alike, and poses give all heights 0.5 m."""
+    eye = eye_at(height_m=60.0)
+    flown = survey(photograph(eye, painted(eye, Flat(0.0))))
+    grid = replace(GRID, shape=(100, 100))
+    height, sigma, score = (np.full(grid.shape, value, np.float32) for value in (200.0, 0.1, 1.0))
+    found = TerrainModel(Surface(grid, height, sigma, score, 0.5), None)
+    terrain.write_raster(flown, found, tmp_path / "maps" / "terrain.tif")
+    made = told(capsys, str(tmp_path), str(tmp_path))
+    assert made["net"]["cells_sigma_m3"] == pytest.approx(math.sqrt(2) * 0.1 * 9 * 100 * made["cell_m2"], rel=1e-4)
+    assert made["level_sigma_m"] == pytest.approx(math.sqrt(2) * 0.5)
 
 
 @pytest.mark.parametrize(
