@@ -76,7 +76,7 @@ def write_pieces(
         "count": bands,
         "dtype": dtype,
         "crs": grid.crs,
-        "transform": rasterio.Affine(grid.step_x, 0, grid.west, 0, -grid.step_y, grid.north),
+        "transform": grid.affine,
         "tiled": True,
         "blockxsize": TILE,
         "blockysize": TILE,

@@ -16,6 +16,7 @@ from dappled.decode.array_types import Floats
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.heights import HeightRaster, HeightsError
+from dappled.products.maps.map_grid import unwrapped
 
 MOST_HEIGHTS = 5000
 _HEIGHTS = 20.0  # over the relief, where no interval is asked for
@@ -82,7 +83,7 @@ def write(contours: Sequence[Contour], projection: Projection, interval_m: float
     """Write lines with `height_m`, and `major` for each fifth."""
     east, north = np.concatenate([np.empty((0, 2)), *(one.line for one in contours)]).T
     latitude, longitude = projection.to_geodetic(east, north)
-    near = (longitude - longitude[:1] + 180) % 360 - 180 + longitude[:1]  # in one piece across the antimeridian
+    near = unwrapped(longitude, float(longitude[0])) if contours else longitude
     places = np.round(np.stack([near, latitude], axis=1), 8)
     lines = np.split(places, np.cumsum([len(one.line) for one in contours])[:-1]) if contours else []
     features = [

@@ -57,10 +57,8 @@ def write_geojson(covered: Coverage, projection: Projection, path: Path, *, leas
 def _features(
     covered: Coverage, projection: Projection, values: NDArray[np.int32], where: NDArray[np.bool_], *, hole: bool
 ) -> Iterator[dict[str, Any]]:
-    rasterio, shapes = need("rasterio"), need("rasterio.features")
-    grid = covered.grid
-    affine = rasterio.Affine(grid.step_x, 0, grid.west, 0, -grid.step_y, grid.north)
-    for shape, value in shapes.shapes(values, mask=where, transform=affine):
+    shapes = need("rasterio.features")
+    for shape, value in shapes.shapes(values, mask=where, transform=covered.grid.affine):
         rings = []
         for ring in shape["coordinates"]:
             latitude, longitude = projection.to_geodetic(*np.array(ring).T)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyproj
@@ -20,6 +20,7 @@ from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
 
 GEODETIC = "EPSG:4326"
+Degrees = TypeVar("Degrees", float, Floats)
 _OVERLAP_DEG = 6.0  # how far a projection may be used beyond the area that it was made for
 _MOST_M = 120.0  # of sea level above or below the ellipsoid: EGM2008 has -107 to 86
 _SYSTEM_GRIDS = Path("/usr/share/proj")
@@ -96,8 +97,8 @@ def geoid(given: str | None) -> Geoid:
     )
 
 
-def wrapped(longitude_deg: float) -> float:
-    """A longitude from −180 up to, but not including, 180.
+def wrapped(longitude_deg: Degrees) -> Degrees:
+    """A longitude, or each of several, from −180 up to, but not including, 180.
 
     >>> wrapped(180.5), wrapped(-181.0), wrapped(180.0)
     (-179.5, 179.0, -180.0)

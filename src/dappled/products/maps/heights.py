@@ -67,8 +67,8 @@ def resampled(values: Singles, source: MapGrid, target: MapGrid) -> Singles:
     warp.reproject(
         np.asarray(values, np.float32),
         made,
-        src_transform=_affine(source),
-        dst_transform=_affine(target),
+        src_transform=source.affine,
+        dst_transform=target.affine,
         src_crs=source.crs,
         dst_crs=target.crs,
         src_nodata=np.nan,
@@ -76,10 +76,6 @@ def resampled(values: Singles, source: MapGrid, target: MapGrid) -> Singles:
         resampling=warp.Resampling.bilinear,
     )
     return made
-
-
-def _affine(grid: MapGrid) -> Any:
-    return need("rasterio").Affine(grid.step_x, 0, grid.west, 0, -grid.step_y, grid.north)
 
 
 def _read(source: Any, file: Path) -> HeightRaster:

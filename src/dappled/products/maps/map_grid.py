@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +55,11 @@ class MapGrid:
         """West, south, east, north: outer edges."""
         rows, columns = self.shape
         return self.west, self.north - rows * self.step_y, self.west + columns * self.step_x, self.north
+
+    @property
+    def affine(self) -> Any:
+        """From column and row to the map, as rasterio takes it. Raises MissingExtraError."""
+        return need("rasterio").Affine(self.step_x, 0, self.west, 0, -self.step_y, self.north)
 
     def part(self, rows: slice, columns: slice) -> MapGrid:
         """The grid of some rows and columns."""
@@ -115,7 +121,7 @@ def degree_steps(projection: Projection, east: float, north: float, gsd_m: float
 
 def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
     """Longitudes within 180° of `near_deg`, so that a strip across the antimeridian stays in one piece."""
-    return np.asarray(near_deg + np.vectorize(wrapped)(longitude_deg - near_deg), dtype=np.float64)
+    return near_deg + wrapped(longitude_deg - near_deg)
 
 
 def sample(image: Singles, at: Floats) -> Singles:

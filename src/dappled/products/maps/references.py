@@ -69,7 +69,7 @@ class BaseMap:
             picture = np.full((len(bands), *grid.shape), np.nan, dtype=np.float32)
             known = np.zeros(grid.shape, dtype=np.uint8)
             place = {
-                "dst_transform": rasterio.Affine(step, 0, grid.west, 0, -step, grid.north),
+                "dst_transform": grid.affine,
                 "dst_crs": self.projection.crs.to_wkt(),
             }
             warp.reproject(
