@@ -65,25 +65,24 @@ class Machine:
                 self.run("true", timeout_s=10)
                 return time.monotonic() - began
             assert self._process.poll() is None, self._log.read_text(errors="replace")[-2000:]
-            time.sleep(0.5)
+            time.sleep(0.5)  # a machine that boots has nothing to wait on, and each try is a process
         raise TimeoutError(self._log.read_text(errors="replace")[-2000:])
 
     def run(self, command: str, *, timeout_s: float = 120, check: bool = True) -> str:
         """What a command prints there, as root. Raises subprocess.SubprocessError."""
-        options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "LogLevel=ERROR", "ConnectTimeout=5"]
-        words = ["ssh", "-i", str(self._built / "key"), *(word for one in options for word in ("-o", one))]
-        done = subprocess.run(
-            [*words, f"root@{THERE}", command], capture_output=True, text=True, timeout=timeout_s, check=False
-        )
+        done = subprocess.run(self._shell(command), capture_output=True, text=True, timeout=timeout_s, check=False)
         if check and done.returncode:
             raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr + done.stdout)
         return done.stdout
 
     def put(self, path: str, data: bytes) -> None:
         """Write a file there."""
-        options = ["-o", "StrictHostKeyChecking=no", "-o", "UserKnownHostsFile=/dev/null", "-o", "LogLevel=ERROR"]
-        words = ["ssh", "-i", str(self._built / "key"), *options, f"root@{THERE}", f"cat >{path}"]
-        subprocess.run(words, input=data, check=True, timeout=120)
+        subprocess.run(self._shell(f"cat >{path}"), input=data, check=True, timeout=120)
+
+    def _shell(self, command: str) -> list[str]:
+        options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "LogLevel=ERROR", "ConnectTimeout=5"]
+        there = ["-i", str(self._built / "key"), *(word for one in options for word in ("-o", one)), f"root@{THERE}"]
+        return ["ssh", *there, command]
 
     def cut(self) -> None:
         """Pull its plug."""
