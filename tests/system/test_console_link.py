@@ -33,7 +33,7 @@ from tests.system.test_console import (
 )
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Route
 
 __all__ = ["chromium", "daemon", "leave"]  # fixtures
 
@@ -205,6 +205,31 @@ def test_a_running_series_is_on_the_first_screen_and_stopped_over_a_bad_link(
     begin_series(another)  # what was said of the last one is over
     until(page, "document.querySelector('#outcome').textContent === ''")
     until(page, "!document.querySelector('#interval-stop').disabled")
+    page.click("#interval-stop")
+    until(page, said("the interval is stopped"))
+
+
+def test_stop_repeated_across_a_restart_says_that_the_daemon_was_started_again(
+    chromium: Browser, daemon: Daemon
+) -> None:
+    page = page_of(chromium, daemon.url, "phone")
+    begin_series(page)
+    earlier = "another-1"  # the token of a start before this one, which page and answer were lost with
+    page.evaluate("(token) => sessionStorage.setItem('stop', JSON.stringify({ token, elapsed_ms: 1e9 }))", earlier)
+    lost: list[Route] = []
+
+    def loses_the_first(route: Route) -> None:
+        if lost:
+            route.continue_()
+        else:
+            lost.append(route)
+            route.abort()
+
+    page.route("**/api/interval/stop", loses_the_first)
+    page.reload()
+    until(page, said("no interval of then is running: the daemon was started again since"))
+    assert lost
+    until(page, r"/^\d+ taken, next /.test(document.querySelector('#progress').textContent)")  # what runs now is shown
     page.click("#interval-stop")
     until(page, said("the interval is stopped"))
 

@@ -68,6 +68,7 @@ class ConsoleRequests:
         self._shutter, self._series = shutter, series
         self._parameters, self._look, self._clock = parameters, look, clock
         self._done: OrderedDict[int, dict[str, Any]] = OrderedDict()
+        self._stopped_ms: int | None = None  # when the Stop that ended the last interval was pressed
 
     def answer(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """Do what is asked: a shot, an interval, its end, a setting, live view, what became of a number, or lines of
@@ -119,18 +120,23 @@ class ConsoleRequests:
 
     def _stop_interval(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """A stop is never too late, but it ends only what ran when it was pressed: held back by a link, it must not
-        cut short an interval that somebody began since. Without a token it ends what runs now."""
-        asked_ns = None
+        cut short an interval that somebody began since. The same press again, whose answer was lost, has the same
+        answer. Without a token it ends what runs now."""
+        asked_ns = pressed_ms = None
         if "token" in request:
             pressed_ms = self._pressed_ms(request, HELD_MS)
             if pressed_ms is None:
-                return {"ok": True, "text": "no interval of then is running: the daemon was started again since"}
+                text = "no interval of then is running: the daemon was started again since"
+                return {"ok": True, "text": text, "restarted": True}
             asked_ns = (pressed_ms + 1) * 10**6  # the token counts whole milliseconds
         ends = {self._shutter.stop_interval(asked_ns=asked_ns), self._series.end(asked_ns=asked_ns)}
         if "began later" in ends:
             text = "not stopped: this interval was begun after Stop was pressed; press it again to end it"
             return {"ok": False, "error": text}
-        return {"ok": True, "text": "the interval is stopped" if "stopped" in ends else "no interval was running"}
+        if "stopped" in ends:
+            self._stopped_ms = pressed_ms
+        is_stopped = "stopped" in ends or (pressed_ms is not None and pressed_ms == self._stopped_ms)
+        return {"ok": True, "text": "the interval is stopped" if is_stopped else "no interval was running"}
 
     def _outcome(self, request: Mapping[str, Any]) -> dict[str, Any]:
         """What became of a number. "waiting": it may still arrive in time; "never": it did not, and is refused now."""

@@ -417,14 +417,14 @@ async function stop(pressed) {
   stored("stop", pressed);
   tell("stopping…", "busy");
   tick();
-  for (let isFirst = true; ; isFirst = false) {
+  for (;;) {
     const answer = await post("/api/interval/stop", pressed).catch(() => ({}));
     if ("ok" in answer) {   // the daemon's; others are of what lies between
-      if (answer.ok) {
+      if (answer.ok && !answer.restarted) {   // of another start, the press says nothing of what runs now
         interval = null;
         stoppedMs = Number(pressed.token.split("-").at(-1)) + pressed.elapsed_ms + 1;
       }
-      tell(answer.ok ? (isFirst ? answer.text : "the interval is stopped") : answer.error, answer.ok ? "stopped" : "bad");
+      tell(answer.ok ? answer.text : answer.error, answer.ok ? "stopped" : "bad");
       break;
     }
     if (ended) { tell("the flight has ended, and what ran with it"); break; }
