@@ -13,6 +13,7 @@ import pytest
 from dappled.cli import main
 from dappled.decode.array_types import Floats
 from dappled.products.maps.earth import Projection
+from dappled.products.maps.map_grid import MapGrid
 from tests.products.maps.test_volumes import GRID, cone, written
 
 pytest.importorskip("contourpy")
@@ -79,6 +80,26 @@ def test_lines_are_not_nearer_than_the_heights_are_known(tmp_path: Path, capsys:
     assert told["interval_m"] == 5.0
     assert told["sigma_m"] == pytest.approx(1.1)
     assert len(lines) == 3
+
+
+def test_lines_across_180_degrees_are_cut_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    east, north = (float(one) for one in Projection("EPSG:32760").to_map(-17.0, 180.0))
+    grid = MapGrid("EPSG:32760", east - 100, north + 100, 0.5, 0.5, GRID.shape)
+    _, y = grid.axes()
+    height = np.array(np.broadcast_to(200.0 + 0.1 * (grid.north - y)[:, None], grid.shape))
+    output = tmp_path / "contours.geojson"
+    raster = written(tmp_path / "a.tif", height, grid=grid)
+    assert main(["terrain", "contours", raster, "--interval", "5", "-o", str(output)]) == 0
+    capsys.readouterr()
+    lines = [one["geometry"] for one in json.loads(output.read_text())["features"]]
+    assert len(lines) == 3
+    for line in lines:
+        assert line["type"] == "MultiLineString"
+        pieces = sorted((np.array(one) for one in line["coordinates"]), key=lambda piece: piece[0, 0])
+        assert len(pieces) == 2
+        assert pieces[0][:, 0].min() == -180
+        assert pieces[1][:, 0].max() == 180
+        assert all(np.ptp(piece[:, 0]) < 0.01 for piece in pieces)
 
 
 def test_smoothing_leaves_a_plane_and_takes_noise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,7 +8,6 @@ import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -21,7 +20,7 @@ from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.geotags.marks import Marked
-from dappled.products.maps.earth import Geoid
+from dappled.products.maps.earth import Geoid, geojson_line
 from dappled.products.mounting import Mounting
 
 
@@ -231,10 +230,7 @@ def geojson(placed: Sequence[Placed]) -> str:
     known = sorted(((one, one.camera) for one in placed if one.camera), key=lambda pair: pair[0].frame.index)
     features: list[dict[str, Any]] = []
     if len(known) > 1:
-        pieces = _cut([_coordinates(camera) for _, camera in known])
-        line = {"type": "LineString", "coordinates": pieces[0]}
-        if len(pieces) > 1:
-            line = {"type": "MultiLineString", "coordinates": pieces}
+        line = geojson_line([_coordinates(camera) for _, camera in known])
         features.append({"type": "Feature", "properties": {"name": "track"}, "geometry": line})
     for one, camera in known:
         turned = _ypr(camera) if camera.pix4d else (None, None, None)
@@ -267,21 +263,6 @@ def geojson(placed: Sequence[Placed]) -> str:
 def _coordinates(camera: CameraPose) -> list[float]:
     place = [round(camera.longitude_deg, 9), round(camera.latitude_deg, 9)]
     return place if camera.height_ellipsoid_m is None else [*place, round(camera.height_ellipsoid_m, 3)]
-
-
-def _cut(line: Sequence[list[float]]) -> list[list[list[float]]]:
-    """A line of longitude, latitude (and height) cut at the antimeridian (RFC 7946, 3.1.9)."""
-    pieces = [[line[0]]]
-    for a, b in pairwise(line):
-        if abs(b[0] - a[0]) > 180:
-            edge = math.copysign(180.0, a[0])
-            span = b[0] + 2 * edge - a[0]
-            share = (edge - a[0]) / span if span else 0.0
-            between = [round(p + share * (q - p), 9) for p, q in zip(a[1:], b[1:], strict=False)]
-            pieces[-1] += [] if a[0] == edge else [[edge, *between]]
-            pieces.append([] if b[0] == -edge else [[-edge, *between]])
-        pieces[-1].append(b)
-    return [piece if len(piece) > 1 else piece * 2 for piece in pieces]  # a line has two points or more
 
 
 def _ypr(camera: CameraPose) -> tuple[float, float, float]:

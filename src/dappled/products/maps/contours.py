@@ -14,9 +14,8 @@ from scipy import ndimage
 from dappled import durable
 from dappled.decode.array_types import Floats
 from dappled.products.extras import need
-from dappled.products.maps.earth import Projection
+from dappled.products.maps.earth import Projection, geojson_line
 from dappled.products.maps.heights import HeightRaster, HeightsError
-from dappled.products.maps.map_grid import unwrapped
 
 MOST_HEIGHTS = 5000
 _HEIGHTS = 20.0  # over the relief, where no interval is asked for
@@ -80,17 +79,16 @@ def of(raster: HeightRaster, interval_m: float, *, smooth_m: float = 0.0) -> lis
 
 
 def write(contours: Sequence[Contour], projection: Projection, interval_m: float, path: Path) -> None:
-    """Write lines with `height_m`, and `major` for each fifth."""
+    """Write lines with `height_m`, and `major` for each fifth; what crosses 180° is cut there."""
     east, north = np.concatenate([np.empty((0, 2)), *(one.line for one in contours)]).T
     latitude, longitude = projection.to_geodetic(east, north)
-    near = unwrapped(longitude, float(longitude[0])) if contours else longitude
-    places = np.round(np.stack([near, latitude], axis=1), 8)
+    places = np.round(np.stack([longitude, latitude], axis=1), 8)
     lines = np.split(places, np.cumsum([len(one.line) for one in contours])[:-1]) if contours else []
     features = [
         {
             "type": "Feature",
             "properties": {"height_m": one.height_m, "major": round(one.height_m / interval_m) % _MAJOR == 0},
-            "geometry": {"type": "LineString", "coordinates": line.tolist()},
+            "geometry": geojson_line(line.tolist()),
         }
         for one, line in zip(contours, lines, strict=True)
     ]

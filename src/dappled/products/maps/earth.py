@@ -7,7 +7,9 @@ poles) of its first frame. PROJ must be able to carry out every transformation i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -104,6 +106,24 @@ def wrapped(longitude_deg: Degrees) -> Degrees:
     (-179.5, 179.0, -180.0)
     """
     return (longitude_deg + 180) % 360 - 180
+
+
+def geojson_line(line: Sequence[list[float]]) -> dict[str, Any]:
+    """The GeoJSON geometry of a line of longitude, latitude (and height), cut at the antimeridian (RFC 7946, 3.1.9)."""
+    pieces = [[line[0]]]
+    for a, b in pairwise(line):
+        if abs(b[0] - a[0]) > 180:
+            edge = math.copysign(180.0, a[0])
+            span = b[0] + 2 * edge - a[0]
+            share = (edge - a[0]) / span if span else 0.0
+            between = [round(p + share * (q - p), 9) for p, q in zip(a[1:], b[1:], strict=False)]
+            pieces[-1] += [] if a[0] == edge else [[edge, *between]]
+            pieces.append([] if b[0] == -edge else [[-edge, *between]])
+        pieces[-1].append(b)
+    several = [piece if len(piece) > 1 else piece * 2 for piece in pieces]  # a line has two points or more
+    if len(several) == 1:
+        return {"type": "LineString", "coordinates": several[0]}
+    return {"type": "MultiLineString", "coordinates": several}
 
 
 def touch(a: tuple[float, ...], b: tuple[float, ...], *, degrees: bool) -> bool:
