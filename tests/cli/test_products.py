@@ -107,6 +107,15 @@ def test_an_animation_goes_round_the_aperture_or_through_the_scene(field: str, k
     assert main(["views", field, "--animate", kind, "--of", "slices", "-o", str(tmp_path / "b.webp")]) == 2
 
 
+def test_without_webp_in_pillow_an_animation_is_refused_in_words(
+    field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("PIL.features.check", lambda name: name != "webp")
+    assert main(["views", field, "--animate", "parallax", "-o", str(tmp_path / "a.webp")]) == 1
+    assert "this Pillow was built without WebP: install another, or name a .mp4" in capsys.readouterr().err
+    assert not (tmp_path / "a.webp").exists()
+
+
 @pytest.mark.parametrize(("side", "count"), [(1, 0), (2, 4), (3, 8)])
 def test_few_views_are_animated_once_round_and_one_is_refused(
     side: int, count: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]

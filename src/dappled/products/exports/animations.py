@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, features
 
 from dappled import durable
 from dappled.errors import DappledError
@@ -35,6 +35,8 @@ def save(path: Path, pictures: Sequence[Bytes]) -> None:
 
 
 def _webp(drawn: Sequence[Image.Image]) -> bytes:
+    if not features.check("webp"):
+        raise DappledError("this Pillow was built without WebP: install another, or name a .mp4")
     file = io.BytesIO()
     drawn[0].save(file, "WEBP", save_all=True, append_images=drawn[1:], duration=1000 // _A_SECOND, loop=0, quality=85)
     return file.getvalue()
