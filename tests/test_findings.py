@@ -14,7 +14,6 @@ SOURCE = Path(dappled.__file__).parent
 
 
 def test_each_code_has_words_and_is_found_somewhere() -> None:
-    assert set(WORDS) == set(Code)
     names = {
         name
         for path in SOURCE.rglob("*.py")
@@ -22,6 +21,12 @@ def test_each_code_has_words_and_is_found_somewhere() -> None:
         for name in re.findall(r"Code\.([A-Z_0-9]+)", path.read_text("utf-8"))
     }
     assert {one.name for one in Code} <= names, "a code that nothing finds"
+
+
+def test_type_checkers_read_the_codes_of_the_table() -> None:
+    """`tools/findings_page.py` writes them."""
+    listed = re.findall(r'^    (\w+) = "(.*)"$', (SOURCE / "finding_codes.pyi").read_text("utf-8"), re.MULTILINE)
+    assert listed == [(one.name, one.value) for one in Code]
 
 
 def test_the_words_of_all_codes_stand_in_one_order() -> None:

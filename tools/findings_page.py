@@ -1,4 +1,5 @@
-"""Write docs/findings.md from `dappled.findings`: what can be found, in words, what to do, and where more is said."""
+"""Write what is made from `findings.toml`: docs/findings.md (what can be found, in words, what to do, and where more is
+said), and `finding_codes.pyi`, the codes for type checkers and editors."""
 
 from __future__ import annotations
 
@@ -7,7 +8,20 @@ from pathlib import Path
 
 from dappled.findings import WORDS
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "findings.md"
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "findings.md"
+STUB = ROOT / "src" / "dappled" / "finding_codes.pyi"
+STUB_HEAD = '''"""The codes of `findings.toml`, written by `python tools/findings_page.py`."""
+
+from enum import StrEnum
+from typing import Any
+
+TABLE: dict[str, dict[str, Any]]
+
+class Code(StrEnum):
+    """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""
+
+'''
 HEAD = """# What can be found
 
 Whatever a person may have to know is a finding: a code, a level, what it is about, and facts. Health record, ledger,
@@ -33,5 +47,11 @@ def page() -> str:
     return "\n".join(parts)
 
 
+def stub() -> str:
+    """The list of codes as it should be."""
+    return STUB_HEAD + "".join(f'    {code.name} = "{code.value}"\n' for code in WORDS)
+
+
 if __name__ == "__main__":
+    STUB.write_text(stub(), encoding="utf-8")
     PAGE.write_text(page(), encoding="utf-8")
