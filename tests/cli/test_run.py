@@ -10,6 +10,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -179,12 +180,14 @@ def test_a_service_waits_for_work_in_its_flights_and_leaves_the_links_to_who_rec
 def test_a_service_whose_signing_times_can_t_be_kept_answers_too(
     config: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are beside the flights."""
+    """They are beside the flights. Where the root is read-only, /tmp is no place for others."""
     make_key(tmp_path / "link.key")
     (tmp_path / "flights").symlink_to("/proc/there-is-none")
     text = config.read_text().replace("[mavlink]\n", f'[mavlink]\nkeys = "{tmp_path}/link.key"\n')
     config.write_text(text)
     assert len(_grounded(config, monkeypatch)) == 1
+    monkeypatch.setattr(tempfile, "tempdir", "/proc/there-is-none")
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     answer_meanwhile(configuration.load(config), "the disk is gone", lambda: True)
 
 

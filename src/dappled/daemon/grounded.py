@@ -5,6 +5,7 @@ The disk may be read-only, full or gone. Whoever flies is to hear that, not sile
 
 from __future__ import annotations
 
+import os
 import tempfile
 import threading
 from collections.abc import Callable
@@ -34,7 +35,8 @@ def answer_meanwhile(
     Signing times can't be kept either. A packet that is replayed here is refused like any other.
     """
     clock = clock or SystemClock()
-    with tempfile.TemporaryDirectory(prefix="dappled-") as times:
+    runtime = os.environ.get("RUNTIME_DIRECTORY")  # systemd's, in memory: /tmp may lie on the disk that is read-only
+    with tempfile.TemporaryDirectory(prefix="dappled-", dir=runtime) as times:
         links = configured_links(settings, clock, transport, times=Path(times))
         camera = _GroundedCamera(links.sender, settings, reason, clock)
         turn = threading.Event()
