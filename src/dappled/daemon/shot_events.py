@@ -18,7 +18,7 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
-from dappled.findings import text, told
+from dappled.findings import Code, Finding, Subject, finding, text, told
 from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,7 @@ _OF_BODY = 1000  # the working loop takes them fifty times a second
 class ShotEvents(Observer):
     """Observes a live pipeline. `camera` and `utc` are what is known of the camera and of the time.
 
-    `outside` is called last. `misfit` is a sentence where the calibration of `recipe` is not for this camera; "" where
+    `outside` is called last. `misfit` says why the calibration of `recipe` is not for this camera; None where
     it is, or nothing is known of the camera.
     `of_body` is what the plan of the body is compared with, in order; the working loop takes it.
     """
@@ -49,7 +49,7 @@ class ShotEvents(Observer):
         self._recording, self._camera, self._utc = recording, camera, utc
         self._shutter, self._component, self._logbook = shutter, component, logbook
         self._depth, self._recipe, self._outside = depth, recipe, outside
-        self.misfit = ""
+        self.misfit: Finding | None = None
         self.of_body: deque[BodyNews] = deque(maxlen=_OF_BODY)
 
     def settled(self, index: int, ok: bool) -> None:
@@ -118,9 +118,10 @@ class ShotEvents(Observer):
             try:
                 found = calibration_files.misfit(self._recipe, model)
                 # the flight's own copy is read: a pilot on the field has no use for its long name
-                self.misfit = str(told(found.with_facts(file="the calibration"))) if found else ""
+                why = None if found is None else str(told(found.with_facts(file="the calibration")))
             except DappledError as error:
-                self.misfit = str(error)
+                why = str(error)
+            self.misfit = None if why is None else finding(Code.DECODE_MISFIT, Subject("decoding"), why=why)
 
     def _record_camera(self, camera: Identity) -> None:
         """Write down which camera it is: the first one, or another."""

@@ -30,6 +30,7 @@ BODY = BodyReport(True, True, (), (), None, 250, "100%", 100, battery_low=False,
 DARK = finding(Code.FRAME_DARK, FRAME, share=0.001)
 STEPPED = finding(Code.CLOCK_STEPPED, Subject("autopilot"), steps=1, by_s=0.3)
 ELSEWHERE = finding(Code.CARRIERS_HALF_WAY, FRAME)
+MISFIT = finding(Code.DECODE_MISFIT, Subject("decoding"), why="the calibration was made with another mask")
 CABLE = "no file came within 30 s: a cable or a card that is too slow"
 FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
     "lens cap": (
@@ -56,7 +57,7 @@ FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
     "no camera": (Code.CAMERA_ABSENT, {"state": "absent", "reason": "none is on the bus"}),
     "stale calibration": (
         Code.DECODE_MISFIT,
-        {"decoding": DecodingState(True, misfit="the calibration was made with another mask")},
+        {"decoding": DecodingState(True, misfit=MISFIT)},
     ),
     "decode behind": (Code.DECODE_BEHIND, {"items": 3}),
 }

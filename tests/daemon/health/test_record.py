@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Any, cast
 
@@ -40,8 +41,13 @@ SAME_IDS = finding(Code.LINK_SAME_IDS, Subject("link", "x"), source="y", system=
 NORTH = (1.0, 0.0, 0.0, 0.0)
 HERE = Pose("interpolated", 0, None, 0.7, -1.6, 200.0, 20.0, None, NORTH, 0.1, None, None, 9)
 CLOCK = BootClock("timesync", 0, 0, 0.0, 10**5)
+MISFIT = finding(Code.DECODE_MISFIT, Subject("decoding"), why="c.toml was made with another mask")
 ENVELOPE = {"schema": "dappled/health", "version": 1, "flight": "f", "seq": 0, "dropped": 0}
 LINK = LinkStatistics("udpin:127.0.0.1:1", 5, 5, 0, 0, 0, 0, 100 * S, None)
+
+
+def failures(*why: str) -> DecodeFailures:
+    return reduce(DecodeFailures.after, why, DecodeFailures())
 
 
 def record(
@@ -110,12 +116,10 @@ def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: P
         ({"found": [SAME_IDS]}, "sends as 1/100 too"),
         ({"utc_known": False}, "UTC is not known yet"),
         ({"settings": replace(WELL, record=RecordSettings(warn_free_mb=10_000_000))}, "the disk is filling up"),
-        ({"decoding": DecodingState(True, DecodeFailures(1, 1, "dark"))}, "1 frame kept, not decoded: dark"),
-        (
-            {"decoding": DecodingState(True, DecodeFailures(4, 3, "dark"))},
-            "decoding fails: the last 3 frames are kept, not decoded: dark",
-        ),
-        ({"decoding": DecodingState(True, misfit="c.toml was made")}, "frames can't be decoded: c.toml was made"),
+        ({"decoding": DecodingState(True, failures("dark"))}, "1 frame kept, not decoded: dark"),
+        ({"decoding": DecodingState(True, replace(failures(*"dddd"), in_a_row=0))}, "4 frames kept, not decoded: d"),
+        ({"decoding": DecodingState(True, failures("far", "dark", "dark"))}, "the last 3 frames are kept, not decoded"),
+        ({"decoding": DecodingState(True, failures(*"ddd"), MISFIT)}, "frames can't be decoded: c.toml was made"),
         ({"dead": ["mavlink 0"]}, "thread mavlink 0: it has ended: restart dappled"),
         ({"dead": ["capture"]}, "thread capture: it has ended: restart dappled"),
         ({"items": 3}, "decode fell behind by 2 frames, kept in the record"),

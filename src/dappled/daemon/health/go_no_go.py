@@ -11,7 +11,6 @@ GoNoGo = Literal["go", "caution", "no-go"]
 _STATES: Mapping[Level, GoNoGo] = {Level.NOTE: "go", Level.CAUTION: "caution", Level.STOP: "no-go"}
 _WEAK_FIXES = {1: "no fix", 2: "a 2D fix"}  # by GPS_FIX_TYPE; 0, no receiver, may fly by other means
 _SURE_M, _SLOW_CLOCK_MS = 5.0, 50.0
-FAILING = 3  # so many frames in a row that can't be decoded are no accident
 _FRAME_BYTES = 20e6  # of a large one: whether little room is left before a flight has shown its own
 _FEW_FRAMES = 100
 _EARLIEST_UTC_NS = 1_700_000_000 * 10**9  # a machine with a date before 2023 has no clock
@@ -92,9 +91,3 @@ def _decoding(decode: Mapping[str, Any]) -> Iterator[Finding]:
         yield finding(Code.DECODE_OFF, about)
     elif not decode["calibration"]:
         yield finding(Code.DECODE_UNCALIBRATED, about, mask=decode["mask"])
-    if decode["misfit"]:
-        yield finding(Code.DECODE_MISFIT, about, why=decode["misfit"])
-    elif decode["failed_in_a_row"] >= FAILING:
-        yield finding(Code.DECODE_FAILING, about, in_a_row=decode["failed_in_a_row"], why=decode["failure"])
-    elif decode["failed"]:
-        yield finding(Code.DECODE_FAILED, about, frames=decode["failed"], why=decode["failure"])

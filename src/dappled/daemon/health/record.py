@@ -34,13 +34,18 @@ _RECEIVER_MS = 5000.0
 
 @dataclass(frozen=True, slots=True)
 class DecodingState:
-    """Whether frames are decoded in flight, what could not be decoded, why the calibration can't be used ("" where
+    """Whether frames are decoded in flight, what could not be decoded, why the calibration can't be used (None where
     it can), and how the decoded frames were judged."""
 
     running: bool = False
     failures: DecodeFailures = field(default_factory=DecodeFailures)
-    misfit: str = ""
+    misfit: Finding | None = None
     verdicts: VerdictCounts = field(default_factory=VerdictCounts)
+
+    def findings(self) -> list[Finding]:
+        """What was found. Where the calibration can't be used, that none could be decoded says nothing more."""
+        failures = self.failures.findings() if self.misfit is None else [self.misfit]
+        return [*failures, *self.failures.found, *self.verdicts.findings()]
 
     def judged(self) -> dict[str, Any]:
         """The verdicts, as JSON values."""
@@ -171,8 +176,6 @@ def record(
             "running": decoding.running,
             "failed": decoding.failures.count,
             "failed_in_a_row": decoding.failures.in_a_row,
-            "failure": decoding.failures.reason,
-            "misfit": decoding.misfit,
             "judged": decoding.judged(),
         },
     }
@@ -188,8 +191,7 @@ def record(
         *([finding(Code.GIMBAL_UNHEARD, Subject("vehicle"))] if deaf else []),
         *shortages,
         *go_no_go.judge(facts),
-        *decoding.failures.found,
-        *decoding.verdicts.findings(),
+        *decoding.findings(),
     ]
     opened = (standing or StandingFindings()).refresh(now, time.monotonic_ns)
     return facts | {"findings": [one.to_json(time.monotonic_ns) for one in opened]}

@@ -12,7 +12,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dappled import findings
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
@@ -25,22 +24,37 @@ from dappled.daemon.stream.publisher import Stream
 from dappled.drivers.camera import Camera
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import report, sentence
-from dappled.findings import FRAME, Code, Finding
+from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
 
 log = logging.getLogger(__name__)
+_DECODING = Subject("decoding")
+_FAILING = 3  # so many frames in a row that can't be decoded are no accident
 
 
 @dataclass(frozen=True, slots=True)
 class DecodeFailures:
-    """The frames that could not be decoded: all, those since the last one that could, and why the last could not; and
-    what was found of the last decoded one."""
+    """The frames that could not be decoded: how many, how many since the last one that could, and the last of them as
+    a finding (fact `why`); and what was found of the last decoded one."""
 
     count: int = 0
     in_a_row: int = 0
-    reason: str = ""
+    last: Finding | None = None
     found: tuple[Finding, ...] = ()
+
+    def findings(self) -> list[Finding]:
+        """That frames could not be decoded."""
+        if self.last is None:
+            return []
+        if self.in_a_row < _FAILING:
+            return [self.last]
+        return [finding(Code.DECODE_FAILING, _DECODING, in_a_row=self.in_a_row, why=self.last.facts["why"])]
+
+    def after(self, why: str) -> DecodeFailures:
+        """With one more."""
+        last = finding(Code.DECODE_FAILED, _DECODING, frames=self.count + 1, why=why)
+        return replace(self, count=self.count + 1, in_a_row=self.in_a_row + 1, last=last)
 
 
 class Pipeline:
@@ -162,7 +176,7 @@ class Decoding:
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
         law = decoded.decision
-        decided = () if law is None else (findings.finding(Code.DECODE_LAW_DECIDED, FRAME, why=law.sentence),)
+        decided = () if law is None else (finding(Code.DECODE_LAW_DECIDED, FRAME, why=law.sentence),)
         self.failures = replace(self.failures, in_a_row=0, found=(*decoded.doubts, *decided))
         pending.decoded = decoded
         self._unrecorded = decoded.decision or self._unrecorded
@@ -199,8 +213,7 @@ class Decoding:
             pending.verdict = self.judge.count(pending.shot.index, found)
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
-        before = self.failures
-        self.failures = replace(before, count=before.count + 1, in_a_row=before.in_a_row + 1, reason=sentence(error))
+        self.failures = self.failures.after(sentence(error))
         self._unjudged(pending, "it could not be decoded")
         self._ends.leave(pending, "not decoded", sentence(error))
 
