@@ -154,6 +154,7 @@ class Code(StrEnum):
     FRAME_UNREADABLE = "frame.unreadable"
     FRAME_UNSHARP = "frame.unsharp"
     FRAME_VIGNETTED = "frame.vignetted"
+    FRAME_ZOOMED = "frame.zoomed"
     FRAMES_BAD = "frames.bad"
     FRAMES_LENS_MOVED = "frames.lens_moved"
     GIMBAL_UNHEARD = "gimbal.unheard"

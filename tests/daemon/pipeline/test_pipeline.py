@@ -431,7 +431,7 @@ def test_a_zoom_that_changed_is_told(tmp_path: Path) -> None:
             assert index is not None
             one.ended(index)
         told = [text for text in one.events() if text.startswith("zoom")]
-    assert told == ["zoom: the focal length is 24 mm; it was 10 mm at frame 1"]
+    assert told == ["zoom: frame 2: the focal length is 24 mm; it was 10 mm at frame 1"]
 
 
 RIVAL = finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 3), rival=2)

@@ -92,7 +92,7 @@ def _lines(flight: str, proposal: Proposal, picked: Picked | None) -> list[str]:
     if proposal.strangers:
         count = counted(len(proposal.strangers), "file")
         lines.append(f"{count} without a shot in this flight, the first {proposal.strangers[0]}")
-    lines += [f"zoom:        {text}" for text in (picked.zooms if picked else ())]
+    lines += [f"zoom:        {findings.told(one)}" for one in (picked.zooms if picked else ())]
     done = f"{counted(len(proposal.pairs), 'frame')} {'to bring' if picked is None else 'brought'}"
     lines.append(f"{flight}: {done}, {proposal.there_already} already there, {len(proposal.missing)} missing")
     if proposal.doubts:
@@ -119,5 +119,5 @@ def _values(flight: str, proposal: Proposal, picked: Picked | None) -> dict[str,
         "strangers": list(proposal.strangers),
         "there_already": proposal.there_already,
         "camera_clock_minus_utc_s": proposal.offset_s,
-        "zooms": list(picked.zooms) if picked else [],
+        "zooms": codec.plain(picked.zooms) if picked else [],
     }

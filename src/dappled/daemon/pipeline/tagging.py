@@ -16,7 +16,7 @@ from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.errors import DappledError, report, sentence
-from dappled.findings import Finding
+from dappled.findings import Code, Finding, Subject, finding, json_text, told
 from dappled.flight import Frame, Tag
 from dappled.workers import Worker
 
@@ -66,14 +66,15 @@ class Zoom:
     def __init__(self) -> None:
         self._last: tuple[int, float] | None = None
 
-    def look(self, index: int, focal_length_mm: float | None) -> str | None:
-        """A sentence where a frame's focal length differs from that of the last frame that has one."""
+    def look(self, index: int, focal_length_mm: float | None) -> Finding | None:
+        """A finding where a frame's focal length differs from that of the last frame that has one."""
         if focal_length_mm is None:
             return None
         before, self._last = self._last, (index, focal_length_mm)
         if before is None or before[1] == focal_length_mm:
             return None
-        return f"the focal length is {focal_length_mm:g} mm; it was {before[1]:g} mm at frame {before[0]}"
+        frame, (earlier, before_mm) = Subject("frame", index), before
+        return finding(Code.FRAME_ZOOMED, frame, focal_length_mm=focal_length_mm, before_mm=before_mm, before=earlier)
 
 
 def tag(
@@ -157,8 +158,8 @@ class Tagging:
         began = self._clock.monotonic_ns()
         settings = self._settings(frame)
         if zoomed := self._zoom.look(frame.index, settings.focal_length_mm):
-            log.warning("zoom: %s", zoomed)
-            self._ends.note("zoom", zoomed, frame.index)
+            log.warning("zoom: %s", told(zoomed))
+            self._ends.note("zoom", json_text(zoomed), frame.index)
         exposure, pose = self._poses.pose(frame.index, self._expected(pending, settings))
         # The time of a file that may belong to another shot says nothing about the camera's clock.
         if pending.fired and not pending.doubt and (shown := clocks.camera_time(settings.taken)):

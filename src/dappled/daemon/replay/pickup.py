@@ -81,11 +81,11 @@ class Proposal:
 
 @dataclass(frozen=True, slots=True)
 class Picked:
-    """What was picked up. `zooms` are sentences."""
+    """What was picked up. `zooms` are the frames whose focal length is not that of the one before."""
 
     frames: tuple[Frame, ...]
     companions: int
-    zooms: tuple[str, ...]
+    zooms: tuple[Finding, ...]
 
 
 def propose(
@@ -167,7 +167,7 @@ def bring(
     log = folder.telemetry if folder.telemetry.is_file() else None
     telemetry = RecordedTelemetry.flown(settings, log, {}, turns)
     frames: list[Frame] = []
-    zooms: list[str] = []
+    zooms: list[Finding] = []
     companions = 0
     root = flight.resolve().parent  # of the flight itself, whatever link leads to it
     zoom = Zoom()
@@ -201,8 +201,8 @@ def bring(
             ledger.add_tag(tagging.tag(frame, exposure, facts_of, camera=camera, mask=mask, pose=pose, doubt=doubt))
             index.put(IndexEntry(number, folder.name, frame.name, "safe"))
             if zoomed := zoom.look(number, facts_of.focal_length_mm):
-                zooms.append(f"frame {number}: {zoomed}")
-                ledger.add_event("zoom", zoomed, number)
+                zooms.append(zoomed)
+                ledger.add_event("zoom", json_text(zoomed), number)
             frames.append(frame)
             progress(frame.size)
     return Picked(tuple(frames), companions, tuple(zooms))
