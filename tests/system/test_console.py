@@ -556,7 +556,7 @@ def test_what_a_camera_that_is_away_said_last_is_grey_with_its_age(chromium: Bro
     until(page, "document.querySelector('#verdict').dataset.state === 'no-go'")
     assert page.inner_text("#verdict-text") == "the camera is absent"
     assert page.inner_text("#verdict-todo") == "connect it"
-    assert page.inner_text("#verdict-age") == "for 2 min"
+    assert page.inner_text("#verdict-age") == "camera.absent, for 2 min"
     page.screenshot(path=SCREENSHOTS / "camera-away-phone.png")
     for name in ("ISO", "battery"):
         cell = battery.replace("battery", name)

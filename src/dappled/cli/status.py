@@ -144,7 +144,10 @@ def screen(record: Mapping[str, Any]) -> list[str]:
             lines.append(f"{stage['name']:9} {_counts(stage, 'done', 'waiting', 'failed', 'dropped')}")
     found = in_record(record)
     lines.append(f"{state(found).upper() if above_note(found) else ALL_IS_WELL}")
-    lines += [f"{one.level.word:9} {told(one)}{_for(row)}" for one, row in zip(found, record["findings"], strict=True)]
+    lines += [
+        f"{one.level.word:9} {told(one)} [{one.code}]{_for(row)}"
+        for one, row in zip(found, record["findings"], strict=True)
+    ]
     return lines
 
 

@@ -73,10 +73,10 @@ def test_a_fault_is_the_same_code_on_every_face_and_says_what_to_do(tmp_path: Pa
     assert remedy(found)
     assert status.screen(made)[-2:] == [
         "NO-GO" if found.level is Level.STOP else "CAUTION",
-        f"{found.level.word:9} {told(found)}",
+        f"{found.level.word:9} {told(found)} [{code}]",
     ]
     ((said, severity),) = Alarms().lines({"findings": [{**codec.plain(found), "age_s": 60.0}]})
-    assert (said, severity <= mavlink.MAV_SEVERITY_WARNING) == (str(told(found)), True)
+    assert (said, severity <= mavlink.MAV_SEVERITY_WARNING) == (f"{told(found)} [{code}]", True)
     assert f'dappled_finding{{code="{code}"}} {float(found.level)}' in metrics.text(made).decode()
     assert str(told(found)) in health.line(made)
     feed = Feed("ipc://nowhere", "ipc://nobody", Hub(), Studio(None, [1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0]))

@@ -16,6 +16,10 @@ def disk(left_mb: int) -> Finding:
     return finding(Code.DISK_FILLING, Subject("disk"), left_mb=left_mb, least_mb=200)
 
 
+def words(one: Finding) -> str:
+    return f"{told(one)} [{one.code}]"
+
+
 def health(*found: Finding, age_s: float = 60.0) -> dict[str, Any]:
     return {"findings": [{**codec.plain(one), "age_s": age_s} for one in found]}
 
@@ -24,15 +28,15 @@ def test_a_finding_is_told_once_though_its_numbers_change_and_its_end_too() -> N
     alarms = Alarms()
     warning, info = mavlink.MAV_SEVERITY_WARNING, mavlink.MAV_SEVERITY_INFO
     assert alarms.lines(health()) == []
-    assert alarms.lines(health(disk(409))) == [(str(told(disk(409))), warning)]
+    assert alarms.lines(health(disk(409))) == [(words(disk(409)), warning)]
     troubled = [alarms.troubled]
-    assert alarms.lines(health(CAMERA, disk(408))) == [(str(told(CAMERA)), mavlink.MAV_SEVERITY_ERROR)]
+    assert alarms.lines(health(CAMERA, disk(408))) == [(words(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
     troubled += [alarms.troubled]
     assert alarms.lines(health(disk(407))) == [("over: the camera is absent", info)]
     assert alarms.lines(health(disk(406))) == []
     assert alarms.lines(health()) == [("all is well again", info)]
     assert [*troubled, alarms.troubled] == [False, True, False]
-    assert alarms.lines(health(disk(409))) == [(str(told(disk(409))), warning)]
+    assert alarms.lines(health(disk(409))) == [(words(disk(409)), warning)]
 
 
 def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
@@ -41,6 +45,14 @@ def test_a_sentence_goes_in_pieces_and_not_twice_in_ten_seconds() -> None:
     assert len(lines.messages(text, 4, 0)) == 2
     assert lines.messages(text, 4, 9 * 10**9) == []
     assert len(lines.messages(text, 4, 10 * 10**9)) == 2
+
+
+def test_a_sentence_too_long_for_its_pieces_keeps_its_code() -> None:
+    long = finding(Code.CAMERA_ABSENT, Subject("camera"), reason="no bus, " * 50)
+    ((said, severity),) = Alarms().lines(health(long))
+    assert said.endswith("... [camera.absent]")
+    pieces = PilotMessages().messages(said, severity, 0)
+    assert b"".join(one.text.encode().rstrip(b"\0") for one in pieces).decode() == said
 
 
 def test_what_comes_back_at_once_is_told_again() -> None:
@@ -69,7 +81,7 @@ def test_what_becomes_a_stop_is_told_again_and_is_not_over_as_a_caution() -> Non
 def test_what_lasts_is_told_again_when_it_is_asked_for() -> None:
     alarms = Alarms()
     alarms.lines(health(CAMERA))
-    assert alarms.lines(health(CAMERA), again=True) == [(str(told(CAMERA)), mavlink.MAV_SEVERITY_ERROR)]
+    assert alarms.lines(health(CAMERA), again=True) == [(words(CAMERA), mavlink.MAV_SEVERITY_ERROR)]
     assert alarms.lines(health(), again=True) == [("all is well again", mavlink.MAV_SEVERITY_INFO)]
     assert alarms.lines(health(), again=True) == []
 

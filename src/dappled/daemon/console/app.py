@@ -112,7 +112,8 @@ class ConsoleApp:
 
     async def _events(self, _: Request) -> Response:
         feed = self._feed
-        first = [self._about(), feed.state(), *(feed.frame_event(index) for index in feed.frames), {"is": "ready"}]
+        state = feed.state()  # first the verdict; again for what it says of the newest frame
+        first = [self._about(), state, *(feed.frame_event(index) for index in feed.frames), state, {"is": "ready"}]
         if log := await self._log_after(0):
             first.append(log)
         if self._hub.full:

@@ -56,7 +56,7 @@ class Alarms:
         before, new = self._lasting, self._new.among(found, again=again)
         self._lasting = bool(standing) and (before or bool(self._new))
         before_stops, self._stops = self._stops, {one.subject: one for one in found if one.level is Level.STOP}
-        lines = [(str(told(one)), _SEVERITIES[one.level]) for one in new]
+        lines = [(_words(one), _SEVERITIES[one.level]) for one in new]
         if before and not standing:
             return [("all is well again", mavlink.MAV_SEVERITY_INFO)]
         ended = [
@@ -101,6 +101,13 @@ class GroundStations:
             return False
         self._due_ns = None
         return True
+
+
+def _words(one: Finding) -> str:
+    """What was found and what to do, cut so that the code behind it has room."""
+    words, code = str(told(one)), f" [{one.code}]"
+    most = LONGEST_BYTES - 1 - len(code)
+    return (words if len(words) <= most else words[: most - 3] + "...") + code
 
 
 def _pieces(text: str, severity: int, number: int) -> list[MavlinkMessage]:

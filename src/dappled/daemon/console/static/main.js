@@ -67,7 +67,7 @@ function showState({ health, findings, verdict, area = null, frames_left: frames
 function showFindings(findings, stale = false) {
   lastFindings = findings;
   const state = (one) => (stale ? "unknown" : one.state);
-  const item = (one) => element("li", { "data-state": state(one), "data-code": one.code }, mark(state(one)), element("span", {}, told(one)), element("small", {}, ageWords(one.age_s)));
+  const item = (one) => element("li", { "data-state": state(one), "data-code": one.code }, mark(state(one)), element("span", {}, told(one), " ", element("code", {}, one.code)), element("small", {}, ageWords(one.age_s)));
   $("checks").replaceChildren(...findings.map(item));
 }
 
@@ -104,7 +104,7 @@ function showVerdict(verdict, findings) {
   $("verdict-word").textContent = VERDICTS[verdict];
   $("verdict-text").textContent = worst ? worst.text : "all is well";
   $("verdict-todo").textContent = worst ? worst.todo : "";
-  $("verdict-age").textContent = worst ? `for ${ageWords(worst.age_s)}${others.length ? `, and ${others.length} more below` : ""}` : "";
+  $("verdict-age").textContent = worst ? `${worst.code}, for ${ageWords(worst.age_s)}${others.length ? `, and ${others.length} more below` : ""}` : "";
 }
 
 // What a photographer looks at, of the body as it is now; what is not known is "unknown", and never 0.
