@@ -24,7 +24,7 @@ from dappled.daemon.navigation import ExposureTime
 from dappled.decode.geometry import Pose, Vector3, metres_per_radian, multiply, turn_rad
 from dappled.drivers.mavlink import MavlinkMessage, mavlink, pack
 from dappled.flight import Shot
-from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
+from dappled.mocks.autopilot.autopilot import BootTime, heartbeat, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 
@@ -40,6 +40,10 @@ FILES_S = 2.2  # where files are late: a USB download, in which later shots are 
 GLITCH_M = 33.0
 BUSY_NS = 150_000_000  # the next photograph can't be begun sooner: several requests come at once where a link held them
 SILENCE_S = 11.0  # longer than the answers of the autopilot that are compared
+DEAD_S = 0.5, 12.0  # how long an autopilot that has crashed is silent
+BLIND_S = 10.0  # from then on it has neither a place nor UTC
+NUMBERS_NS = 3 * 10**9  # so long a missing number is waited for
+DOWN_S = 1.0, 6.0  # until the daemon is back after a crash
 WAIT_NS = round(PoseSettings().wait_ms * 1e6)
 VEHICLE = (1, 1)
 STATIONS = ((255, 190), (254, 190))
@@ -91,7 +95,8 @@ class Tagged:
 
 @dataclass(slots=True)
 class Outcome:
-    """What a cell gave. `heard` are triggers and requests of which the camera got at least one message."""
+    """What a cell gave. `heard` are triggers and requests of which the camera got at least one message; `missed` those
+    of which it got none because there was no daemon, `unfinished` shots that a crash left without a tag."""
 
     requests: int = 0
     heard: int = 0
@@ -100,6 +105,8 @@ class Outcome:
     triggers: int = 0
     named: int = 0
     refused: int = 0
+    missed: int = 0
+    unfinished: int = 0
     tags: list[Tagged] = field(default_factory=list)
 
 
@@ -131,7 +138,7 @@ class World:
         self.outside = self.cameras[self.own].wiring == "wire"
         self.triggers = CameraTriggers(personality, self.cameras)
         self.found = Outcome()
-        self.daemon = Daemon(outside=self.outside, camera=self.own, send=self._asked_time, fired=self._fired)
+        self.daemon = self._started(None)
         self.of_burst = {0.2: 1, 1.0: 2, 5.0: 3}[cell.hz]
         self.faults = cell.faults
         self.lead_s = LEAD_S + (SILENCE_S if "silence" in self.faults else 0.0)
@@ -150,11 +157,20 @@ class World:
         self._stamps: set[int] = set()
         self._boots = self._requests = 0
         self._down: list[tuple[int, int]] = []
+        self._dead: list[tuple[int, int]] = []  # when the autopilot does nothing
+        self._deaf: list[tuple[int, int]] = []  # when there is no daemon
+        self._gone: list[Daemon] = []  # which have crashed
+        self._unheard: set[tuple[int, int]] = set()  # triggers that no daemon may have heard of
+        self._blind_ns = 0  # until when the autopilot knows no place
         self._held: list[tuple[int, int]] = []
         self._free_ns = 0
         self.glitch_s = math.inf, math.inf
         self._now_ns = START_NS
         self._plan()
+
+    def _started(self, before: Daemon | None) -> Daemon:
+        """A daemon, perhaps the next one after a crash."""
+        return Daemon(outside=self.outside, camera=self.own, send=self._asked_time, fired=self._fired, before=before)
 
     # time
 
@@ -186,6 +202,7 @@ class World:
                 boot_s = offset_s + at_s + 0.2
                 jumps.append((at_s + 0.2, 3.0 - boot_s - sum(by for _, by in jumps)))
                 self._at(at_s + 0.2, self._reboot)
+            jumps += self._crashes(burst, at_s, BootTime(offset_s, drift, tuple(jumps)))
             if "link down" in faults and burst % 5 == 2 and not edge:
                 lost_s = rng.choice(shots_s)
                 self._down.append((_utc_ns(lost_s - 0.05), _utc_ns(lost_s + 0.12)))
@@ -208,6 +225,21 @@ class World:
         if silent:
             self._down.append((_utc_ns(at_s), _utc_ns(shots_s[0] - rng.uniform(0.05, 0.8))))
 
+    def _crashes(self, burst: int, at_s: float, boot: BootTime) -> Iterator[tuple[float, float]]:
+        """The crashes of one burst; the step of the clock where the autopilot starts again."""
+        if "autopilot crashes" in self.faults and burst == self.bursts // 2:
+            back_s = at_s + 0.2 + self.rng.uniform(*DEAD_S)
+            self._dead.append((_utc_ns(at_s + 0.2), _utc_ns(back_s)))
+            self._blind_ns = _utc_ns(back_s + BLIND_S)
+            self._at(back_s, self._reboot)
+            yield back_s, self.rng.uniform(0.5, 3.0) - boot.ns(back_s) / 1e9
+        if "daemon crashes" in self.faults and burst == self.bursts * 3 // 4:
+            crash_s = self.rng.uniform(at_s, at_s + self.burst_s)
+            back_s = crash_s + self.rng.uniform(*DOWN_S)
+            self._deaf.append((_utc_ns(crash_s), _utc_ns(back_s)))
+            self._at(crash_s, self._crash)
+            self._at(back_s, self._restart)
+
     def _at(self, t_s: float, do: Callable[[], None]) -> None:
         heapq.heappush(self._events, (_utc_ns(t_s), next(self._order), do))
 
@@ -217,26 +249,33 @@ class World:
 
     def run(self) -> Outcome:
         """Fly to the end."""
-        heartbeat = (
-            mavlink.MAV_AUTOPILOT_PX4 if self.triggers.personality == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-        )
         self._now_ns = START_NS
-        self._deliver([mavlink.MAVLink_heartbeat_message(2, heartbeat, 0, 0, 4, 3)], sure=True)
+        self._heartbeat()
         while self._events:
             self._now_ns, _, do = heapq.heappop(self._events)
             self.daemon.clock.advance_to(self._now_ns)
             do()
         assert not self._pending
-        found, shots = self.found, self.daemon.shutter.statistics()
-        found.shots, found.refused, found.named = shots.shots, shots.refused, self.daemon.named
-        found.requests, found.heard = self._requests, len(self._heard)
-        return found
+        self._gone.append(self.daemon)
+        shots = [one.shutter.statistics() for one in self._gone]
+        self.found.shots, self.found.refused = sum(one.shots for one in shots), sum(one.refused for one in shots)
+        self.found.named = sum(one.named for one in self._gone)
+        self.found.missed = len(self._unheard - self._heard)
+        self.found.requests, self.found.heard = self._requests, len(self._heard)
+        return self.found
+
+    def _heartbeat(self) -> None:
+        self._deliver([heartbeat(armed=False, personality=self.triggers.personality)], sure=True)
 
     def _boot_us(self, t_s: float | None = None) -> int:
         return self.boot.ns(self.now_s if t_s is None else t_s) // 1000
 
+    @property
+    def _blind(self) -> bool:
+        return bool(self._dead) and self._dead[0][1] <= self._now_ns < self._blind_ns
+
     def _unix_us(self) -> int:
-        return 0 if "no satellites" in self.faults else self._now_ns // 1000 + GPS_MINUS_UTC_US
+        return 0 if "no satellites" in self.faults or self._blind else self._now_ns // 1000 + GPS_MINUS_UTC_US
 
     # the link
 
@@ -252,7 +291,7 @@ class World:
         faults, edge_s = self.faults, self.burst_s
         middle = WARM_UP_S + edge_s < self.now_s < self.end_s - 4 - edge_s
         for message in messages:
-            if any(begin <= self._now_ns < end for begin, end in self._down):
+            if self._within(self._down) or (self._within(self._dead) and who == VEHICLE):
                 continue
             for link in (0, 1) if "two ports" in faults else (0,):
                 if "one packet of ten lost" in faults and middle and not sure and self.rng.random() < 0.1:
@@ -265,7 +304,8 @@ class World:
                 self._arrives(delay_s, link, message, raw)
                 if "every packet twice" in faults:
                     self._arrives(delay_s + 0.01, link, message, raw)
-                self._note_heard(message, request)
+                if not self._within(self._deaf, self._now_ns + round(delay_s * 1e9)):
+                    self._note_heard(message, request)
 
     def _hold_s(self, delay_s: float) -> float:
         """How much longer a link holds what would have come so much later than now. It keeps the order."""
@@ -275,8 +315,16 @@ class World:
                 return (end - there_ns) / 1e9 + (there_ns - begin) / 1e12
         return 0.0
 
+    def _within(self, spans: Sequence[tuple[int, int]], at_ns: int | None = None) -> bool:
+        """Whether an instant (now) is in one of them."""
+        return any(begin <= (self._now_ns if at_ns is None else at_ns) < end for begin, end in spans)
+
     def _arrives(self, delay_s: float, link: int, message: MavlinkMessage, raw: bytes) -> None:
-        self._at(self.now_s + delay_s, lambda: self.daemon.receive(link, message, raw))
+        def receive() -> None:
+            if not self._within(self._deaf):
+                self.daemon.receive(link, message, raw)
+
+        self._at(self.now_s + delay_s, receive)
 
     def _note_heard(self, message: MavlinkMessage, request: int) -> None:
         kind = message.get_type()
@@ -320,7 +368,10 @@ class World:
             )
             numbers = [mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION, mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT]
             if step % 5 == 0:
-                numbers += [mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_SYSTEM_TIME]
+                numbers += [mavlink.MAVLINK_MSG_ID_SYSTEM_TIME]
+                numbers += [] if self._blind else [mavlink.MAVLINK_MSG_ID_GPS_RAW_INT]
+            if self._blind:
+                seen = replace(seen, latitude_deg=0.0, longitude_deg=0.0)
             self._deliver(telemetry_message(number, seen, boot_ns, self._unix_us()) for number in numbers)
             if step % 5 == 0 and self.triggers.personality == "px4":
                 self._deliver([_odometry(boot_ns // 1000)])
@@ -331,8 +382,21 @@ class World:
         self.triggers = CameraTriggers(self.triggers.personality, self.cameras)
         self._boots += 1
 
+    def _crash(self) -> None:
+        """The daemon dies: what it had in hand is left to recovery."""
+        self.found.unfinished += len(self._pending)
+        self._pending.clear()
+
+    def _restart(self) -> None:
+        """It comes back, and knows what its ledger has."""
+        self._gone.append(self.daemon)
+        self.daemon = self._started(self.daemon)
+        self._heartbeat()
+
     def _act(self) -> None:
         """One photograph is asked for: by the mission, or by a ground station that sends to all components."""
+        if self._within(self._dead):
+            return
         self._requests += 1
         number = self._requests
         if "stations broadcast" in self.faults:
@@ -355,6 +419,8 @@ class World:
         else:
             made = self.triggers.command(command, self._boot_us(), self._unix_us())
         self.found.triggers += 1
+        if any(begin - NUMBERS_NS <= self._now_ns < end for begin, end in self._deaf):
+            self._unheard.add((self._boots, self.triggers.images[self.own]) if self.outside else (-1, number))
         self._deliver(made, request=number)
         if self.outside:
             self._expose((self._boots, self.triggers.images[self.own]), self.triggers)
@@ -397,6 +463,8 @@ class World:
     # tags
 
     def _tick(self) -> None:
+        if self._within(self._deaf):
+            return
         self.daemon.component.tick()
         for pending in list(self._pending):
             shot, expected, boot = pending

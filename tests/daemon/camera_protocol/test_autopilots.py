@@ -193,18 +193,52 @@ def test_what_another_camera_repeats_before_any_clock_is_known_is_no_shot(unix_u
 
 
 def test_an_autopilot_without_time_that_starts_again_begins_its_numbers_again() -> None:
-    """The first of its messages is lost: the second may be a repeated one and is told with it, the third is a shot."""
+    """The first of its messages is lost and told; the second one and the third are shots."""
     rig = rig_of(fires=False)
     for missed, boot_s in ((0, 300.0), (1, 3.0)):
         autopilot = CameraTriggers(cameras=(CameraPort("wire"),))
+        rig.clock.advance(3)
         fly(rig, boot_s, 1.0)
         for number in range(3):
             rig.clock.advance(1)
             messages = autopilot.trigger(BOOT_US + number * 10**6)
             hear(rig, messages if number >= missed else [])
     rig.tick(4)
-    assert len(rig.fired) == 4
-    assert named(rig) == [(1, 2)]
+    assert len(rig.fired) == 5
+    assert named(rig) == [(1, 1)]
+
+
+def test_triggers_of_a_new_start_that_seemed_old_before_it_was_certain_are_told_as_lost() -> None:
+    """Without satellites, and the first ones were lost on the link: no number is above the last start's yet."""
+    rig = rig_of(fires=False)
+    for boot_s, seen in ((300.0, range(1, 10)), (3.0, range(3, 5))):
+        autopilot = CameraTriggers(cameras=(CameraPort("wire"),))
+        rig.clock.advance(3)
+        fly(rig, boot_s, 0.2)
+        for number in range(1, 10):
+            messages = autopilot.trigger(BOOT_US + number * 10**6)
+            hear(rig, messages if number in seen else [])
+            rig.clock.advance(0.01)
+        fly(rig, boot_s + 0.3, 1.0)
+    assert rig.autopilot.restarts == 1
+    hear(rig, autopilot.trigger(BOOT_US + 10 * 10**6))
+    rig.tick(4)
+    assert len(rig.fired) == 10
+    assert [number for first, last in named(rig) for number in range(first, last + 1)] == list(range(1, 10))
+
+
+def test_a_contact_of_a_new_start_is_a_shot_before_anything_else_shows_it() -> None:
+    """Its number had another time before."""
+    rig = rig_of(fires=False)
+    for boot_s in (300.0, 3.0):
+        autopilot = CameraTriggers(cameras=(CameraPort("wire", pin=True),))
+        for number in range(2):
+            at_us = round((boot_s + number) * 1e6)
+            hear(rig, [*autopilot.trigger(at_us), *autopilot.contact(at_us)])
+            fly(rig, boot_s + number, 0.4)
+        rig.clock.advance(3)
+    rig.tick(4)
+    assert (len(rig.fired), named(rig)) == (4, [])
 
 
 @pytest.mark.parametrize("personality", ["ardupilot", "px4"])
@@ -355,6 +389,7 @@ def test_losses_around_a_restart_of_the_autopilot_are_told() -> None:
     for number in (9, 10, 14):
         rig.clock.advance(0.1)
         hear(rig, [asked(number)])
+    rig.clock.advance(2)
     fly(rig, 2.0, 0.7)
     rig.clock.advance(1)
     hear(rig, [asked(3)])

@@ -11,6 +11,7 @@ from dappled.daemon.navigation.samples import CAPTURED, image_number, sent_us
 from dappled.drivers.mavlink import MavlinkMessage
 
 _CONTACT_NS = 2 * 10**9  # no body takes longer from the trigger to the contact
+_TIMES = 256
 _IMAGES = 2**16  # img_idx has 16 bits
 
 
@@ -22,8 +23,11 @@ class CameraFeedback:
         self._autopilot, self._clock = autopilot, clock
         self._cam_idx, self._makes_shots = cam_idx, makes_shots
         self._last: int | None = None
+        self._last_ns = 0
+        self._unclear: deque[tuple[int, int]] = deque(maxlen=64)  # no time, no newer number: of the next start, perhaps
         self._restarts = autopilot.restarts
         self._stamps: deque[int] = deque(maxlen=64)
+        self._times: dict[int, int] = {}  # of the last images
         self._captured: deque[tuple[int, int]] = deque(maxlen=64)
         self._triggered: deque[int] = deque(maxlen=64)  # CAMERA_TRIGGERs whose CAMERA_IMAGE_CAPTURED has not come yet
 
@@ -61,19 +65,24 @@ class CameraFeedback:
         """
         if feedback.cam_idx != self._cam_idx:
             return False
-        if self._restarts != self._autopilot.restarts:
-            self._restarts, self._last = self._autopilot.restarts, None
+        self._follow_restarts(where)
+        now_ns = self._clock.monotonic_ns()
         time_us, image, known = int(feedback.time_usec), int(feedback.img_idx), self._last
         newer = image == 1 and known != 1
         if known is not None:
             newer = newer or 0 < (image - known) % _IMAGES < _IMAGES // 2
         if known is None or newer:
-            self._last = image
+            self._last, self._last_ns = image, now_ns
         if time_us in self._stamps:
             return False
         if time_us:
             self._stamps.append(time_us)
+        if self._begins_anew(image, time_us):
+            self._last, self._last_ns = image, now_ns
+            return True
         stale = self._autopilot.is_stale(time_us) if time_us else None
+        if stale is not False and (stale or not newer) and image != known:
+            self._unclear.append((image, now_ns))
         why = ""
         if stale and newer and known is not None:
             why = "reported more than 5 s late"
@@ -81,5 +90,31 @@ class CameraFeedback:
             why = "the first report heard, without a time that is known: perhaps another camera's"
         if why and self._makes_shots:
             numbers = self._autopilot.numbers["CAMERA_FEEDBACK"]
-            numbers.late(image, self._clock.monotonic_ns(), lambda: f"{why}, {where()}")
+            numbers.late(image, now_ns, lambda: f"{why}, {where()}")
         return newer if stale is None else not stale
+
+    def _begins_anew(self, image: int, time_us: int) -> bool:
+        """Whether it has an earlier time than this number had: the autopilot has started again."""
+        anew = 0 < time_us < self._times.get(image, 0)
+        if anew:
+            self._times.clear()
+        if time_us:
+            self._times[image] = time_us
+            if len(self._times) > _TIMES:
+                del self._times[next(iter(self._times))]
+        return anew
+
+    def _follow_restarts(self, where: Callable[[], str]) -> None:
+        """Where the autopilot has started again its numbers began at 1 then, and some may have come before that was
+        certain: those that seemed no newer are triggers that are lost."""
+        if self._restarts == self._autopilot.restarts:
+            return
+        self._restarts, since_ns = self._autopilot.restarts, self._autopilot.restarted_ns
+        if self._last is None or self._last_ns <= since_ns:
+            self._last = 0
+        numbers, now_ns = self._autopilot.numbers["CAMERA_FEEDBACK"], self._clock.monotonic_ns()
+        for image, heard_ns in self._unclear:
+            if heard_ns >= since_ns and image > self._last and self._makes_shots:
+                numbers.late(image, now_ns, lambda: f"reported while the autopilot started again, {where()}")
+                self._last = image
+        self._unclear.clear()

@@ -243,7 +243,8 @@ class _ShownClock:
         self._first: tuple[int, int] = 0, 0  # of those in doubt
 
     def heard(self, time_us: int, now_ns: int) -> int | None:
-        """Take a time. Where the clock has certainly gone back by now: since when."""
+        """Take a time. Where the clock has certainly gone back by now: when it began anew, as it says itself, but after
+        the last time of before."""
         shown = self._shown
         if shown is None or shown[0] - STALE_US <= time_us <= _runs_to(shown, now_ns) + STALE_US:
             self._shown, self._doubted = (time_us, now_ns), None
@@ -256,7 +257,7 @@ class _ShownClock:
         if now_ns - since_ns < (CONFIRM_NS if certain else STEADY_NS):
             return None
         self._shown, self._doubted = self._doubted, None
-        return since_ns if time_us < shown[0] else None
+        return max(shown[1], since_ns - first_us * 1000) if time_us < shown[0] else None
 
     def is_about(self, time_us: int, now_ns: int) -> bool | None:
         """Whether a time is within `STALE_US` of now, perhaps one of 32 bits; None where the clock is not known."""
@@ -474,7 +475,7 @@ class OwnAutopilot:
         self._cam_idx, self._named = cam_idx, NamedComponent(cam_idx, links.component_id)
         self._now, self._battery = AutopilotNow(), BatteryReports()
         self.numbers = {kind: TriggerNumbers() for kind in ("CAMERA_FEEDBACK", "CAMERA_TRIGGER", CAPTURED)}
-        self.restarts = 0  # of the autopilot, so far: its numbers begin again
+        self.restarts = self.restarted_ns = 0  # of the autopilot, so far: its numbers began again then (monotonic)
 
     def fired_by(self, system_id: int) -> None:
         """The autopilot of this system has fired this very camera: of several, it may be the camera's own."""
@@ -494,7 +495,7 @@ class OwnAutopilot:
         if message.get_type() == "PARAM_VALUE" and message.get_srcComponent() == 1:
             self._named.heard(message)
         if since_ns is not None:
-            self.restarts += 1
+            self.restarts, self.restarted_ns = self.restarts + 1, since_ns
             for numbers in self.numbers.values():
                 numbers.restart(since_ns)
 
@@ -507,7 +508,10 @@ class OwnAutopilot:
     def is_stale(self, time_us: int) -> bool | None:
         """Whether a time of the autopilot's, in microseconds since boot (perhaps of 32 bits) or of UTC, is not about
         now: more than `STALE_US` ago, or ahead. None where its clock is not known yet."""
-        return self._now.is_stale(time_us, self._clock.monotonic_ns())
+        stale = self._now.is_stale(time_us, self._clock.monotonic_ns())
+        if stale is None and abs(self._clock.utc_ns() // 1000 - time_us) <= STALE_US:
+            return False  # this machine's clock says so
+        return stale
 
     def findings(self) -> list[Finding]:
         """What of its telemetry comes too seldom to interpolate poses; that it fires another component than ours."""

@@ -16,7 +16,7 @@ from dappled.daemon.navigation.clocks import (
     from_arrivals,
     from_few,
     from_timesync,
-    step_ns,
+    stepped_since,
 )
 from dappled.daemon.navigation.excerpts import between, latest
 from dappled.daemon.navigation.samples import Epoch, Sample, prune
@@ -32,7 +32,7 @@ _KNOWN_NS = 500_000_000  # a clock at another rate steps sooner, by what the ans
 _TOLD_NS = 20_000_000  # a step that doesn't matter to a frame: σ contains it
 _ANSWERS_COME_NS = 10**9
 _SILENT_NS = 10 * 10**9  # an autopilot that has answered within this time shows its steps by its answers
-_LOOKED_AT = 64  # answers: more than come in the ten seconds that `step_ns` looks back
+_LOOKED_AT = 64  # answers: more than come in the ten seconds that `stepped_since` looks back
 _FEW = 3
 _FitKey = tuple[str | int, ...]  # what a fit was made from: its kind, the epoch's first packet, the last packets
 
@@ -91,13 +91,14 @@ class AutopilotTime:
                 self._step(Epoch(number, before_ns, stamp_ns, -by_ns), -by_ns)
         return True
 
-    def _step(self, epoch: Epoch, by_ns: int) -> None:
-        """Begin an epoch. The autopilot's UTC didn't step with its clock: SYSTEM_TIME says so a second later."""
+    def _step(self, epoch: Epoch, by_ns: int, uncertain_ns: int = 0) -> None:
+        """Begin an epoch. The autopilot's UTC didn't step with its clock: SYSTEM_TIME says so a second later, and until
+        then the step does, as far as it is known."""
         self._epochs.append(epoch)
         old_ns = next((offset for stamp_ns, offset in reversed(self._unix) if stamp_ns <= epoch.before_ns), None)
         now_ns = self.unix_minus_boot_ns
         if old_ns is not None and now_ns is not None and abs(now_ns - old_ns) < abs(by_ns) / 2:
-            self.unix_minus_boot_ns = old_ns + by_ns
+            self.unix_minus_boot_ns = old_ns + by_ns if uncertain_ns < _TOLD_NS else None
 
     def first(self, limit: int) -> int:
         """The packet number at which the epoch began that was current below `limit`."""
@@ -188,9 +189,10 @@ class AutopilotTime:
             return False  # from before or after a reboot that the telemetry has yet to show
         del self._requests[message.ts1]  # the same answer on a second link is not a second observation
         known = between(self._answers[-_LOOKED_AT:], self._epochs[-1].number, number)
-        by_ns = step_ns(known, answer)
-        if by_ns is not None:
-            self._step(Epoch(number, known[-1].stamp_ns, stamp_ns, by_ns), by_ns)
+        old = stepped_since(known, answer)
+        if old is not None:
+            by_ns = answer.offset_ns - old.offset_ns
+            self._step(Epoch(number, old.stamp_ns, stamp_ns, by_ns), by_ns, (old.delay_ns + answer.delay_ns) // 2)
         self._answers.append(answer)
         return False
 

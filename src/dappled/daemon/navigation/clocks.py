@@ -238,9 +238,9 @@ def from_few(answers: Sequence[TimesyncAnswer]) -> BootClock:
     return BootClock("timesync", best.boot_ns, best.offset_ns, 0.0, sigma_ns)
 
 
-def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> int | None:
-    """By how much UTC − boot time has changed since the last of `answers`, where a steady clock can't give `new`; else
-    None.
+def stepped_since(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> TimesyncAnswer | None:
+    """The last of `answers` after which the clock has stepped, as a steady one can't give both it and `new`; else None.
+    Later ones took so long that they may be from before the step or after it.
 
     An answer is wrong by at most half its round trip, so two differ by at most half of both, plus what crystals and
     a machine clock under correction (0.06 %) can drift in between. Answers of the last ten seconds count, and the
@@ -252,7 +252,7 @@ def step_ns(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> int | Non
             break
         most_ns = (old.delay_ns + new.delay_ns) / 2 + _STEADY * apart_ns + _STEP_FLOOR_NS
         if abs(new.offset_ns - old.offset_ns) > most_ns:
-            return new.offset_ns - answers[-1].offset_ns
+            return old
     return None
 
 

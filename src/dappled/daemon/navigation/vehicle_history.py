@@ -351,8 +351,8 @@ class VehicleHistory:
         if found is None:
             return
         told = self._feedbacks[-_REPEATS:]
-        if any((one.kind, one.time_us) == (found.kind, found.time_us) and one.image != found.image for one in told):
-            return  # the report of another camera repeats this one's last time, with the number of a trigger to come
+        if any((one.kind, one.time_us) == (found.kind, found.time_us) for one in told):
+            return  # a copy, or another camera's report: this one's last time, with the number of a trigger to come
         self.counts.feedbacks += 1
         self.counts.marks += mark
         keep(self._feedbacks, found)
