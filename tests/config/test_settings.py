@@ -32,12 +32,12 @@ def test_empty_file_is_a_whole_configuration(tmp_path: Path) -> None:
         ("[camera]\n\nprot = 3", "test.toml, line 3: [camera] prot is not a known key; did you mean 'port'?"),
         ("[camra]\n", "test.toml, line 1: camra is not a known table; did you mean [camera]?"),
         ("camera = 3", "must be a table"),
-        ("[camera]\nport = 3", "line 2: [camera] port = 3 must be text in quotes"),
+        ("[camera]\nport = 3", "line 2: [camera] port must be text, not 3"),
         ("[camera]\nmax_pending = true", "must be a whole number"),
         ("[camera]\nmax_pending = 0", "must lie between 1 and 1000"),
-        ("[camera]\nlatency_ms = nan", "must lie between 0 and 5000 ms"),
+        ("[camera]\nlatency_ms = nan", "must be a finite number"),
         ("[camera]\ncapture_target = 'tape'", "must be one of card, ram"),
-        ("[mavlink]\nurl = [1]", "must be text in quotes"),
+        ("[mavlink]\nurl = [1]", "[mavlink] url[0] must be text"),
         ("[decode]\nlaw = 'ohm'", "must be one of"),
     ],
 )
@@ -83,7 +83,7 @@ def test_missing_and_broken_files_are_named(tmp_path: Path) -> None:
         ("[mavlink]\ncomponent_id = " + "1" * 5000, "more than 20 digits"),
         ("[mavlink]\ncomponent_id = " + "1" * 26, "beyond 64 bits"),
         ("[camera]\nport = '" + "a" * 5_000_000 + "'", "longer than 4.19 MB"),
-        ("[mavlink]\nurl = [[" + "1, " * 100_000 + "]]", "must be text in quotes"),
+        ("[mavlink]\nurl = [[" + "1, " * 100_000 + "]]", "must be text"),
     ],
 )
 def test_hostile_files_are_named_in_a_short_sentence(tmp_path: Path, text: str, words: str) -> None:

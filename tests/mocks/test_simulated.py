@@ -11,11 +11,11 @@ from dappled.mocks import simulated
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"seed": "one"}, "camera.options: seed = 'one' must be a whole number"),
+        ({"seed": "one"}, "camera.options: seed must be a whole number, not 'one'"),
         ({"seed": -1}, "seed = -1 must lie between 0"),
         ({"scale": 0}, "scale = 0.0 must lie between 0.01 and 4"),
         ({"law": "fish"}, "law = 'fish' must be one of geometric, fd"),
-        ({"folder": 7}, "folder = 7 must be text"),
+        ({"folder": 7}, "folder must be text, not 7"),
         ({"f_numbr": 8}, "f_numbr"),
     ],
 )

@@ -126,8 +126,8 @@ class MaskProfile:
 class _CameraTable:
     law: str = setting("fd", "carrier law", choices=tuple(LAWS))
     mask_distance_mm: float = setting(1.0, "mask to sensor", unit="mm", low=1e-3, high=100)
-    raw: tuple[dict, ...] = setting((), "raw shapes")  # type: ignore[type-arg]  # each is built from a table of its own
-    lens: tuple[dict, ...] = setting((), "calibrated lenses")  # type: ignore[type-arg]  # likewise
+    raw: tuple[dict[str, Any], ...] = setting((), "raw shapes")  # each is built from a table of its own
+    lens: tuple[dict[str, Any], ...] = setting((), "calibrated lenses")
     description: str = setting("", "one line")
     models: tuple[str, ...] = setting((), "model names as EXIF and libgphoto2 write them")
     focal_length_mm: tuple[float, float] | None = setting(None, "shortest and longest", unit="mm", low=0.1, high=10_000)
@@ -135,7 +135,7 @@ class _CameraTable:
         None, "nearest that a mask can be mounted to the sensor: its cover glass", unit="mm", low=0, high=100
     )
     f_number: tuple[float, float] | None = setting(None, "widest and narrowest stop of the lens", low=0.5, high=256)
-    verdict: dict | None = setting(None, "bounds for frames")  # type: ignore[type-arg]  # noqa: RUF009  # likewise
+    verdict: dict[str, Any] | None = setting(None, "bounds for frames")  # noqa: RUF009  the default is None
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,8 +7,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from dappled import codec
 from dappled.bounds.claims import ClaimError
@@ -149,42 +148,24 @@ def examine(
             continue
         rule = field.metadata.get("rule", Rule(""))
         try:
-            values[key] = _convert(table[key], hints[key], rule, f"{source.where(name, key)}")
+            values[key] = _read(table[key], hints[key], rule, source.where(name, key))
         except ConfigError as error:
             findings.append(BadSetting(name, key, str(error)))
     return cls(**values), findings
 
 
-def _convert(value: Any, wanted: Any, rule: Rule, where: str) -> Any:
-    origin, arguments = get_origin(wanted), get_args(wanted)
-    if origin in (Union, UnionType):
-        inner = [a for a in arguments if a is not type(None)]
-        return _convert(value, inner[0], rule, where)
-    if origin is tuple:
-        return _convert_tuple(value, arguments, rule, where)
-    if wanted is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-        raise ConfigError(f"{where} = {codec.shown(value)} must be {_kind(wanted)}")
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        unit = f" {rule.unit}" if rule.unit else ""
-        if not math.isfinite(value) or not rule.low <= value <= rule.high:
-            raise ConfigError(f"{where} = {value} must lie between {rule.low:g} and {rule.high:g}{unit}")
-    if rule.choices and value not in rule.choices:
-        raise ConfigError(f"{where} = {codec.shown(value)} must be one of {', '.join(rule.choices)}")
-    return value
-
-
-def _convert_tuple(value: Any, arguments: tuple[Any, ...], rule: Rule, where: str) -> tuple[Any, ...]:
-    values = value if isinstance(value, list) else [value]
-    if arguments[-1] is Ellipsis:
-        return tuple(_convert(v, arguments[0], rule, where) for v in values)
-    if len(values) != len(arguments):
-        raise ConfigError(f"{where} = {codec.shown(value)} must be a list of {len(arguments)} values")
-    return tuple(_convert(v, a, rule, where) for v, a in zip(values, arguments, strict=True))
-
-
-def _kind(wanted: type) -> str:
-    return {str: "text in quotes", int: "a whole number", float: "a number", bool: "true or false"}.get(
-        wanted, wanted.__name__
-    )
+def _read(value: Any, wanted: Any, rule: Rule, where: str) -> Any:
+    """A setting's value; one that may be a list may stand alone. Raises ConfigError."""
+    if not isinstance(value, list) and any(get_origin(one) is tuple for one in (wanted, *get_args(wanted))):
+        value = [value]
+    try:
+        made = codec.read(wanted, value)
+    except codec.CodecError as error:
+        raise ConfigError(f"{where}{error}" if error.place.startswith("[") else f"{where} {error}") from None
+    for one in made if isinstance(made, tuple) else (made,):
+        if isinstance(one, int | float) and not isinstance(one, bool) and not rule.low <= one <= rule.high:
+            unit = f" {rule.unit}" if rule.unit else ""
+            raise ConfigError(f"{where} = {one} must lie between {rule.low:g} and {rule.high:g}{unit}")
+        if rule.choices and one not in rule.choices:
+            raise ConfigError(f"{where} = {codec.shown(one)} must be one of {', '.join(rule.choices)}")
+    return made

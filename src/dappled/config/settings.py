@@ -39,7 +39,7 @@ class CameraSettings:
     pickup: str = setting(
         "", "Where fujifilm and folder get the files from: later, storage, a libgphoto2 port, or a folder"
     )
-    options: dict | None = setting(None, "A table of the driver's own options")  # type: ignore[type-arg]  # noqa: RUF009  the field's default is None; the driver checks what is in it
+    options: dict[str, Any] | None = setting(None, "A table of the driver's own options")  # noqa: RUF009  the default is None; the driver checks them
     latency_ms: float = setting(
         60.0, "Time from the trigger call to the start of the exposure", unit="ms", low=0, high=5000
     )
