@@ -38,6 +38,7 @@ from dappled.drivers.gphoto2.protocol import (
     FileAdded,
     HeldError,
     LostError,
+    NotOnBusError,
     RefusedError,
     SessionError,
     SettingTurned,
@@ -260,6 +261,28 @@ def test_absent_camera_is_looked_for_until_it_comes(harness: Harness) -> None:
     harness.fire(1)
     assert "nothing here" in failures(harness.turn())[1]
     assert states(harness.turn(1.1, steps=1)) == []  # the same state isn't sent twice
+    assert states(harness.turn(1.1)) == [("ready", "")]
+
+
+def test_a_camera_is_looked_for_when_the_bus_changes_and_else_rarely(harness: Harness) -> None:
+    """Each look loads all of libgphoto2's drivers."""
+    nodes = [0]
+    loop = CameraLoop(
+        harness.loop_channel, GPhoto2Settings(), harness.camera.open, harness.clock, bus=lambda: tuple(nodes)
+    )
+    harness.loop, camera = loop, harness.camera
+    camera.errors["open"] = [NotOnBusError("no camera is on USB") for _ in range(4)]
+    harness.turn(steps=1)
+    assert states(harness.turn(1.1)) == states(harness.turn(1.1)) == []
+    assert len(camera.policies) == 1
+    nodes.append(1)
+    harness.turn(1.1)
+    assert len(camera.policies) == 2
+    harness.turn(20.0)  # what the bus doesn't tell
+    assert len(camera.policies) == 3
+    camera.errors["open"] = [AbsentError("no camera answers at usb:001,002")]  # one that is there, and may answer yet
+    nodes.append(2)
+    harness.turn(1.1)
     assert states(harness.turn(1.1)) == [("ready", "")]
 
 

@@ -38,12 +38,13 @@ from dappled.drivers.gphoto2.protocol import (
     CaptureComplete,
     FileAdded,
     LostError,
+    NotOnBusError,
     RefusedError,
     Session,
     SessionError,
     SettingTurned,
 )
-from dappled.drivers.gphoto2.session import open_session
+from dappled.drivers.gphoto2.session import bus_nodes, open_session
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.gphoto2.state import CameraState
 from dappled.drivers.gphoto2.viewfinder import Viewfinder
@@ -52,6 +53,8 @@ from dappled.shown import guard_output
 _POLL_BUSY_S = 0.005
 _POLL_IDLE_S = 0.3
 _REOPEN_S = 0.25
+_SURE_NS = 15 * 10**9
+"""Looking for a camera loads all of libgphoto2's drivers: so often where the bus is as it was when there was none."""
 _LAST_TRIES = 3
 _HEAD_BYTES = 65536
 _QUIET_S = 5.0
@@ -68,7 +71,10 @@ class CameraLoop:
         open_camera: Callable[[GPhoto2Settings, str | None], Session] = open_session,
         clock: Clock | None = None,
         carryover: Carryover | None = None,
+        *,
+        bus: Callable[[], object] = bus_nodes,
     ) -> None:
+        """`bus` tells what is on USB: while that is the same, a camera that was not there is rarely looked for."""
         self._channel = channel
         self._settings = settings
         self._open_camera = open_camera
@@ -78,7 +84,9 @@ class CameraLoop:
         self._viewfinder = Viewfinder(channel)
         self._session: Session | None = None
         self._keeps_files = settings.capture_target == "card"
-        self._open_at_ns = 0
+        self._open_at_ns = self._sure_until_ns = 0
+        self._bus = bus if "ptpip:" not in (settings.port or "") else object  # a network doesn't tell: never the same
+        self._bus_then = self._bus()
 
     def run(self) -> None:
         """Step until a stop command comes, or until the parent is gone (ChannelError)."""
@@ -235,6 +243,11 @@ class CameraLoop:
 
     def _open(self, *, quiet: bool = False) -> None:
         """Open the camera. `quiet`: it was there just now; if it can't be opened, that is said of the next attempt."""
+        bus, now_ns = self._bus(), self._now_ns()
+        if self._is_away and bus == self._bus_then and now_ns < self._sure_until_ns:
+            self._open_at_ns = now_ns + round(self._settings.timeouts.retry_s * 1e9)
+            return
+        self._bus_then, self._sure_until_ns = bus, 0
         if self._sender.state is None:
             self._send_state("starting")
         try:
@@ -245,6 +258,8 @@ class CameraLoop:
                 self._open_at_ns = self._now_ns() + round(_REOPEN_S * 1e9)
                 return
             self._open_at_ns = self._now_ns() + round(self._settings.timeouts.retry_s * 1e9)
+            if isinstance(error, NotOnBusError):
+                self._sure_until_ns = self._now_ns() + _SURE_NS
             self._send_state("absent" if isinstance(error, AbsentError) else "faulted", str(error))
             return
         self._session, self._keeps_files = session, session.keeps_files

@@ -21,6 +21,10 @@ class AbsentError(SessionError):
     """No camera to open."""
 
 
+class NotOnBusError(AbsentError):
+    """It will not be there before something changes on the USB bus."""
+
+
 class HeldError(SessionError):
     """The camera is there and can't be opened."""
 
