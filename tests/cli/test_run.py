@@ -153,6 +153,16 @@ def test_time_that_runs_out_before_the_frames_is_a_failure(config: Path, capsys:
     assert "0 shots" in capsys.readouterr().err
 
 
+@pytest.mark.slow
+def test_a_flight_without_a_mask_loads_nothing_that_decodes(config: Path) -> None:
+    """It takes a small computer seconds, in which there is no camera."""
+    code = f"import sys; from dappled.cli import main; main(['run', '--config', {str(config)!r}, '--for', '0'])"
+    done = subprocess.run(
+        [sys.executable, "-c", code + "; print(*sys.modules)"], capture_output=True, text=True, timeout=100, check=True
+    )
+    assert not {"scipy", "dappled.drivers.raw.darkroom"} & set(done.stdout.split())
+
+
 def _grounded(config: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The reasons that a service of these settings answers on its links with, until it is ended."""
     reasons: list[str] = []

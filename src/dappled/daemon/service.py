@@ -60,7 +60,7 @@ from dappled.drivers.camera import Camera
 from dappled.drivers.gnss.port import gnss_port
 from dappled.drivers.gnss.recorded import TelemetryNotebook
 from dappled.drivers.mavlink import Transport
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report, sentence

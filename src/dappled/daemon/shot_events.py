@@ -15,8 +15,7 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink import mavlink
-from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError, report
 from dappled.findings import Code, Finding, Subject, finding, text, told
 from dappled.flight import Recording
@@ -115,6 +114,8 @@ class ShotEvents(Observer):
     def _judge_calibration(self, model: str) -> None:
         """Whether the calibration is for this camera. Its mask and law were judged before the flight began."""
         if self._recipe is not None:
+            from dappled.drivers.raw import calibration_files  # noqa: PLC0415  # what decodes loads SciPy
+
             try:
                 found = calibration_files.misfit(self._recipe, model)
                 # the flight's own copy is read: a pilot on the field has no use for its long name

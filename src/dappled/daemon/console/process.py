@@ -21,7 +21,7 @@ from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
 from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess
 from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel, RestartBudget
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from typing import Any
 from dappled import durable
 from dappled.config import profiles
 from dappled.config.settings import Settings
-from dappled.drivers.raw.darkroom import FILES, FOLDER, Darkroom, Recipe, camera_name, of_flight
+from dappled.drivers.raw.recipe import FILES, FOLDER, Recipe, camera_name, of_flight
 from dappled.errors import DappledError
 
 __all__ = ["FOLDER", "Names", "called", "keep", "names", "of_flight", "recipe", "versions"]
@@ -40,6 +40,8 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
     names = called(settings)
     if not settings.decode.enabled or not settings.mask.profile:
         return names, None
+    from dappled.drivers.raw.darkroom import Darkroom  # noqa: PLC0415  # SciPy takes a small computer seconds
+
     made = Recipe(
         camera=settings.camera.profile,
         mask=settings.mask.profile,

@@ -13,8 +13,8 @@ from dappled.daemon.stream.publisher import Stream
 from dappled.daemon.stream.wire import frame_header
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.raw.raw_file import ExposureSettings
+from dappled.drivers.raw.recipe import camera_name
 from dappled.errors import DappledError, report, sentence
 from dappled.findings import Code, Finding, Subject, finding, json_text, told
 from dappled.flight import Frame, Tag

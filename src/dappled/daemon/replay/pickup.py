@@ -24,8 +24,8 @@ from dappled.daemon.pipeline.tagging import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.drivers.camera import CameraError
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import camera_name
 from dappled.drivers.raw.raw_file import read_exif
+from dappled.drivers.raw.recipe import camera_name
 from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups

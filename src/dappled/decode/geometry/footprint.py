@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 _A_M, _E2 = 6378137.0, 0.00669437999014  # WGS 84
 _STEEPEST = 0.2  # the least share of a ray's length that points down: 78° from straight down
@@ -67,6 +66,8 @@ def rectify(frame: OrientedFrame, picture: NDArray[np.uint8], longest_side: int)
     at_x = (camera[..., 0] / ahead * frame.focal_length_mm / frame.size_mm[1] + 0.5) * width - 0.5
     at_y = (camera[..., 1] / ahead * frame.focal_length_mm / frame.size_mm[0] + 0.5) * height - 0.5
     inside = (camera[..., 2] > 0) & (at_x > -0.5) & (at_x < width - 0.5) & (at_y > -0.5) & (at_y < height - 0.5)
+    from scipy import ndimage  # noqa: PLC0415  # the daemon draws no pictures: loading it takes a small computer seconds
+
     grey = ndimage.map_coordinates(picture, [at_y, at_x], order=1, mode="nearest")
     rgba = np.repeat(grey[..., None], 4, axis=2)
     rgba[..., 3] = np.where(inside, 255, 0)

@@ -37,7 +37,7 @@ from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check_report
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, exposure, not_linear, shares_of_white
 from dappled.drivers.raw.reading import RawFile
-from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, of_flight
+from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, camera_name, of_flight
 from dappled.errors import DappledError
 from dappled.findings import Finding, Subject, told
 
@@ -72,14 +72,6 @@ def override(raw: RawFile, recipe: Recipe) -> RawFile:
 
 
 @lru_cache(maxsize=64)  # each frame asks, and finding a model reads every profile
-def camera_name(camera: str, model: str | None) -> str:
-    """Return what a camera is called: its profile, by name or by model; else the model, or "unknown"."""
-    if camera != "auto":
-        return Path(camera).stem if camera.endswith(".toml") else camera
-    found = profiles.camera_for_model(model or "")
-    return found.name if found else model or "unknown"
-
-
 def camera_profile(recipe: Recipe, model: str) -> CameraProfile:
     """Return the camera's profile: the recipe's, or by model. Raises DappledError where no profile knows the model."""
     if recipe.camera != "auto":
@@ -108,7 +100,6 @@ __all__ = [
     "DecodeResult",
     "LawDecision",
     "Recipe",
-    "camera_name",
     "known_to",
     "of_flight",
 ]

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled import codec, confined
+from dappled.config import profiles
 from dappled.decode.optics import LAWS
 from dappled.errors import DappledError
 
@@ -110,3 +111,11 @@ def _kept_profile(profile: str, folder: Path, kind: str) -> str:
 def _inside(folder: Path, name: str) -> Path:
     """A file of the flight's own inputs. Raises OutsideError where a link leads out of them."""
     return confined.path(folder.parent, f"{folder.name}/{name}", f"the flight {folder.parent}")
+
+
+def camera_name(camera: str, model: str | None) -> str:
+    """Return what a camera is called: its profile, by name or by model; else the model, or "unknown"."""
+    if camera != "auto":
+        return Path(camera).stem if camera.endswith(".toml") else camera
+    found = profiles.camera_for_model(model or "")
+    return found.name if found else model or "unknown"
