@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from tests.machine.uml import HERE, Machine, Station, copy, own_network, station
 ROOT = Path(__file__).parents[2]
 PACKAGED = ("src", "systemd", "tools/deb.py", "tools/install.py", "requirements-onboard.lock")
 SIZE = 2_000_000
+FLIGHTS = "/var/lib/dappled/flights"
 
 
 @pytest.fixture(scope="session")
@@ -44,7 +45,7 @@ def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     subprocess.run([str(word) for word in make], check=True, stdout=sys.stderr)
     (package,) = folder.glob("*.deb")
     with own_network():
-        machine = Machine(built, copy(built / "disk", folder / "disk"), folder / "console")
+        machine = Machine(built, [copy(built / "disk", folder / "disk")], folder / "console")
         try:
             machine.start()
             machine.put("/root/dappled.deb", package.read_bytes())
@@ -64,11 +65,11 @@ class Scene:
     def __init__(self, machine: Machine, body: SimulatedBody, station: Station) -> None:
         self.machine, self.body, self.station = machine, body, station
 
-    def configure(self, more: str = "") -> None:
-        """Settings of the service; those of the links and the camera are given."""
+    def configure(self, port: str = "", more: str = "") -> None:
+        """Settings of the service; those of the links and the camera are given. `port`: not over PTP/IP."""
         settings = (
-            f'[camera]\nport = "{self.body.port}"\nfile_timeout_s = 120\n[mavlink]\nurl = "udpout:{HERE}:14550"\n'
-            f'[record]\ndirectory = "/var/lib/dappled/flights"\n{more}'
+            f'[camera]\nport = "{port or self.body.port}"\nfile_timeout_s = 120\n'
+            f'[mavlink]\nurl = "udpout:{HERE}:14550"\n[record]\ndirectory = "{FLIGHTS}"\n{more}'
         )
         self.machine.put("/etc/dappled/dappled.toml", settings.encode())
 
@@ -80,18 +81,47 @@ class Scene:
             timeout_s=240,
         )
 
+    def shown(self, name: str) -> str:
+        """A property of the service."""
+        return self.machine.run(f"systemctl show -P {name} dappled").strip()
+
+    def frames(self) -> dict[int, str]:
+        """The hash of each shot's frame, of all flights."""
+        listed = self.machine.run(f"cd {FLIGHTS} && sha256sum */frames/*.cr2 2>/dev/null || true").split()
+        return {
+            int(name.rpartition("/")[2].partition(".")[0]): found
+            for found, name in zip(listed[::2], listed[1::2], strict=True)
+        }
+
 
 @pytest.fixture
 def scene(built: Path, installed: Path, tmp_path: Path) -> Iterator[Callable[..., Scene]]:
-    """Makes the scene: a machine with so much memory that is on, a body, and a station."""
+    """Makes the scene: a machine with so much memory that is on, a body, and a station. `disks`: it has these, too."""
     with ExitStack() as stack:
         stack.enter_context(own_network())
 
-        def made(memory_mb: int = 1024, body: BodyOptions | None = None) -> Scene:
-            machine = Machine(built, copy(installed, tmp_path / "disk"), tmp_path / "console", memory_mb)
+        def made(
+            memory_mb: int = 1024, body: BodyOptions | None = None, disks: Sequence[Path] = (), usb: Path | None = None
+        ) -> Scene:
+            root = f"{tmp_path / 'written'},{installed}"
+            machine = Machine(built, [root, *disks], tmp_path / "console", memory_mb, usb)
             stack.callback(machine.cut)
             machine.start()
             options = body or BodyOptions(picture=f"pattern:{SIZE}:cr2", bind=HERE)
             return Scene(machine, stack.enter_context(SimulatedBody.start(options)), stack.enter_context(station()))
 
         yield made
+
+
+_ROWS: list[tuple[str, str]] = []
+
+
+@pytest.fixture
+def table() -> Callable[[str, object], None]:
+    """Enters a line in the table that is printed in the end: what was measured, and the value."""
+    return lambda what, value: _ROWS.append((what, str(value)))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    for what, value in _ROWS:
+        terminalreporter.write_line(f"{what:<60} {value}")

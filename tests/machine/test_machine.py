@@ -13,20 +13,6 @@ from tests.machine.conftest import SIZE, Scene
 
 pytestmark = [pytest.mark.long, pytest.mark.machine, pytest.mark.alone, pytest.mark.timeout(3600)]
 Make = Callable[..., Scene]
-FLIGHTS = "/var/lib/dappled/flights"
-
-
-def shown(scene: Scene, name: str) -> str:
-    return scene.machine.run(f"systemctl show -P {name} dappled").strip()
-
-
-def frames(scene: Scene) -> dict[int, str]:
-    """The hash of each shot's frame, of all flights."""
-    listed = scene.machine.run(f"cd {FLIGHTS} && sha256sum */frames/*.cr2 2>/dev/null || true").split()
-    return {
-        int(name.rpartition("/")[2].partition(".")[0]): found
-        for found, name in zip(listed[::2], listed[1::2], strict=True)
-    }
 
 
 def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
@@ -40,11 +26,11 @@ def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
     for _ in range(20):
         flown.station.shoot()
     pictures = {hashlib.sha256(pattern(number, SIZE)).hexdigest() for number in range(1, 21)}
-    assert set(frames(flown).values()) == pictures
-    assert sorted(frames(flown)) == sorted(flown.station.captured) == list(range(20))
+    assert set(flown.frames().values()) == pictures
+    assert sorted(flown.frames()) == sorted(flown.station.captured) == list(range(20))
     said = flown.machine.run("systemd-analyze security dappled --no-pager | tail -n 2")
     assert float(said.split("dappled.service: ")[1].split()[0]) <= 1.5
-    assert shown(flown, "NRestarts") == "0"
+    assert flown.shown("NRestarts") == "0"
     doctor = flown.machine.run("dappled doctor --config /etc/dappled/dappled.toml 2>&1 || true")
     assert "of user dappled runs here" in doctor
     assert "holds" not in doctor  # its own camera process is nobody who is in the way
@@ -56,8 +42,8 @@ def test_half_a_gigabyte_of_memory_records_every_frame(scene: Make) -> None:
     flown.begin()
     for _ in range(60):
         flown.station.shoot()
-    assert len(frames(flown)) == len(flown.station.captured) == 60
-    assert shown(flown, "NRestarts") == "0"
+    assert len(flown.frames()) == len(flown.station.captured) == 60
+    assert flown.shown("NRestarts") == "0"
 
 
 def test_a_read_only_root_leaves_a_camera_that_answers_and_says_why(scene: Make) -> None:
@@ -68,4 +54,4 @@ def test_a_read_only_root_leaves_a_camera_that_answers_and_says_why(scene: Make)
     flown.station.until(lambda it: any("NO PHOTOGRAPHS" in text for text in it.texts), "why there is none")
     flown.station.request()
     flown.station.until(lambda it: it.refused_s, "a refusal")
-    assert shown(flown, "NRestarts") == "0"
+    assert flown.shown("NRestarts") == "0"

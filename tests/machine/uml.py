@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import random
 import signal
 import socket
+import struct
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ HERE, THERE = "192.168.77.1", "192.168.77.2"
 STATION_PORT = 14550
 _CLONE_NEWNET = 0x40000000
 _BOOT_S = 240.0
+_MARK = b"mark"
+_PAGE = 4096  # what flash writes as a whole, and a block of ext4
 
 
 @contextlib.contextmanager
@@ -43,22 +47,29 @@ def own_network() -> Iterator[None]:
 
 
 class Machine:
-    """One machine. `built` is the folder that tools/machine/build.py made, `disk` what it starts from."""
+    """One machine. `built` is the folder that tools/machine/build.py made; `disks` are /dev/ubda, /dev/ubdb …: files,
+    or "WRITTEN,FILE" where FILE is not to be changed. The second one has a volatile write cache."""
 
-    def __init__(self, built: Path, disk: Path, log: Path, memory_mb: int = 1024) -> None:
-        self._built, self._disk, self._log, self._memory_mb = built, disk, log, memory_mb
+    def __init__(
+        self, built: Path, disks: Sequence[str | Path], log: Path, memory_mb: int = 1024, usb: Path | None = None
+    ) -> None:
+        self._built, self._disks, self._log, self._memory_mb = built, disks, log, memory_mb
+        self._kernel = (usb or built) / "linux"
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self) -> float:
         """Switch it on; seconds until its shell answers."""
         assert self._process is None or self._process.poll() is not None, "it is on, and holds its disk"
         began = time.monotonic()
-        words = f"mem={self._memory_mb}M ubd0={self._disk} root=/dev/ubda rw con=null con0=null,fd:1 ssl=null"
+        words = f"mem={self._memory_mb}M root=/dev/ubda rw con=null con0=null,fd:1 ssl=null eth0=tuntap,tap0"
+        disks = [f"ubd{number}={disk}" for number, disk in enumerate(self._disks)]
+        here = {"LD_PRELOAD": str(self._built / "before_libc.so"), "TMPDIR": "/dev/shm"}
+        if len(self._disks) > 1:
+            here["CACHED"] = str(self._disks[1])
         with open(self._log, "ab") as log:
             self._process = subprocess.Popen(
-                [self._built / "linux", *words.split(), "eth0=tuntap,tap0"],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-                env={**os.environ, "LD_PRELOAD": str(self._built / "xstate.so"), "TMPDIR": "/dev/shm"},
+                [self._kernel, *words.split(), *disks],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **here},
             )  # fmt: skip
         while time.monotonic() < began + _BOOT_S:
             with contextlib.suppress(subprocess.SubprocessError):
@@ -85,11 +96,53 @@ class Machine:
         return ["ssh", *there, command]
 
     def cut(self) -> None:
-        """Pull its plug."""
+        """Pull its plug. What was in its root disk's cache is not lost."""
         if self._process is not None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait(30)
+
+    @contextlib.contextmanager
+    def halted(self) -> Iterator[None]:
+        """Not one step of it and none of its disks is done meanwhile."""
+        assert self._process is not None
+        # The kernel, and its thread for disks, which is a process; those of the guest are traced by it, and wait.
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()
+        own = [pid for pid in children if "TracerPid:\t0\n" in Path(f"/proc/{pid}/status").read_text()]
+        stopped = [self._process.pid, *map(int, own)]
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            while not all(
+                Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T" for pid in stopped
+            ):
+                time.sleep(0.001)  # a call of the kernel is finished first
+            yield
+        finally:
+            for pid in stopped:
+                with contextlib.suppress(ProcessLookupError):  # its plug was pulled
+                    os.kill(pid, signal.SIGCONT)
+
+    def as_cut(self, to: Path, chance: random.Random) -> None:
+        """Copy the second disk as it would be had the plug been pulled now: of each page that its cache holds it
+        depends on chance whether it is written."""
+        disk = Path(self._disks[1])
+        copy(disk, to)
+        earlier = disk.with_name(disk.name + ".before").read_bytes()
+        lost = chance.choice((0.0, 0.5, 1.0))
+        done: dict[int, bool] = {}
+        with open(to, "r+b") as file:
+            at = 0
+            while at < len(earlier):  # the first record about a page is what a flush had brought to the disk
+                offset, size = struct.unpack_from("<QQ", earlier, at)
+                at += 16
+                for page in range(offset, offset + size, _PAGE):
+                    if page not in done:
+                        done[page] = chance.random() < lost
+                        if done[page]:
+                            file.seek(page)
+                            file.write(earlier[at + page - offset : at + min(page - offset + _PAGE, size)])
+                at += size
 
     def off(self) -> None:
         """Switch it off in order."""
@@ -124,7 +177,7 @@ class Station:
         self._mav.robust_parsing = True
         self._peer: tuple[str, int] | None = None
         self._lock = threading.Condition()
-        self._sequence = 0
+        self._sequence = self._marks = 0
         self._ended = threading.Event()
         self._loop = Loop("station", self._hear, self._ended)
         self._loop.start()
@@ -137,12 +190,16 @@ class Station:
     def _hear(self) -> None:
         while not self._ended.is_set():
             try:
-                data, self._peer = self._socket.recvfrom(2048)
+                data, peer = self._socket.recvfrom(2048)
             except TimeoutError:
                 continue
             with self._lock:
-                for message in self._mav.parse_buffer(data) or ():
-                    self._take(message)
+                if data == _MARK:
+                    self._marks += 1
+                else:
+                    self._peer = peer
+                    for message in self._mav.parse_buffer(data) or ():
+                        self._take(message)
                 self._lock.notify_all()
 
     def _take(self, message: Any) -> None:
@@ -162,6 +219,12 @@ class Station:
     def until(self, found: Any, what: str, timeout_s: float = 120) -> None:
         with self._lock:
             assert self._lock.wait_for(lambda: found(self), timeout_s), f"{what}: {self}"
+
+    def catch_up(self) -> None:
+        """Return when all that was sent by now has been heard."""
+        marks = self._marks
+        self._socket.sendto(_MARK, (HERE, STATION_PORT))
+        self.until(lambda it: it._marks > marks, "its own mark")
 
     def request(self) -> None:
         """Ask for one photograph, and don't wait."""
