@@ -91,7 +91,14 @@ def _refused(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str])
     return told
 
 
-@pytest.mark.parametrize("pattern", [_fence, _chain_link, _cloth, _halftone, _halftone_near_the_mask, _screen])
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        _fence,
+        _halftone_near_the_mask,
+        *(pytest.param(one, marks=pytest.mark.slow) for one in (_chain_link, _cloth, _halftone, _screen)),
+    ],
+)
 def test_a_period_of_the_scene_is_no_light_field(
     pattern: Callable[[Grid], Grid], bare: Grid, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -141,8 +141,11 @@ LONG: list[tuple[Left, int]] = [
 ]
 
 
-def test_a_power_cut_at_some_steps_loses_nothing_acknowledged(calls: list[Call], folder: Path) -> None:
-    assert cut_everywhere(calls, folder / "flights", folder / "left", SHORT, each=29) > 20
+@pytest.mark.parametrize(("each", "least"), [(79, 7), pytest.param(29, 20, marks=pytest.mark.slow)])
+def test_a_power_cut_at_some_steps_loses_nothing_acknowledged(
+    calls: list[Call], folder: Path, each: int, least: int
+) -> None:
+    assert cut_everywhere(calls, folder / "flights", folder / "left", SHORT, each=each) > least
 
 
 @pytest.mark.long

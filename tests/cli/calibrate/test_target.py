@@ -65,18 +65,22 @@ def test_frames_of_several_zooms_are_no_targets(folder: Path, tmp_path: Path, mo
         from_frames(recipe, [folder / "2.dng", folder / "6.dng"], [2.0, 6.0])
 
 
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        (["--target", "2"], "give --target one distance per frame"),
-        pytest.param(["--target", "6", "2"], "in the order of the frames", marks=pytest.mark.slow),
-    ],
-)
-def test_wrong_targets_are_told(
-    folder: Path, more: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_targets_without_a_distance_each_are_told_before_a_frame_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    frames = [tmp_path / f"{metres}.dng" for metres in (2, 6)]
+    for frame in frames:
+        frame.touch()
+    words = [*map(str, frames), "--mask", "reference-5x5", "-o", str(tmp_path / "m.toml")]
+    assert main(["calibrate", *words, "--target", "2"]) == 1
+    assert "give --target one distance per frame" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == frames
+
+
+@pytest.mark.slow
+def test_targets_in_another_order_are_told(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     frames = [str(folder / f"{metres}.dng") for metres in (2, 6)]
     with_mask = ["--mask", "reference-5x5", "--calibration", str(folder / "c.toml"), "-o", str(tmp_path / "m.toml")]
-    assert main(["calibrate", *frames, *more, *with_mask]) == 1
-    assert words in capsys.readouterr().err
+    assert main(["calibrate", *frames, "--target", "6", "2", *with_mask]) == 1
+    assert "in the order of the frames" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -401,7 +401,11 @@ def test_beside_a_log_with_triggers_one_without_is_of_a_start_in_which_none_was_
 
 @pytest.mark.parametrize(  # both readers run in processes of their own, which take their time to begin
     ("kind", "count"),
-    [("bin", 8), ("ulg", 8), *(pytest.param(kind, 150, marks=pytest.mark.long) for kind in ("bin", "ulg"))],
+    [
+        ("bin", 3),
+        ("ulg", 3),
+        *(pytest.param(kind, 150, marks=pytest.mark.long) for kind in ("bin", "ulg")),
+    ],
 )
 def test_a_damaged_log_is_read_or_refused(
     tmp_path: Path, kind: str, count: int, capsys: pytest.CaptureFixture[str]

@@ -51,7 +51,7 @@ def _holds(shot: Shot) -> bool:
         ("mask-1", CANON, 11.0, "white"),
         pytest.param("mask-3-octave", FUJI, 8.0, "texture", marks=pytest.mark.slow),
         pytest.param("mask-4-linear", FUJI, 16.0, "boards", marks=pytest.mark.slow),
-        ("mask-2-full", CANON, 22.0, "boards"),
+        pytest.param("mask-2-full", CANON, 22.0, "boards", marks=pytest.mark.slow),
     ],
 )
 def test_a_mask_of_the_thesis_is_found_behind_a_round_stop(name: str, body: Body, f_number: float, scene: str) -> None:

@@ -19,7 +19,7 @@ from tests.flight.makers import deliver, held, mavlink_2, request, tag, words_of
 from tests.standing import STRAY, failure
 
 SEED = 20261122
-EDITS = 50
+EDITS, MANY_EDITS = 12, 50
 WORDS = ("of the chain", "chain lacks", "since dappled wrote it", "other than dappled")
 
 
@@ -98,11 +98,12 @@ def test_a_flight_with_rows_in_every_table_is_intact(recorded: FlightFolder) -> 
     assert words_of(report.problems) == ()
 
 
+@pytest.mark.parametrize("edits", [EDITS, pytest.param(MANY_EDITS, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("table", [*KEYS, "chain"])
-def test_each_edit_of_a_row_is_named(recorded: FlightFolder, table: str) -> None:
+def test_each_edit_of_a_row_is_named(recorded: FlightFolder, table: str, edits: int) -> None:
     chosen = random.Random(f"{SEED} {table}")  # noqa: S311  chances, not secrets
     unseen, before = [], recorded.ledger.read_bytes()
-    for _ in range(EDITS):
+    for _ in range(edits):
         recorded.ledger.write_bytes(before)
         with attacked(recorded) as db:
             done = edit(db, table, chosen)
