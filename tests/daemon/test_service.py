@@ -87,7 +87,7 @@ def test_a_wish_goes_to_the_end_and_can_be_looked_up_in_the_next_flight(camera: 
     assert flight_check.check(service.folder).intact
     assert camera.stopped
     after = started(settings, shots)
-    found = after._control.lookup(0)
+    found = after.parts.control.lookup(0)
     assert found is not None
     assert (found.ok, found.url) == (True, "frames/000000.dng")
     assert after.request(CaptureRequest("test", "console", 1)).index == 1
@@ -99,7 +99,7 @@ def test_triggers_lost_in_the_last_seconds_of_a_flight_are_in_its_ledger(
 ) -> None:
     """They wait 2.5 s for a second link; the flight ended before, and the counts agreed."""
     service = started(settings, [])
-    numbers = service._autopilot.numbers["CAMERA_FEEDBACK"]
+    numbers = service.parts.autopilot.numbers["CAMERA_FEEDBACK"]
     for number in (10, 14):
         numbers.heard(number, service._clock.monotonic_ns(), lambda: "noticed here")
     service.stop()
@@ -115,8 +115,8 @@ def test_an_old_flight_that_was_moved_away_is_unknown(camera: FakeCamera, settin
     first.stop()
     second = started(settings, shots)
     first.folder.rename(first.folder.parent.parent / "moved")
-    assert second._control.lookup(0) is None
-    assert second._control.lookup(99) is None
+    assert second.parts.control.lookup(0) is None
+    assert second.parts.control.lookup(99) is None
     second.stop()
 
 
@@ -157,7 +157,7 @@ def test_too_little_memory_refuses_in_words_as_long_as_that_is_fresh(
     service = started(settings, [])
     with monkeypatch.context() as small:
         small.setattr(resources, "look", lambda: resources.ResourcesLeft(500, 10**7))
-        service._control.look()
+        service.parts.control.look()
     decision = service.request(CaptureRequest("test", "console", 1))
     said = "too little memory is left for a photograph: 10 MB; end other programs"
     assert decision.words == f"no photo: {said}"
@@ -188,7 +188,7 @@ def test_a_flight_that_closes_badly_is_kept(
 
 def test_without_a_mask_decoding_is_off(camera: FakeCamera, settings: Settings) -> None:
     service = started(settings, [])
-    assert not service._shots.decoding
+    assert not service.parts.shots.decoding
     service.stop()
 
 
@@ -236,7 +236,7 @@ def test_a_believed_clock_that_the_satellites_contradict_is_a_problem(camera: Fa
     service = started(replace(settings, record=replace(settings.record, utc="system")), [])
     try:
         assert "clock" not in "".join(problems(service.health()))
-        service.navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
+        service.parts.navigation.utc.look(UtcCorrection(-3600 * 10**9, 10**7, "SYSTEM_TIME"))
         assert "this machine's clock is +3600 s away" in "".join(problems(service.health()))
     finally:
         service.stop()
@@ -248,10 +248,10 @@ def test_another_component_with_our_ids_is_a_problem(
     """Two daemons of which one forgot its component id: the pilot and the health record name where it sends from."""
     service = started(replace(settings, mavlink=replace(settings.mavlink, url=("udpin:127.0.0.1:0",))), [])
     try:
-        service._autopilot.identity.settled = True  # as after three seconds
+        service.parts.autopilot.identity.settled = True  # as after three seconds
         said = list[str]()
-        monkeypatch.setattr(service.component, "say", lambda text, *_, **__: said.append(text))
-        with Peer(service.links.port(0), 1, settings.mavlink.component_id) as twin:
+        monkeypatch.setattr(service.parts.component, "say", lambda text, *_, **__: said.append(text))
+        with Peer(service.parts.links.port(0), 1, settings.mavlink.component_id) as twin:
             twin.packer.seq = 200
             twin.heartbeat()
             eventually(lambda: "sends as 1/100 too, which is this camera" in stepped(service), "the other camera")
@@ -271,12 +271,12 @@ def test_a_lens_that_was_zoomed_between_two_frames_is_told(
         service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")
         (pending,) = shots
-        component, said = service.component, list[str]()
+        component, said = service.parts.component, list[str]()
         assert pending.tag is not None
         monkeypatch.setattr(component, "say", lambda text, *_, **__: said.append(text))
         for length_mm in (35.0, None, 35.0, 55.0):
             pending.tag = replace(pending.tag, focal_length_mm=length_mm)
-            service._events.tagged(pending)
+            service.parts.events.tagged(pending)
         assert said == ["image 0 was zoomed from 35 to 55 mm: is it calibrated?"]
     finally:
         service.stop()
@@ -304,7 +304,7 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
     service = Service(settings, observer=CallingObserver(finished=shots.append), after=after)
     service.start()
     eventually(lambda: service.health()["camera"]["state"] == "ready", "the camera is ready")
-    parameters = service._parameters
+    parameters = service.parts.parameters
     camera.script = lambda _: []
     assert service.request(CaptureRequest("test", "console", 1)).index == 0
     with pytest.raises(CameraError, match="1 shot under way"):
@@ -313,15 +313,15 @@ def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, set
         assert not isinstance(event, Exception)
         camera.say(event)
     eventually(lambda: shots, "the shot's end")
-    service.shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
+    service.parts.shutter.start_interval(CaptureRequest("test", "console", 2), 3600, 0)
     camera.script = good
     with pytest.raises(CameraError, match="stop the interval first"):
         parameters.change("LF_MASK", "mask-3")
-    service.shutter.stop_interval()
+    service.parts.shutter.stop_interval()
     for event in good(1):
         assert not isinstance(event, Exception)
         camera.say(event)
-    eventually(lambda: service.shutter.statistics().pending == 0, "the interval's shot's end")
+    eventually(lambda: service.parts.shutter.statistics().pending == 0, "the interval's shot's end")
     assert parameters.change("LF_MASK", "mask-3")
     assert "next flight begins" in service.request(CaptureRequest("test", "console", 3)).words
     service.run()  # ends by itself
@@ -336,10 +336,10 @@ def test_a_viewer_s_thread_that_dies_is_told_and_ends_no_flight(
     service = started(settings, [])
     try:
         with monkeypatch.context() as broken:
-            broken.setattr(service._answers, "dead_threads", lambda: ["answers"])
+            broken.setattr(service.parts.answers, "dead_threads", lambda: ["answers"])
             assert "thread answers: it has ended: restart dappled" in problems(service.health())
             assert service.healthy()
-            broken.setattr(service._pipeline, "dead_threads", lambda: ["capture"])
+            broken.setattr(service.parts.pipeline, "dead_threads", lambda: ["capture"])
             assert not service.healthy()
     finally:
         service.stop()

@@ -23,7 +23,7 @@ def test_an_interval_of_0_s_is_a_burst_that_loses_and_doubles_nothing(sockets: P
         flying(settings_of(here, camera={"port": body.port})) as daemon,
     ):
         daemon.until_ready()
-        verdict = daemon.service.shutter.start_interval(CaptureRequest("test", "console", 1), 0.0, SHOTS)
+        verdict = daemon.service.parts.shutter.start_interval(CaptureRequest("test", "console", 1), 0.0, SHOTS)
         assert verdict.outcome != "refused", verdict.reason
         eventually(lambda: len(daemon.shots) == SHOTS, "the burst's end")
         assert body.releases == SHOTS
@@ -51,7 +51,7 @@ def test_in_a_burst_each_shot_ends_once_whatever_the_body_does(sockets: Path, tm
         flying(settings_of(here, camera={"port": body.port, "file_timeout_s": 20})) as daemon,
     ):
         daemon.until_ready()
-        shutter = daemon.service.shutter
+        shutter = daemon.service.parts.shutter
 
         def safe() -> list[Frame]:
             return [pending.frame for pending in list(daemon.shots) if pending.frame is not None]

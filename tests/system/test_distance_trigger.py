@@ -17,7 +17,7 @@ def test_settings_without_a_series_refuse_to_begin_one(tmp_path: Path, capsys: p
         settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": "udpin:127.0.0.1:0"})
         with flying(settings) as daemon:
             daemon.until_ready()
-            url = f"udpout:127.0.0.1:{daemon.service.links.port(0)}"
+            url = f"udpout:127.0.0.1:{daemon.service.parts.links.port(0)}"
             assert main(["trigger", "--url", url, "--distance", "settings"]) == 1
             assert "no photos: set trigger.distance_m or overlap" in capsys.readouterr().err
             assert main(["trigger", "--url", url, "--distance", "5"]) == 0

@@ -91,7 +91,9 @@ def test_marks_time_the_frames_and_the_stream_comes_out_again(
         stack.callback(receiver.loop.stop, 5.0)
         with flying(simulated) as daemon:
             daemon.until_ready()
-            eventually(lambda: daemon.service.navigation.telemetry.utc_correction() is not None, "the autopilot's UTC")
+            eventually(
+                lambda: daemon.service.parts.navigation.telemetry.utc_correction() is not None, "the autopilot's UTC"
+            )
             for _ in range(1 + FRAMES):  # that marks come is known with the first one
                 daemon.shoot()
             folder = daemon.service.folder

@@ -34,7 +34,7 @@ URL = "udpin:127.0.0.1:0"
 
 def ground(daemon: Flying) -> Peer:
     daemon.until_ready()
-    return Peer(daemon.service.links.port(0))
+    return Peer(daemon.service.parts.links.port(0))
 
 
 def shoot(peer: Peer, sequence: int) -> tuple[int, int]:
@@ -84,12 +84,12 @@ def test_a_signed_link_through_a_restart(tmp_path: Path) -> None:
                 assert shoot(peer, 8) == ((0, 1) if fresh else (2, 1))
                 if fresh:
                     assert peer.one("CAMERA_IMAGE_CAPTURED").image_index == 1
-                counts = daemon.service.links.statistics()[0].signing
+                counts = daemon.service.parts.links.statistics()[0].signing
                 assert counts is not None
                 assert counts.replayed == run
         with flying(settings) as daemon:  # and dappled's own ground station, with the same key
             daemon.until_ready()
-            url = f"udpout:127.0.0.1:{daemon.service.links.port(0)}"
+            url = f"udpout:127.0.0.1:{daemon.service.parts.links.port(0)}"
             assert main(["trigger", "--url", url, "--key", str(tmp_path / "radio.key")]) == 0
     assert (tmp_path / "flights" / ".mavlink-signing").stat().st_mode & 0o777 == 0o600
 
@@ -124,7 +124,7 @@ def test_a_station_behind_a_vehicle_on_two_ports_has_each_report_once(tmp_path: 
         settings = settings_of(tmp_path, camera={"port": body.port}, mavlink={"url": [URL, URL]})
         daemon = stack.enter_context(flying(settings))
         daemon.until_ready()
-        first, second = (f"udpout:127.0.0.1:{daemon.service.links.port(link)}" for link in (0, 1))
+        first, second = (f"udpout:127.0.0.1:{daemon.service.parts.links.port(link)}" for link in (0, 1))
         radio = free_port()
         autopilot = Autopilot.start(
             first,
@@ -136,7 +136,7 @@ def test_a_station_behind_a_vehicle_on_two_ports_has_each_report_once(tmp_path: 
         peer = stack.enter_context(Peer(radio))
 
         def both_are_heard() -> bool:
-            return all(link.packets_in > 200 for link in daemon.service.links.statistics())
+            return all(link.packets_in > 200 for link in daemon.service.parts.links.statistics())
 
         eventually(both_are_heard, "telemetry on both ports")
         reports = []
@@ -165,7 +165,7 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
     settings = settings_of(tmp_path, mavlink={"url": URL})
     with Simulation(World(), settings, tmp_path) as simulated, flying(simulated) as daemon:
         daemon.until_ready()
-        with Peer(daemon.service.links.port(2)) as peer:
+        with Peer(daemon.service.parts.links.port(2)) as peer:
             peer.heartbeat()
             peer.one("HEARTBEAT")
             for value, decoded in (("off", False), ("on", True)):

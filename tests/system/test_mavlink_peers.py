@@ -35,7 +35,7 @@ class Camera:
     flying: Flying
 
     def port(self, link: int) -> int:
-        return self.flying.service.links.port(link)
+        return self.flying.service.parts.links.port(link)
 
     def iso(self) -> str:
         """As the body has it."""

@@ -41,7 +41,7 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
             station = simulation.ground_station(1)
             service.run(lambda: not station.running())
             until = time.monotonic() + 60
-            service.run(lambda: service.navigation.utc.learnt is not None or time.monotonic() > until)
+            service.run(lambda: service.parts.navigation.utc.learnt is not None or time.monotonic() > until)
             assert "UTC" not in "".join(problems(service.health()))
         finally:
             service.stop()

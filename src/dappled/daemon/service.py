@@ -2,7 +2,7 @@
 
 Parts know only parts that are built before them, so their references form no circle. Packets go from the links to
 Navigation and to the component. Commands go down: component → shutter → FlightControl → PendingShots → camera. Events
-go down too: pipeline → ShotEvents → component, shutter, logbook. `_build` reads in that order.
+go down too: pipeline → ShotEvents → component, shutter, logbook. `_built` reads in that order.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.shot_events import ShotEvents
 from dappled.daemon.stream import wire
@@ -57,9 +58,9 @@ from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher, Stream
 from dappled.daemon.survey_facts import LiveSurvey, distance_trigger
 from dappled.drivers.camera import Camera
-from dappled.drivers.gnss.port import gnss_port
+from dappled.drivers.gnss.port import GnssPort, gnss_port
 from dappled.drivers.gnss.recorded import TelemetryNotebook
-from dappled.drivers.mavlink import Transport
+from dappled.drivers.mavlink import MavlinkLinks, Transport
 from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
@@ -92,14 +93,43 @@ class StandIns:
     stream: Stream | None = None
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FlightParts:
+    """The parts of a flight, each built from some above it. `vital` are those without which no photograph is taken and
+    kept; None: the settings ask for none."""
+
+    recording: Recording
+    links: MavlinkLinks
+    publisher: Stream
+    shots: PendingShots
+    writer: LedgerWriter
+    navigation: Navigation
+    control: FlightControl
+    shutter: Shutter
+    autopilot: OwnAutopilot
+    distance: DistanceTrigger
+    gnss: GnssPort | None
+    body: BodyPlan
+    parameters: Parameters
+    component: Component
+    decoder: DecodeProcess | None
+    depth: LiveDepth | None
+    events: ShotEvents
+    pipeline: Pipeline
+    answers: Answers
+    vital: tuple[HasThreads, ...]
+
+
 class Service:
     """One flight, from `start` to `stop`. `run` is the working loop between them.
 
     `observer` follows the pipeline; `after` takes what the next flight is to be flown with, where there may be one.
     `start` raises DappledError when a part can't be had, and closes what it has opened. A camera that isn't there, a
     link without an autopilot and a recipe without a mask are no such failures: health reports them. `instead` stands
-    in for parts of the world.
+    in for parts of the world. `parts` are there from `start` on.
     """
+
+    parts: FlightParts
 
     def __init__(
         self,
@@ -133,34 +163,39 @@ class Service:
             camera = self._instead.camera or open_camera(settings.camera)
             listener = console_process.open_listener(settings, stack)
             private = listener.private if listener else ""
-            self._publisher: Stream = self._instead.stream or Publisher.of(
-                settings.publish, private=private, clock=self._clock
+            publisher = self._instead.stream or Publisher.of(settings.publish, private=private, clock=self._clock)
+            stack.callback(publisher.stop)
+            links = configured_links(settings, self._clock, self._instead.transport)
+            links.open()
+            stack.callback(links.stop)
+            recording, recipe = self._begin_recording(names, recipe, links, stack)
+            self.parts = parts = self._built(
+                camera, names, recipe, recording=recording, links=links, publisher=publisher
             )
-            stack.callback(self._publisher.stop)
-            self.links = configured_links(settings, self._clock, self._instead.transport)
-            self.links.open()
-            stack.callback(self.links.stop)
-            recipe = self._begin_recording(names, recipe, stack)
-            self._build(camera, names, recipe)
             if listener:  # before the publisher, so that it ends after it: the pages are told how the flight ended
                 self.console_url = listener.url
-                look, parts = CameraLook(camera, self.shutter, self._clock), (self.shutter, self._parameters)
-                requests = ConsoleRequests(*parts, look, self._logbook, series=self._distance, clock=self._clock)
+                look = CameraLook(camera, parts.shutter, self._clock)
+                requests = ConsoleRequests(
+                    parts.shutter, parts.parameters, look, self._logbook, series=parts.distance, clock=self._clock
+                )
                 self._console = console_process.start(
                     listener, settings, stack, recipe=recipe, requests=requests, clock=self._clock
                 )
+            self._tasks = self._periodic_tasks()
             self._start_parts(names, stack)
             self._started = True
             self._stack = stack.pop_all()
-        for one in self._recording.recovered:
+        for one in recording.recovered:
             log.warning("earlier flight: %s", findings.told(one))
 
-    def _begin_recording(self, names: Names, recipe: Recipe | None, stack: ExitStack) -> Recipe | None:
-        """Begin the flight folder. Returns the recipe with the copies of its files that the flight keeps."""
+    def _begin_recording(
+        self, names: Names, recipe: Recipe | None, links: MavlinkLinks, stack: ExitStack
+    ) -> tuple[Recording, Recipe | None]:
+        """Begin the flight folder. Returns its recording, and the recipe with the copies of its files that it keeps."""
         settings, clock = self._settings.now, self._clock
-        self._utc_known = utc_known(settings.record.utc, clock.utc_ns())
-        if self._utc_known:
-            self.links.clock_known()
+        known = utc_known(settings.record.utc, clock.utc_ns())
+        if known:
+            links.clock_known()
         facts = {
             "software": {"dappled": dappled.__version__, **recipes.versions()},
             "settings": configuration.to_tables(settings),
@@ -168,39 +203,49 @@ class Service:
             "decode_in_flight": recipe is not None,
         }
         directory, key = Path(settings.record.directory), settings.record.seal_key
-        self._recording = flights.begin(
-            directory, clock, facts, utc_known=self._utc_known, seal_key=seal_key.load(Path(key)) if key else None
+        recording = flights.begin(
+            directory, clock, facts, utc_known=known, seal_key=seal_key.load(Path(key)) if key else None
         )
-        stack.callback(self._remove_unused_flight)
-        stack.callback(_close, self._recording)
-        stack.callback(self.links.stop)  # before the recording closes: packets are logged there
+        stack.callback(self._remove_unused_flight, recording)
+        stack.callback(_close, recording)
+        stack.callback(links.stop)  # before the recording closes: packets are logged there
         if recipe is None:
-            return None
-        kept = recipes.keep(recipe, self._recording.folder.path)
-        self._recording.note_inputs(recipes.FOLDER)
-        return kept
+            return recording, None
+        kept = recipes.keep(recipe, recording.folder.path)
+        recording.note_inputs(recipes.FOLDER)
+        return recording, kept
 
-    def _build(self, camera: Camera, names: Names, recipe: Recipe | None) -> None:
+    def _built(
+        self,
+        camera: Camera,
+        names: Names,
+        recipe: Recipe | None,
+        *,
+        recording: Recording,
+        links: MavlinkLinks,
+        publisher: Stream,
+    ) -> FlightParts:
         """Build the parts, each from parts built before it. None of them runs yet."""
-        settings, clock, recording = self._settings.now, self._clock, self._recording
-        self._shots = shots = PendingShots(camera, clock)
-        self._writer = writer = LedgerWriter(recording, clock)
-        self.navigation = Navigation(self._settings, clock, recording, utc_known=self._utc_known)
-        reported, sender = ReportedCamera(settings), self.links.sender
-        self._control = FlightControl(
+        settings, clock = self._settings.now, self._clock
+        shots = PendingShots(camera, clock)
+        writer = LedgerWriter(recording, clock)
+        known = recording.ledger.fact(bool, "utc_known") is True
+        navigation = Navigation(self._settings, clock, recording, utc_known=known)
+        reported, sender = ReportedCamera(settings), links.sender
+        control = FlightControl(
             self._settings,
             clock,
             recording,
             shots=shots,
             writer=writer,
-            navigation=self.navigation,
+            navigation=navigation,
             camera=reported,
             sender=sender,
             alarms=self._alarms,
             handover=self._after,
         )
-        self.shutter = Shutter(
-            self._control,
+        shutter = Shutter(
+            control,
             clock,
             next_index=recording.next_index,
             capacity=settings.camera.max_pending,
@@ -208,116 +253,144 @@ class Service:
         )
         cam_idx = settings.mavlink.cam_idx
         autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal, cam_idx=cam_idx)
-        self._autopilot = autopilot
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
-        survey = LiveSurvey(self.navigation, reported, shots)
-        self._distance = distance_trigger(self.shutter, survey, clock, settings)
-        self._gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, self.navigation, clock), clock)
-        self._body = BodyPlan(settings.body, settings.camera.capture_target, camera)
-        self._parameters = self._settable(self._body, names, decodes=recipe is not None)
-        self.component = Component(
+        survey = LiveSurvey(navigation, reported, shots)
+        distance = distance_trigger(shutter, survey, clock, settings)
+        gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, navigation, clock), clock)
+        body = BodyPlan(settings.body, settings.camera.capture_target, camera)
+        parameters = self._settable(body, shots, writer, shutter, names, decodes=recipe is not None)
+        component = Component(
             sender,
             autopilot,
-            self.shutter,
+            shutter,
             clock,
-            self._parameters,
-            model=self._control,
+            parameters,
+            model=control,
             earlier=IndexedOutcomes(recording.index),
-            series=self._distance,
+            series=distance,
             cam_idx=cam_idx,
         )
-        self._decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
-        self._depth = None
+        decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
+        depth: LiveDepth | None = None
         if recipe is not None and settings.decode.depth:
-            self._depth = LiveDepth(
+            depth = LiveDepth(
                 DecodeProcess(recipe, clock=clock),
                 writer,
                 shots,
-                self._publisher,
+                publisher,
                 method=settings.decode.depth,
                 interval_s=settings.decode.depth_interval_s,
                 clock=clock,
-                nearest=self._control if settings.decode.depth_to_autopilot else None,
+                nearest=control if settings.decode.depth_to_autopilot else None,
             )
-        self._events = ShotEvents(
+        events = ShotEvents(
             recording,
             reported,
-            self.navigation.utc,
-            shutter=self.shutter,
-            component=self.component,
+            navigation.utc,
+            shutter=shutter,
+            component=component,
             logbook=self._logbook,
-            depth=self._depth,
+            depth=depth,
             recipe=recipe,
             outside=self._outside,
         )
-        self._pipeline = Pipeline(
+        pipeline = Pipeline(
             camera,
             shots,
             writer,
-            self.navigation,
-            decoder=self._decoder,
-            publisher=self._publisher,
+            navigation,
+            decoder=decoder,
+            publisher=publisher,
             latency=BodyLatency.of(settings.camera),
             names=names,
-            observer=self._events,
+            observer=events,
             decode_queue=settings.decode.queue,
-            judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal, plan=self._body),
+            judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal, plan=body),
             preview_interval_s=settings.publish.preview_interval_s,
         )
-        self._answers = Answers(writer, self._decoder, shots, clock=clock)
-        driver = tuple(part for part in (camera, self._gnss) if isinstance(part, HasThreads))
-        self._vital: tuple[HasThreads, ...] = (self._pipeline, self.links, self.shutter, self._distance, *driver)
-        self._tasks = self._periodic_tasks()
+        answers = Answers(writer, decoder, shots, clock=clock)
+        driver = tuple(part for part in (camera, gnss) if isinstance(part, HasThreads))
+        return FlightParts(
+            recording,
+            links,
+            publisher,
+            shots,
+            writer,
+            navigation,
+            control,
+            shutter,
+            autopilot,
+            distance,
+            gnss,
+            body,
+            parameters,
+            component,
+            decoder,
+            depth,
+            events,
+            pipeline,
+            answers,
+            vital=(pipeline, links, shutter, distance, *driver),
+        )
 
-    def _settable(self, body: BodyPlan, names: Names, *, decodes: bool) -> Parameters:
+    def _settable(
+        self,
+        body: BodyPlan,
+        shots: PendingShots,
+        writer: LedgerWriter,
+        shutter: Shutter,
+        names: Names,
+        *,
+        decodes: bool,
+    ) -> Parameters:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
-        decoding = DecodingParameter(self._shots, self._writer, decodes=decodes)
-        recipe = RecipeParameters(names, self._after, self._settings, self.shutter, self._writer)
+        decoding = DecodingParameter(shots, writer, decodes=decodes)
+        recipe = RecipeParameters(names, self._after, self._settings, shutter, writer)
         return Parameters(body, (decoding, recipe), unsigned=self._settings.now.mavlink.unsigned_parameters)
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:
         """Start the last stage first, so that each item finds its receiver. A part that fails is stopped too."""
-        if self._decoder is not None:
-            stack.callback(self._decoder.close)
-            self._decoder.begin_warm_up()
-        stack.callback(self._answers.stop)
-        self._answers.start()
-        self._publisher.start(self._recording.folder.name, self._answers.answer)
+        if self.parts.decoder is not None:
+            stack.callback(self.parts.decoder.close)
+            self.parts.decoder.begin_warm_up()
+        stack.callback(self.parts.answers.stop)
+        self.parts.answers.start()
+        self.parts.publisher.start(self.parts.recording.folder.name, self.parts.answers.answer)
         publish = self._settings.now.publish
         start = wire.start_header(publish, self._clock.utc_ns(), camera=names.camera, mask=names.mask)
-        self._publisher.publish("start", start)
+        self.parts.publisher.publish("start", start)
         stack.callback(self._publish_end)
-        if self._depth is not None:
-            stack.callback(self._depth.stop)
-            self._depth.start()
-        stack.callback(self._pipeline.stop, _STOP_S)
-        self._pipeline.start()
-        stack.callback(self.shutter.stop)
-        self.shutter.start()
-        stack.callback(self._distance.stop)
-        self._distance.start()
-        self.links.start(self.navigation, self.component)
-        if self._gnss is not None:
-            stack.callback(self._gnss.stop)
-            self._gnss.start()
+        if self.parts.depth is not None:
+            stack.callback(self.parts.depth.stop)
+            self.parts.depth.start()
+        stack.callback(self.parts.pipeline.stop, _STOP_S)
+        self.parts.pipeline.start()
+        stack.callback(self.parts.shutter.stop)
+        self.parts.shutter.start()
+        stack.callback(self.parts.distance.stop)
+        self.parts.distance.start()
+        self.parts.links.start(self.parts.navigation, self.parts.component)
+        if self.parts.gnss is not None:
+            stack.callback(self.parts.gnss.stop)
+            self.parts.gnss.start()
 
-    def _remove_unused_flight(self) -> None:
+    def _remove_unused_flight(self, recording: Recording) -> None:
         """Remove the folder of a flight whose start failed. A flight that has begun is kept, however it ends."""
         if not self._started:
-            _remove_empty(self._recording)
+            _remove_empty(recording)
 
     def _publish_end(self) -> None:
-        self.component.finish()
-        self.shutter.settle_refusals(all_of_them=True)
+        self.parts.component.finish()
+        self.parts.shutter.settle_refusals(all_of_them=True)
         try:
-            self._writer.write_later()
+            self.parts.writer.write_later()
         except DappledError as error:
             report(log, "events", error)
-        now = self.shutter.statistics()
+        now = self.parts.shutter.statistics()
         counts = {"wished": now.shots, "safe": now.succeeded, "failed": now.failed, "open": now.pending}
-        self._publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts})
-        self._publisher.stop()  # answers the last questions, for which the decoder is still there
+        self.parts.publisher.publish("end", {"utc_ns": self._clock.utc_ns(), "shots": counts})
+        self.parts.publisher.stop()  # answers the last questions, for which the decoder is still there
 
     def ask_to_stop(self) -> None:
         """End `run` soon; safe in a signal handler."""
@@ -333,9 +406,9 @@ class Service:
     def _periodic_tasks(self) -> dict[PeriodicTask, Callable[[], object]]:
         """The tasks of the working loop, in order, and what each does. Without the loop there is no heartbeat."""
         tasks: dict[PeriodicTask, Callable[[], object]] = {
-            PeriodicTask("events"): self._writer.write_later,
+            PeriodicTask("events"): self.parts.writer.write_later,
             PeriodicTask("body"): self._follow_body,
-            PeriodicTask("resources", every_ns=HEALTH_NS): self._control.look,
+            PeriodicTask("resources", every_ns=HEALTH_NS): self.parts.control.look,
             PeriodicTask("health", every_ns=HEALTH_NS): self._publish_health,
         }
         if not self._settings.now.mavlink.url:
@@ -348,9 +421,9 @@ class Service:
         }
 
     def _look_for_utc(self) -> None:
-        self.navigation.look_for_utc()
-        if (learnt := self.navigation.utc.learnt) is not None:
-            self.links.clock_known(learnt.correction_ns)
+        self.parts.navigation.look_for_utc()
+        if (learnt := self.parts.navigation.utc.learnt) is not None:
+            self.parts.links.clock_known(learnt.correction_ns)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Send heartbeats and health until `ask_to_stop` or `stop` is called, the ground station has set what the next
@@ -368,45 +441,45 @@ class Service:
         return self._after is not None and self._after.next is not None
 
     def _tick(self) -> None:
-        self.component.tick(healthy=self.healthy)
+        self.parts.component.tick(healthy=self.healthy)
 
     def _follow_body(self) -> None:
         """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
-        while self._events.of_body:
-            if drift := self._body.take(self._events.of_body.popleft()):
+        while self.parts.events.of_body:
+            if drift := self.parts.body.take(self.parts.events.of_body.popleft()):
                 self._logbook.add(str(findings.text(drift)), "warning")
 
     def _follow_vehicle(self) -> None:
-        self.navigation.belongs_to(self.component.vehicle)
+        self.parts.navigation.belongs_to(self.parts.component.vehicle)
 
     def _publish_health(self) -> None:
         record = self.health()
-        self._publisher.publish("health", record)
+        self.parts.publisher.publish("health", record)
         for kind, one in self._told.of(record):
-            self._writer.later(kind, findings.json_text(one))
-        for text, severity in self._alarms.lines(record, again=self.component.audience_has_grown()):
-            self.component.say(text, severity, news=True)  # it began or ended again
+            self.parts.writer.later(kind, findings.json_text(one))
+        for text, severity in self._alarms.lines(record, again=self.parts.component.audience_has_grown()):
+            self.parts.component.say(text, severity, news=True)  # it began or ended again
 
     def healthy(self) -> bool:
         """Whether everything runs that photographs are taken and kept with. Viewers' parts don't count."""
-        return not any(part.dead_threads() for part in self._vital)
+        return not any(part.dead_threads() for part in self.parts.vital)
 
     def health(self) -> dict[str, Any]:
         """The state of everything, as published."""
-        navigation = self.navigation
+        navigation = self.parts.navigation
         viewers: list[HasThreads] = [
-            self._publisher,
-            self._answers,
-            *(part for part in (self._depth, self._console) if part is not None),
+            self.parts.publisher,
+            self.parts.answers,
+            *(part for part in (self.parts.depth, self._console) if part is not None),
         ]
         found = (
-            *self.component.findings(),
+            *self.parts.component.findings(),
             navigation.utc.doubt(),
             *navigation.telemetry.doubts(),
-            self._control.shortage,
-            *self.links.findings(),
-            None if self._gnss is None else self._gnss.problem(),
-            *self._body.unseen(),
+            self.parts.control.shortage,
+            *self.parts.links.findings(),
+            None if self.parts.gnss is None else self.parts.gnss.problem(),
+            *self.parts.body.unseen(),
             *(task.failing for task in self._tasks),
         )
         return health.record(
@@ -415,27 +488,33 @@ class Service:
                 self._clock.utc_ns(), self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known
             ),
             ShootingState(
-                self._shots,
-                self.shutter.statistics(),
-                self._control.lost_triggers,
-                self._distance.statistics(),
-                self._body.report(),
-                codec.plain(self._parameters.all()),
+                self.parts.shots,
+                self.parts.shutter.statistics(),
+                self.parts.control.lost_triggers,
+                self.parts.distance.statistics(),
+                self.parts.body.report(),
+                codec.plain(self.parts.parameters.all()),
             ),
             VehicleState(
-                self.links.statistics(),
+                self.parts.links.statistics(),
                 navigation.telemetry.statistics(),
                 navigation.telemetry.boot_clock(),
                 navigation.pose_now(),
-                self._autopilot.battery(),
+                self.parts.autopilot.battery(),
             ),
             KeepingState(
-                self.folder, self._pipeline.statistics(), self._publisher.statistics(), self._writer.frame_bytes
+                self.folder,
+                self.parts.pipeline.statistics(),
+                self.parts.publisher.statistics(),
+                self.parts.writer.frame_bytes,
             ),
             decoding=DecodingState(
-                self._decoder is not None, self._pipeline.decode_failures, self._events.misfit, self._pipeline.verdicts
+                self.parts.decoder is not None,
+                self.parts.pipeline.decode_failures,
+                self.parts.events.misfit,
+                self.parts.pipeline.verdicts,
             ),
-            dead_threads=[name for part in (*self._vital, *viewers) for name in part.dead_threads()],
+            dead_threads=[name for part in (*self.parts.vital, *viewers) for name in part.dead_threads()],
             found=[one for one in found if one is not None],
             standing=self._standing,
         )
@@ -445,16 +524,16 @@ class Service:
     @property
     def folder(self) -> Path:
         """The flight's folder."""
-        return self._recording.folder.path
+        return self.parts.recording.folder.path
 
     @property
     def requested(self) -> int:
         """Shots so far."""
-        return self.shutter.statistics().shots
+        return self.parts.shutter.statistics().shots
 
     def request(self, request: CaptureRequest) -> ShotDecision:
         """Take a capture request that did not come over a link: from a console, or a test."""
-        return self.shutter.request(request)
+        return self.parts.shutter.request(request)
 
     def reload(self, wanted: Settings) -> list[str]:
         """Take over what may change in flight."""

@@ -157,7 +157,7 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     loop = threading.Thread(target=service.run)
     loop.start()
     over = threading.Event()
-    peers = [Peer(service.links.port(0), system, 1) for system in (THEIRS, OURS)]
+    peers = [Peer(service.parts.links.port(0), system, 1) for system in (THEIRS, OURS)]
 
     def speak() -> None:
         boot_ms = 1000
@@ -170,7 +170,7 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     speaking = threading.Thread(target=speak)
     speaking.start()
     try:
-        eventually(lambda: service.component.vehicle, "it is decided whose camera this is")
+        eventually(lambda: service.parts.component.vehicle, "it is decided whose camera this is")
         eventually(lambda: (service.health()["vehicle"] or {}).get("latitude_deg") == pytest.approx(47), "our place")
         service.request(CaptureRequest("test", "console", 1))
         eventually(lambda: shots, "the shot's end")

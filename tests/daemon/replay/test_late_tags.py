@@ -52,7 +52,7 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
     loop.start()
     boot_ms = 1000
     left = tmp_path / "left" / service.folder.name
-    with Peer(service.links.port(0), 1, 1) as autopilot:
+    with Peer(service.parts.links.port(0), 1, 1) as autopilot:
 
         def heard(until: object) -> bool:
             nonlocal boot_ms
@@ -66,7 +66,7 @@ def killed(settings: Settings, tmp_path: Path) -> Path:
             return bool(until)
 
         try:
-            eventually(lambda: heard(service.component.vehicle), "whose camera this is")
+            eventually(lambda: heard(service.parts.component.vehicle), "whose camera this is")
             eventually(lambda: heard(service.health()["vehicle"]), "a position")
             service.request(CaptureRequest("test", "console", 1))
             eventually(lambda: heard(shots), "the first shot's end")
