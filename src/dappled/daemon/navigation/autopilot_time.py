@@ -130,7 +130,7 @@ class AutopilotTime:
 
     def awaits_answer(self, utc_ns: int) -> bool:
         """Whether an answer to TIMESYNC from after an instant is still to come, which may show a step before it."""
-        last_ns = self._answers[-1].stamp_ns if self._answers else 0
+        last_ns = next((one.stamp_ns for one in reversed(self._answers[-_LOOKED_AT:]) if not one.held), 0)
         return last_ns < utc_ns <= last_ns + _ANSWERS_COME_NS
 
     @property

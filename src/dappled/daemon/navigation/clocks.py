@@ -48,6 +48,7 @@ _PRIOR = np.diag([0.0, 1 / (DRIFT_SIGMA * 1e9) ** 2])  # of level (ns) and slope
 _TIMESYNC_FLOOR_NS = 50_000.0
 _TIMESYNC_ASYMMETRY = 0.05  # share of the least round trip by which the two ways may differ; not observable
 _STEADY = 600e-6
+_HELD_ANSWER_NS = 200_000_000
 _STEP_LOOK_NS = 10 * 10**9
 _STEP_FLOOR_NS = 500_000
 _RECENT_NS = 5 * 10**9
@@ -168,6 +169,11 @@ class TimesyncAnswer:
         return self.received_utc_ns - self.sent_utc_ns
 
     @property
+    def held(self) -> bool:
+        """Whether the link has held it, or the request."""
+        return self.delay_ns > _HELD_ANSWER_NS
+
+    @property
     def offset_ns(self) -> int:
         """UTC minus boot time, if both ways took equally long."""
         return (self.sent_utc_ns + self.received_utc_ns) // 2 - self.boot_ns
@@ -240,7 +246,8 @@ def from_few(answers: Sequence[TimesyncAnswer]) -> BootClock:
 
 def stepped_since(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> TimesyncAnswer | None:
     """The last of `answers` after which the clock has stepped, as a steady one can't give both it and `new`; else None.
-    Later ones took so long that they may be from before the step or after it.
+    Later ones took so long that they may be from before the step or after it. One that the link has held shows a step
+    only where that is longer: the next ones tell how large a shorter one is.
 
     An answer is wrong by at most half its round trip, so two differ by at most half of both, plus what crystals and
     a machine clock under correction (0.06 %) can drift in between. Answers of the last ten seconds count, and the
@@ -251,6 +258,7 @@ def stepped_since(answers: Sequence[TimesyncAnswer], new: TimesyncAnswer) -> Tim
         if apart_ns > _STEP_LOOK_NS and old is not answers[-1]:
             break
         most_ns = (old.delay_ns + new.delay_ns) / 2 + _STEADY * apart_ns + _STEP_FLOOR_NS
+        most_ns += sum(one.delay_ns for one in (old, new) if one.held) / 2
         if abs(new.offset_ns - old.offset_ns) > most_ns:
             return old
     return None

@@ -47,7 +47,7 @@ from dappled.drivers.mavlink.sample_judge import (
 
 POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
 _REPEATS = 64
-_TOGETHER_NS, _COMPARED_NS = 200_000_000, 300_000_000
+_TOGETHER_NS, _AT_ONCE_NS, _COMPARED_NS = 200_000_000, 1_000_000, 300_000_000
 _PART_NS, _FAST = 2 * 10**9, 0.2
 _ALIVE_NS = 5 * 10**9
 _AUTOPILOT, _FIX_3D = 1, 3
@@ -220,13 +220,14 @@ class VehicleHistory:
 
     def late_ns(self, heard_ns: int, limit: int, clock: BootClock) -> int | None:
         """How late a message without a time came that was heard then: as late as the samples that came with it, whose
-        time is known. None where none did."""
+        time is known. None where none did. Of those that came at once, as from a link that has held them, the first."""
         histories: tuple[Sequence[Sample], ...] = (self._positions, self._attitudes)
-        late = [
-            one.stamp_ns - clock.utc_ns(one.boot_ns)
-            for history in histories
-            for one in beside(between(history, *self.time.span(limit, heard_ns)), heard_ns, _TOGETHER_NS)
-        ]
+        first = self.time.boot_first(self.time.span(limit, heard_ns)[0] + 1)
+        late = list[int]()
+        for known in (between(history, first, limit) for history in histories):
+            for near in beside(known, heard_ns + 1, _AT_ONCE_NS)[:1] or beside(known, heard_ns + 1, _TOGETHER_NS):
+                one = known[bisect_left(known, near.stamp_ns, key=lambda sample: sample.stamp_ns)]
+                late.append(one.stamp_ns - clock.utc_ns(one.boot_ns))
         return min(late, default=None)
 
     def around(self, utc_ns: int, boot_ns: int, sigma_ns: float, limit: int, *, placed: bool = True) -> Around:
