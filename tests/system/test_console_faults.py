@@ -26,7 +26,7 @@ from tests.daemon.health.test_record import HERE, S, record
 from tests.system.test_console import SCREENSHOTS, chromium, leave, until
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Route
 
 __all__ = ["chromium", "leave", "rig"]  # fixtures
 
@@ -119,6 +119,28 @@ def test_a_fault_is_on_the_first_screen_with_its_code_and_what_to_do(
         )
         assert cut == [], f"{width} px wide"
         on_screen(page, "verdict", "verdict-text", "verdict-todo", "shoot", "interval-stop")
+
+
+def test_until_the_views_are_made_the_mean_picture_is_shown(
+    chromium: Browser, rig: Rig, picture: bytes, tmp_path: Path
+) -> None:
+    told_of(rig, tmp_path)
+    page = chromium.new_context(viewport={"width": 1280, "height": 800}).new_page()
+    held: list[Route] = []
+
+    def answer(route: Route) -> None:
+        if route.request.url.endswith("views.json"):
+            held.append(route)
+        else:
+            route.fulfill(body=picture, content_type="image/jpeg")
+
+    page.route("**/api/frames/**", answer)
+    page.goto(rig.url)
+    page.wait_for_selector('#picture[data-kind="mean"]:not([hidden])')
+    until(page, "document.querySelector('#caption').textContent === 'The mean picture. Its views are being made.'")
+    assert held
+    held[-1].fulfill(json={"error": "this frame has no views"}, status=422)
+    until(page, "document.querySelector('#caption').textContent === 'The mean picture. this frame has no views'")
 
 
 @pytest.mark.parametrize("size", SIZES)

@@ -107,6 +107,38 @@ def test_a_light_field_of_views_alone_and_one_of_slices_alone() -> None:
     )
 
 
+class SlowViews(LightFieldFrames):
+    """Its views take as long as somebody holds them."""
+
+    def __init__(self) -> None:
+        super().__init__("a.npz", 9, light_field())
+        self.begun, self.gate = threading.Event(), threading.Event()
+
+    def light_field(self, _index: int) -> LightField | None:
+        self.begun.set()
+        assert self.gate.wait(60)
+        return super().light_field(_index)
+
+
+def test_what_can_be_shown_at_once_does_not_wait_for_the_views() -> None:
+    source = SlowViews()
+    served = Served(source)
+
+    async def look() -> list[int]:
+        views = asyncio.create_task(served.get("/api/frames/0/views.json"))
+        await asyncio.to_thread(source.begun.wait, 60)
+        quick = [await asyncio.wait_for(served.get(f"/api/frames/0/{one}.jpg"), 30) for one in ("mean", "thumb")]
+        assert not views.done()
+        source.gate.set()
+        return [one.status_code for one in (*quick, await views)]
+
+    try:
+        assert asyncio.run(look()) == [200, 200, 200]
+    finally:
+        source.gate.set()
+        served.asked()
+
+
 def test_a_new_page_is_told_everything_and_then_that_the_flight_has_ended() -> None:
     served = Served(LightFieldFrames("a.npz", 9, light_field()))
 

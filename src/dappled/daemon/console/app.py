@@ -41,7 +41,8 @@ _STATIC = Path(str(resources.files("dappled.daemon.console") / "static"))
 
 
 class ConsoleApp:
-    """The application's endpoints. Pictures are made one at a time on a thread for that."""
+    """The application's endpoints. Views, which take seconds, are made one at a time on a thread for them, all other
+    pictures on another one: what can be shown at once doesn't wait behind them."""
 
     def __init__(
         self, feed: Feed, studio: Studio, daemon: DaemonQuestions, rules: Access, background: Background | None
@@ -49,6 +50,7 @@ class ConsoleApp:
         self._feed, self._hub, self._studio, self._daemon = feed, feed.hub, studio, daemon
         self._rules, self._background = rules, background
         self._pictures = ThreadPoolExecutor(1, "pictures")
+        self._views = ThreadPoolExecutor(1, "views")
         self._questions = ThreadPoolExecutor(2, "questions")  # they wait for the daemon
 
     def asgi(self) -> ASGIApp:
@@ -92,6 +94,7 @@ class ConsoleApp:
     def close(self) -> None:
         """End the threads."""
         self._pictures.shutdown()
+        self._views.shutdown()
         self._questions.shutdown()
 
     # the page and its events
@@ -206,7 +209,7 @@ class ConsoleApp:
         message = await self._feed.slices(frame)
         studio = self._studio
         if name == "refocus.jpg":
-            return _file(await self._make(studio.refocused, message, _disparity(request)), name)
+            return _file(await self._make(studio.refocused, message, _disparity(request), on=self._views), name)
         makers: dict[str, Callable[..., Any]] = {
             "thumb.jpg": lambda one: pictures.jpeg(studio.thumb(one)),
             "mean.jpg": studio.mean,
@@ -217,7 +220,8 @@ class ConsoleApp:
         }
         if name not in makers:
             raise FeedError(f"a frame has {_PICTURES}, but no {name}")
-        return _file(await self._make(makers[name], message), name)
+        thread = self._views if name.startswith("views.") else None
+        return _file(await self._make(makers[name], message, on=thread), name)
 
     async def _map(self, _: Request) -> Response:
         if self._background is None:
@@ -229,8 +233,8 @@ class ConsoleApp:
             raise FeedError("no area is configured in console.area")
         return Response(self._feed.area.holes_png(), media_type="image/png", headers={"cache-control": "no-store"})
 
-    async def _make(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        return await asyncio.get_running_loop().run_in_executor(self._pictures, function, *arguments)
+    async def _make(self, function: Callable[..., Any], *arguments: Any, on: ThreadPoolExecutor | None = None) -> Any:
+        return await asyncio.get_running_loop().run_in_executor(on or self._pictures, function, *arguments)
 
     async def _rectified(self, frame: int, longest_side: int, *, sharp: bool = False) -> RectifiedFrame | None:
         """A frame on the ground; `sharp` from its slices, else from its small picture. None without a position."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
@@ -32,13 +33,15 @@ _ALIKE = 0.05  # sensors whose sides differ by less have the same footprint
 
 
 class Studio:
-    """Use it from one thread. A frame is given as its `slices` message; `mount` leads from camera to body axes."""
+    """`views` and `refocused` are for one thread, all else may be used from another one at the same time. A frame is
+    given as its `slices` message; `mount` leads from camera to body axes."""
 
     def __init__(self, recipe: Recipe | None, mount: Sequence[float]) -> None:
         self._darkroom = None if recipe is None else Darkroom(recipe)
         self._mount = mount
         self._kept: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
         self._bytes = 0
+        self._keeping = threading.Lock()
 
     def slices(self, message: Message) -> bytes:
         """The mosaic of the slices' magnitudes (Fig 43), JPEG."""
@@ -186,14 +189,17 @@ class Studio:
 
     def _once(self, message: Message, kind: str, make: Callable[[], Made]) -> Made:
         key = (message.header["flight"], message.header["frame"], kind)
-        if key in self._kept:
-            self._kept.move_to_end(key)
-            found: Made = self._kept[key]
-            return found
-        made = self._kept[key] = make()
-        self._bytes += _size(made)
-        while self._bytes > KEPT_BYTES and len(self._kept) > 1:
-            self._bytes -= _size(self._kept.popitem(last=False)[1])
+        with self._keeping:
+            if key in self._kept:
+                self._kept.move_to_end(key)
+                found: Made = self._kept[key]
+                return found
+        made = make()
+        with self._keeping:
+            self._kept[key] = made
+            self._bytes += _size(made)
+            while self._bytes > KEPT_BYTES and len(self._kept) > 1:
+                self._bytes -= _size(self._kept.popitem(last=False)[1])
         return made
 
 

@@ -5,6 +5,7 @@ import { ask, place } from "./pictures.js";
 import { Refocus, sharpest } from "./refocus.js";
 
 const TABS = ["refocus", "views", "slices", "spectrum", "live", "depth"];
+const EARLY_MS = 250;   // views that were made before come sooner, and no other picture flashes before them
 const $ = (id) => document.getElementById(id);
 
 export class Stage {
@@ -148,7 +149,29 @@ export class Stage {
     $("caption").textContent = "";
   }
 
+  // Views take seconds to make: until they are there, the mean picture is shown.
   async loadViews(base, turn) {
+    let isMade = false;
+    const early = setTimeout(() => this.showMean(base, turn, () => turn === this.turn && !isMade), EARLY_MS);
+    try {
+      await this.makeViews(base, turn, () => { isMade = true; });
+    } finally {
+      clearTimeout(early);
+      isMade = true;
+    }
+  }
+
+  async showMean(base, turn, wanted) {
+    try {
+      if (await this.loadPicture(`${base}mean.jpg`, "mean", turn, wanted)) {
+        this.layout = this.bitmap = null;
+        this.showSlider();
+        $("caption").textContent = "The mean picture. Its views are being made.";
+      }
+    } catch { /* the views' own answer says why */ }
+  }
+
+  async makeViews(base, turn, made) {
     const wanted = () => turn === this.turn;
     const layout = await ask(`${base}views.json`, { read: (answer) => answer.json(), wanted, first: true });
     if (!layout) return;
@@ -160,6 +183,7 @@ export class Stage {
       bitmap = await createImageBitmap(blob, { colorSpaceConversion: "none", premultiplyAlpha: "none" });
     }
     if (turn !== this.turn) return;
+    made();
     this.layout = layout;
     this.bitmap = bitmap;
     this.showSlider();
@@ -179,12 +203,13 @@ export class Stage {
     this.draw();
   }
 
-  async loadPicture(url, kind, turn) {
-    const blob = await ask(url, { wanted: () => turn === this.turn, first: true });
-    if (!blob || turn !== this.turn) return;
+  // Whether it is shown: not where it is no longer `wanted` by then.
+  async loadPicture(url, kind, turn, wanted = () => turn === this.turn) {
+    const blob = await ask(url, { wanted, first: true });
+    if (!blob || !wanted()) return false;
     const picture = $("picture");
     await place(picture, blob);
-    if (turn !== this.turn) return;
+    if (!wanted()) return false;
     picture.dataset.kind = kind;
     picture.alt = `${kind} of frame ${this.frame.tag.frame}`;
     show(picture, true);
@@ -193,6 +218,7 @@ export class Stage {
     this.aspect = picture.naturalWidth / picture.naturalHeight;
     this.size();
     this.overlay(kind);
+    return true;
   }
 
   draw() {
