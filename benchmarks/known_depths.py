@@ -42,7 +42,8 @@ def views_given(field: LightField, disparity: NDArray[np.floating]) -> NDArray[n
         power = np.maximum((np.abs(spectra[:, 0, alike]) ** 2).mean(axis=1) - frame.noise[0], 0)
         spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
         own = spectrum.at(frame.radius(frame.frequencies))
-        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[alike] ** 2))), KINDS)
+        made_of = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[alike] ** 2))), KINDS)
+        rests = [made_of.of(number) for number in range(len(KINDS))]
         for one in alike:
             there = _disparities(disparity, field.grid, patches, int(one))
             made[:, :, one] = _views(frame, own, rests, spectra[:, :, one], there)

@@ -120,20 +120,20 @@ def test_errors_of_views_are_those_of_the_model_that_the_patches_were_drawn_from
     detail = _complex_normal(chance, (len(own), seen.shape[1], N)) * np.sqrt(own[:, None, None] * shares.T)
     lonely = _complex_normal(chance, (len(own), viewed.shape[2], N)) * np.sqrt(KINDS[kind].alone * own)[:, None, None]
     own_rest = np.float32(KINDS[kind].alone) * (frame.alone @ frame.alone.conj().T) * own[:, None, None]
-    lower = np.linalg.cholesky(rests[kind].astype(np.complex128) - own_rest + 1e-9 * np.eye(rests[kind].shape[1]))
+    lower = np.linalg.cholesky(rests.of(kind).astype(np.complex128) - own_rest + 1e-9 * np.eye(rests.of(kind).shape[1]))
     slices = (
         seen.transpose(0, 2, 1) @ detail + frame.alone @ lonely + lower @ _complex_normal(chance, (*lower.shape[:2], N))
     )
     views = viewed.transpose(0, 2, 1) @ detail + lonely
-    found = views_told(frame, own, rests, slices.astype(np.complex64), shares)
+    found = views_told(frame, rests, slices.astype(np.complex64), shares)
     assert (found.kinds == kind).mean() > 0.9
     squares = np.einsum("fvn,f->vn", np.abs(found.spectra - views) ** 2, frame.multiplicity) / SIDE**2
-    background = PatchBackground.of(rests[kind], frame.alone, KINDS[kind].alone * own)
+    background = PatchBackground.of(rests.of(kind), frame.alone, KINDS[kind].alone * own)
     alone = frame.multiplicity @ background.left / SIDE**2
     np.testing.assert_allclose(squares.mean(axis=1), alone + found.rest.mean(axis=1), rtol=0.15)
     # Told other disparities the views are worse: this test can fail.
     other = np.zeros_like(shares)
     other[:, 26] = 1
-    wrong = views_told(frame, own, rests, slices.astype(np.complex64), other)
+    wrong = views_told(frame, rests, slices.astype(np.complex64), other)
     worse = np.einsum("fvn,f->vn", np.abs(wrong.spectra - views) ** 2, frame.multiplicity) / SIDE**2
     assert worse.mean() > 2 * squares.mean()

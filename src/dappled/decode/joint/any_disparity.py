@@ -7,6 +7,9 @@ For a hypothesis the band's own detail has few degrees of freedom. With the rest
 (y = L⁻¹ slices) it is y = H s + n; HᴴH is diagonalised, and the most probable s and the likelihood follow for any
 strength a of the texture: s = a/(1 + aλ)·Hᴴy. Each view also has a little alone, which is part of the rest and
 estimated from what s leaves of the slices: without noise and folded detail the slices decide, whatever the model.
+
+All hypotheses of a range together span few directions of the slices: patches are projected on these once. Every fourth
+frequency tells which hypotheses a patch may be of; only those are looked at by all.
 """
 
 from __future__ import annotations
@@ -28,6 +31,10 @@ STRENGTHS = np.array([0.01, 0.1, 0.3, 1.0, 3.0, 10.0], dtype=np.float32)
 _ALL = 12  # degrees of freedom a frequency where all disparities are there at once
 _ROUNDING = 1e-6  # of the strongest degree of freedom: a few of the last places of single precision
 _NEGLIGIBLE = 0.01  # of a patch's probability
+_UNSEEN = 1e-5  # of the noise: weaker detail tells nothing, whatever the texture's strength
+_TRIED = 4  # of so many frequencies one is looked at to find the likely hypotheses
+_LIKELY_NATS = 25.0  # by those frequencies alone
+_FEW_PAIRS = 9  # of degrees of freedom: fewer than views
 _ROUNDS = 3  # of how often each disparity occurs; chosen by hand, measured by benchmarks/views.py
 
 
@@ -51,55 +58,79 @@ class PatchBackground:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Hypothesis:
-    """The band's own detail under a hypothesis, diagonalised: `strength` λ (F, R), `viewed` (F, R, V·U) of each degree
-    of freedom, less what the slices' view alone would hold of it, `projected` Hᴴy (F, R, N), and the log
-    likelihoods `gains` (strengths, N) over that of no detail at all."""
+class _Directions:
+    """What slices show of detail in a range: `projector` (F, r, A) takes them to the r directions that have all of it,
+    white, and `rows` (F, D, R, r) are the range's own spectra there."""
 
-    strength: Floats
-    viewed: Complexes
-    projected: Complexes
-    gains: Floats
+    rows: Doubles
+    projector: Complexes
 
     @classmethod
-    def of(
-        cls,
-        seen: Complexes,
-        viewed: Complexes,
-        white: Doubles,
-        background: PatchBackground,
-        *,
-        weights: Singles,
-        most: int,
-    ) -> _Hypothesis:
-        """From `seen` (F, R, A) and `viewed`, for whitened spectra (F, A, N); at most `most` degrees of freedom, and
-        `weights` (F,) of frequencies in the likelihood."""
-        rows = seen.astype(np.complex128) @ background.whitener.transpose(0, 2, 1)
-        if rows.shape[1] <= most:
-            strength, turn = np.linalg.eigh(rows.conj() @ rows.transpose(0, 2, 1))
-        else:
-            strength, left = np.linalg.eigh(rows.transpose(0, 2, 1) @ rows.conj())
-            strength, left = strength[:, -most:], left[:, :, -most:]
-            # What few slices don't see is rounding, not a direction.
-            seen_well = strength > _ROUNDING * strength[:, -1:]
-            strength = np.where(seen_well, strength, 0)
-            scale = np.where(seen_well, 1 / np.sqrt(np.maximum(strength, LEAST_NOISE)), 0)
-            turn = rows.conj() @ left * scale[:, None, :]
-        turned = turn.transpose(0, 2, 1)
-        beside = viewed - seen @ background.unmixed.transpose(0, 2, 1)
-        strength = np.maximum(strength, 0)
-        projected = (turned @ rows).conj() @ white  # in double precision for the likelihood, then no more
-        gains = _gains(strength, projected, weights)
-        return cls(strength, (turned @ beside).astype(np.complex64), projected.astype(np.complex64), gains)
+    def of(cls, some: DisparityRange, own: Floats, whitener: Doubles) -> _Directions:
+        """Of a range, for texture of power `own` (F,)."""
+        size = np.sqrt(own / len(WITHIN))[:, None, None]
+        turn, reduced = np.linalg.qr(whitener @ (some.basis * size).swapaxes(1, 2))
+        rows = some.within.reshape(len(own), -1, some.within.shape[3]) @ reduced.swapaxes(1, 2)
+        projector = (turn.conj().swapaxes(1, 2) @ whitener).astype(np.complex64)
+        return cls(rows.reshape(some.within.shape), projector)
 
 
-def _gains(strength: Floats, projected: Doubles, weights: Singles) -> Floats:
-    """(strengths, N) log likelihoods over that of no detail at all."""
-    scaled = STRENGTHS[:, None, None]
-    shrunk = weights[:, None] * scaled / (1 + scaled * strength)
-    power = (projected.real**2 + projected.imag**2).reshape(-1, projected.shape[2])
-    volume = (weights[:, None] * np.log1p(scaled * strength)).sum(axis=(1, 2))
-    return np.asarray(shrunk.reshape(len(STRENGTHS), -1) @ power - volume[:, None], dtype=np.float64)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Hypothesis:
+    """The band's own detail under a hypothesis, diagonalised: `strength` λ (F, R), `rows` (F, q, r) that make Hᴴy of
+    the q degrees of freedom that slices show of projected patches, and `viewed` (F, R, V·U) of each degree of freedom,
+    less what the slices' view alone would hold of it; the strongest come last."""
+
+    strength: Floats
+    rows: Complexes
+    viewed: Complexes
+
+    def gains(self, low: Complexes, weights: Singles) -> Floats:
+        """(strengths, N) log likelihoods of projected patches (F, r, N) over that of no detail at all, by frequencies'
+        `weights` (F,)."""
+        strength = self.strength[:, -self.rows.shape[1] :]
+        scaled = STRENGTHS[:, None, None].astype(np.float64)
+        shrunk = (weights[:, None] * scaled / (1 + scaled * strength)).reshape(len(STRENGTHS), -1)
+        volume = (weights[:, None] * np.log1p(scaled * strength)).sum(axis=(1, 2))
+        projected = self.rows @ low
+        power = (projected.real**2 + projected.imag**2).reshape(shrunk.shape[1], -1)
+        return np.asarray(shrunk @ power - volume[:, None], dtype=np.float64)
+
+    def at(self, few: slice) -> _Hypothesis:
+        """The same at a few frequencies."""
+        return _Hypothesis(self.strength[few], self.rows[few], self.viewed[few])
+
+
+def _each_of(directions: _Directions, beside: Complexes) -> list[_Hypothesis]:
+    """One of each disparity, from `beside` (F, D, R, V·U)."""
+    rows = directions.rows
+    strength, turn = np.linalg.eigh(rows.conj() @ rows.swapaxes(2, 3))
+    strength = np.maximum(strength, 0)
+    turned = turn.swapaxes(2, 3)
+    shown = max(1, int((strength > _UNSEEN).any(axis=(0, 1)).sum()))
+    made = (turned[:, :, -shown:] @ rows).conj().astype(np.complex64)
+    viewed = turned.astype(np.complex64) @ beside
+    return [
+        _Hypothesis(*(np.ascontiguousarray(part[:, d]) for part in (strength, made, viewed)))
+        for d in range(rows.shape[1])
+    ]
+
+
+def _together(directions: _Directions, beside: Complexes, share: Floats) -> _Hypothesis:
+    """All disparities at once, in shares (D,) of the texture."""
+    scale = np.sqrt(share)[None, :, None, None]
+    rows = (directions.rows * scale).reshape(len(beside), -1, directions.rows.shape[3])
+    strength, left = np.linalg.eigh(rows.swapaxes(1, 2) @ rows.conj())
+    strength, left = strength[:, -_ALL:], left[:, :, -_ALL:]
+    # What few slices don't see is rounding, not a direction.
+    strength = np.where(strength > _ROUNDING * strength[:, -1:], strength, 0)
+    inverse = np.where(strength > 0, 1 / np.sqrt(np.maximum(strength, LEAST_NOISE)), 0)
+    turn = rows.conj() @ left * inverse[:, None, :]
+    viewed = turn.swapaxes(1, 2).astype(np.complex64) @ (beside * scale.astype(np.float32)).reshape(
+        len(beside), rows.shape[1], -1
+    )
+    made = np.sqrt(strength)[:, :, None] * left.conj().swapaxes(1, 2)
+    return _Hypothesis(strength, made.astype(np.complex64), viewed)
 
 
 def views_at_any(
@@ -108,23 +139,37 @@ def views_at_any(
     """The views' spectra (F, V·U, N), and their variance (V·U, N) a pixel but for what each has alone, of patches in a
     range and before a background."""
     size = np.sqrt(own / len(WITHIN)).astype(np.float32)[:, None, None, None]
-    seen, viewed = some.seen * size, some.viewed * size
-    white = background.whitener @ spectra
-    single = [
-        _Hypothesis.of(seen[:, d], viewed[:, d], white, background, weights=frame.weights, most=len(WITHIN))
-        for d in range(seen.shape[1])
-    ]
-    gains = np.concatenate([one.gains for one in single])
+    seen = some.seen * size
+    alone = seen.reshape(len(seen), -1, seen.shape[3]) @ background.unmixed.swapaxes(1, 2)
+    beside = np.asarray(some.viewed * size - alone.reshape(some.viewed.shape), dtype=np.complex64)
+    directions = _Directions.of(some, own, background.whitener)
+    single = _each_of(directions, beside)
+    low = directions.projector @ spectra
+    gains = _likely_gains(single, low, frame.weights)
     _, prior = _weighed(gains, np.full(len(gains), 1 / len(gains)))
     histogram = prior.reshape(len(single), -1).sum(axis=1)
-    share = np.sqrt(0.98 * histogram + 0.02 / len(histogram)).astype(np.float32)[None, :, None, None]
-    flat = [(part * share).reshape(len(part), -1, part.shape[-1]) for part in (seen, viewed)]
-    together = _Hypothesis.of(flat[0], flat[1], white, background, weights=frame.weights, most=_ALL)
-    del white
-    gains = np.concatenate([gains, together.gains])
-    count = len(together.gains)
+    together = _together(directions, beside, 0.98 * histogram + 0.02 / len(histogram))
+    gains = np.concatenate([gains, together.gains(low, frame.weights)])
+    count = len(STRENGTHS)
     odds, _ = _weighed(gains, np.concatenate([0.8 * prior, np.full(count, 0.2 / count)]))
-    return _expected(frame, [*single, together], odds, background, spectra)
+    moved, variance = _expected(frame, [*single, together], odds, low)
+    moved += background.unmixed @ spectra
+    return moved, variance
+
+
+def _likely_gains(hypotheses: list[_Hypothesis], low: Complexes, weights: Singles) -> Floats:
+    """(C, N) `gains` of projected patches, −inf where a few frequencies show that a hypothesis is not likely."""
+    few = slice(None, None, _TRIED)
+    shape = len(hypotheses), len(STRENGTHS), low.shape[2]
+    tried = np.concatenate([one.at(few).gains(low[few], weights[few]) for one in hypotheses])
+    tried = tried.reshape(shape)
+    best = tried.max(axis=1)
+    likely = best >= best.max(axis=0) - _LIKELY_NATS
+    gains = np.full(shape, -np.inf)
+    for one, members, found in zip(hypotheses, likely, gains, strict=True):
+        if members.any():
+            found[:, members] = one.gains(low[:, :, members], weights)
+    return gains.reshape(-1, shape[2])
 
 
 def _weighed(gains: Floats, prior: Floats) -> tuple[Floats, Floats]:
@@ -142,32 +187,51 @@ def _weighed(gains: Floats, prior: Floats) -> tuple[Floats, Floats]:
 
 
 def _expected(
-    frame: FrameModel, hypotheses: list[_Hypothesis], odds: Floats, background: PatchBackground, spectra: Complexes
+    frame: FrameModel, hypotheses: list[_Hypothesis], odds: Floats, low: Complexes
 ) -> tuple[Complexes, Floats]:
-    """The views' spectra (F, V·U, N), averaged over hypotheses, and their variance (V·U, N) a pixel, with that between
-    hypotheses, but for what each view has alone."""
+    """What is added to the views' spectra (F, V·U, N) that each has alone, averaged over hypotheses, and their variance
+    (V·U, N) a pixel, with that between hypotheses, but for what each view has alone; of projected patches."""
     count = len(STRENGTHS)
     patches = odds.shape[1]
     probable = odds.reshape(len(hypotheses), count, patches)
     probable = np.where(probable.sum(axis=1, keepdims=True) > _NEGLIGIBLE, probable, 0)
     probable /= probable.sum(axis=(0, 1))
+    # One hypothesis has no variance between hypotheses.
+    several = np.count_nonzero(probable.any(axis=1), axis=0) > 1
     multiplicity = frame.multiplicity.astype(np.float32)
-    moved = np.zeros((len(spectra), frame.alone.shape[1], patches), dtype=np.complex64)
+    moved = np.zeros((len(low), frame.alone.shape[1], patches), dtype=np.complex64)
     variance = np.zeros(moved.shape[1:])
-    for one, some in zip(hypotheses, probable, strict=True):
-        odd = some.astype(np.float32)
+    for one, odd in zip(hypotheses, probable, strict=True):
         used = np.flatnonzero(odd.sum(axis=0))
         if not len(used):
             continue
         scaled = STRENGTHS[:, None, None]
         shares = scaled / (1 + scaled * one.strength)  # (strengths, F, R)
-        shrunk = np.tensordot(shares, odd[:, used], axes=(0, 0))
-        part = one.viewed.transpose(0, 2, 1) @ (shrunk * one.projected[:, :, used])
-        moved[:, :, used] += part
-        squares = np.einsum("fvn,f->vn", part.real**2 + part.imag**2, multiplicity)
-        variance[:, used] += squares / odd[:, used].sum(axis=0)
+        shown = one.rows.shape[1]
+        shrunk = np.tensordot(shares[:, :, -shown:], odd[:, used], axes=(0, 0)).astype(np.float32)
+        found = shrunk * (one.rows @ low[:, :, used])
+        viewed = one.viewed[:, -shown:]
+        moved[:, :, used] += viewed.transpose(0, 2, 1) @ found
+        between = several[used]
+        if between.any():
+            squares = _squares(viewed, found[:, :, between], multiplicity)
+            variance[:, used[between]] += squares / odd[:, used[between]].sum(axis=0)
         weighted = (np.abs(one.viewed) ** 2 * multiplicity[:, None, None]).reshape(-1, moved.shape[1])
         variance += (shares.reshape(count, -1) @ weighted).T @ odd
-    spread = np.einsum("fvn,f->vn", moved.real**2 + moved.imag**2, multiplicity)
-    # All hypotheses but one are negligible in most patches: there the two cancel but for rounding.
-    return background.unmixed @ spectra + moved, np.maximum(variance - spread, 0) / SIDE**2
+    if several.any():
+        some = moved[:, :, several]
+        variance[:, several] -= np.einsum("fvn,f->vn", some.real**2 + some.imag**2, multiplicity)
+    return moved, np.maximum(variance, 0) / SIDE**2
+
+
+def _squares(viewed: Complexes, found: Complexes, multiplicity: Singles) -> Singles:
+    """(V·U, n) sums over all frequencies of |views|², `viewed` (F, q, V·U) times what is `found` (F, q, n)."""
+    count = viewed.shape[1]
+    if count**2 > _FEW_PAIRS:
+        views = viewed.transpose(0, 2, 1) @ found
+        return np.asarray(np.einsum("fvn,f->vn", views.real**2 + views.imag**2, multiplicity))
+    pairs = (viewed[:, :, None] * viewed[:, None].conj() * multiplicity[:, None, None, None]).reshape(
+        -1, viewed.shape[2]
+    )
+    together = (found[:, :, None] * found[:, None].conj()).reshape(-1, found.shape[2])
+    return np.asarray((pairs.T @ together).real)

@@ -34,9 +34,11 @@ from dappled.decode.joint.patch_model import (
     USUAL_KINDS,
     FrameModel,
     LikelyKinds,
+    Rests,
     TexturePower,
     is_motionless,
     rests_of,
+    usual_nats,
 )
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
@@ -109,31 +111,33 @@ def joint_views(
     pixels, `reach` the largest usual disparity in sensor columns over the aperture, `astray` (patches,) the share of
     a patch's light that gets into each slice but the first, whatever its transfer, row by row of `sigma`; None: none.
     """
-    patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
-    cut, means = patches.less_means(patches.cut(slices), model.common()[: len(slices)])
+    patches, common = Patches((slices.shape[1], slices.shape[2]), SIDE), model.common()[: len(slices)]
+    first, means = patches.less_means(patches.cut(slices[:1]), common[:1])
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach, workers=workers)
-    group = _groups(cut[0].real, patches)
+    group = _groups(first[0].real, patches)
     rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
     stray = np.zeros(len(means)) if astray is None else astray
     # Patches that light goes astray in are apart, but have the spectrum of their group.
     parts = [
-        (alike, alike & (stray == share))
+        (alike, np.flatnonzero(alike & (stray == share)))
         for alike in (group == number for number in np.unique(group))
         for share in np.unique(stray[alike])
     ]
-    parts.sort(key=lambda part: -np.count_nonzero(part[1]))  # a large one that is left to the end is waited for
+    parts.sort(key=lambda part: -len(part[1]))  # a large one that is left to the end is waited for
     found: dict[int, _Looked] = {}
 
     def look(part: int) -> None:
         alike, members = parts[part]
         mean = float(np.sqrt(np.mean(means[alike] ** 2)))
-        ringing = rings * mean if group[members][0] == _TEXTURES else np.zeros(len(rings))
-        here = replace(frame, noise=frame.noise + ringing**2, astray=float(stray[members][0]))
-        found[part] = _Looked.of(here, patches.spectra(cut[:, alike]), mean, np.flatnonzero(members), members[alike])
+        ringing = rings * mean if group[members[0]] == _TEXTURES else np.zeros(len(rings))
+        here = replace(frame, noise=frame.noise + ringing**2, astray=float(stray[members[0]]))
+        power = (np.abs(patches.spectra(first[:, alike])[:, 0]) ** 2).mean(axis=1)
+        cut, _ = patches.less_means(patches.cut(slices, members), common)
+        found[part] = _Looked.of(here, power, mean, members, patches.spectra(cut))
 
     each(look, range(len(parts)), workers)
     looked = [found[part] for part in range(len(parts))]
-    made = _PatchViews.empty(patches, cut, means, model.aperture.views)
+    made = _PatchViews.empty(patches, means, model.aperture.views)
     each(made.solve, looked, workers)
     still = likely = np.zeros(len(means), dtype=bool)
     told: list[ToldPatches] = []
@@ -168,11 +172,10 @@ def joint_views(
 @dataclass(frozen=True, slots=True, eq=False)
 class _PatchViews:
     """The views of all patches while they are made: `windowed` (N, V·U, side, side) with `lit` (N, 1, side, side) of
-    their means, `variance` (V·U, N) and `of_apart` (N,) as in `_Solved`, and which are `beyond` (N,). What solves a
-    part writes its patches."""
+    their means, their `variance` (V·U, N) a pixel by the model, how much `of_apart` (N,) from the patches around is
+    added to it, and which patches are `beyond` (N,). What solves a part writes its patches."""
 
     patches: Patches
-    cut: Complexes
     lit: Singles
     windowed: Singles
     variance: Floats
@@ -180,32 +183,43 @@ class _PatchViews:
     beyond: NDArray[np.bool_]
 
     @classmethod
-    def empty(cls, patches: Patches, cut: Complexes, means: Floats, count: int) -> _PatchViews:
-        """Of patches cut from slices without their means, for `count` views an axis."""
+    def empty(cls, patches: Patches, means: Floats, count: int) -> _PatchViews:
+        """Of patches with these means, for `count` views an axis."""
         lit = (means[:, None, None] * patches.window).astype(np.float32)[:, None]
         windowed = np.empty((len(means), count * count, SIDE, SIDE), dtype=np.float32)
         variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
-        return cls(patches, cut, lit, windowed, variance, of_apart, np.zeros(len(means), dtype=bool))
+        return cls(patches, lit, windowed, variance, of_apart, np.zeros(len(means), dtype=bool))
 
     def solve(self, one: _Looked) -> None:
         """With any disparity."""
-        self._solve(one, one.members, one.likely.with_parallax, np.ones(len(one.members), dtype=bool))
+        self._solve(one, np.arange(len(one.members)), one.likely.with_parallax, np.ones(len(one.members), dtype=bool))
 
     def solve_at_rest(self, one: _Looked, still: NDArray[np.bool_], motionless: bool) -> None:
         """With hardly any parallax where patches are `still` (N,), and with none that a patch could tell where the
         frame is `motionless`."""
-        here = still[one.members]
+        here = np.flatnonzero(still[one.members])
         moved = (one.likely.moved >= MOVES_NATS) | (not motionless)
-        if here.any():
-            self._solve(one, one.members[here], one.likely.at_rest[here], moved[here])
+        self._solve(one, here, one.likely.at_rest[here], moved[here])
 
-    def _solve(
-        self, one: _Looked, members: NDArray[np.intp], kinds: NDArray[np.intp], moved: NDArray[np.bool_]
-    ) -> None:
-        found = _solve(one, kinds, moved, self.patches.spectra(self.cut[:, members]))
-        self.windowed[members] = self.patches.images(found.spectra) + self.lit[members]
-        self.variance[:, members], self.of_apart[members] = found.variance, found.of_apart
-        self.beyond[members] = found.beyond
+    def _solve(self, one: _Looked, which: NDArray[np.intp], kinds: NDArray[np.intp], moved: NDArray[np.bool_]) -> None:
+        """Solve `which` (N,) patches of a part, of these `kinds` (N,); those at rest that have not `moved` (N,) have no
+        parallax that a patch could tell."""
+        frame, own = one.frame, one.rests.own
+        for number in np.unique(kinds):
+            kind = KINDS[number]
+            background = PatchBackground.of(one.rests.of(number), frame.alone, kind.alone * own)
+            left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
+            for still in (False, True):
+                chosen = which[(kinds == number) & (moved != still)]
+                if not len(chosen):
+                    continue
+                some = frame.ranges[MOTIONLESS_RANGE if still else kind.range]
+                members = one.members[chosen]
+                made, found = views_at_any(frame, some, own, background, one.spectra[:, :, chosen])
+                self.windowed[members] = self.patches.images(made) + self.lit[members]
+                self.of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
+                self.variance[:, members] = of_alone * left + of_rest * found
+                self.beyond[members] = kind.range == BEYOND
 
     def told(self, one: _Looked, shares: Floats) -> list[ToldPatches]:
         """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
@@ -213,10 +227,12 @@ class _PatchViews:
         if not here.any():
             return []
         members = one.members[here]
-        found = views_told(one.frame, one.own, one.rests, self.patches.spectra(self.cut[:, members]), shares[members])
+        spectra, kinds = one.spectra[:, :, here], one.likely.with_parallax[here]
+        found = views_told(one.frame, one.rests, spectra, shares[members])
+        gained = found.nats - usual_nats(one.frame, one.rests, kinds, spectra)
         change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
         windowed = np.asarray(self.windowed[members] + _TRUST * change, dtype=np.float32)
-        return [ToldPatches(members, windowed, found.kinds, found.rest, found.nats - one.likely.nats[here])]
+        return [ToldPatches(members, windowed, found.kinds, found.rest, gained)]
 
     def take(self, told: list[ToldPatches], likely: NDArray[np.bool_]) -> None:
         """Take the views of patches as told, where those are `likely` (N,)."""
@@ -252,56 +268,22 @@ def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Solved:
-    """`spectra` (F, V·U, N) of the views, their `variance` (V·U, N) a pixel by the model, how much `of_apart` (N,) from
-    the patches around is added to it, and which patches are `beyond` (N,)."""
-
-    spectra: Complexes
-    variance: Floats
-    of_apart: Floats
-    beyond: NDArray[np.bool_]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """Patches of similar texture, the `members` (M,) of all: their `frame`, the power `own` (F,) of their texture, the
-    `rests` of each kind, and which kinds they are likely to be."""
+    """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, which kinds they
+    are likely to be, and their `spectra` (F, A, M)."""
 
     members: NDArray[np.intp]
     frame: FrameModel
-    own: Floats
-    rests: list[Complexes]
+    rests: Rests
     likely: LikelyKinds
+    spectra: Complexes
 
     @classmethod
     def of(
-        cls, frame: FrameModel, spectra: Complexes, mean: float, members: NDArray[np.intp], which: NDArray[np.bool_]
+        cls, frame: FrameModel, power: Floats, mean: float, members: NDArray[np.intp], spectra: Complexes
     ) -> _Looked:
-        """From the spectra (F, A, L) and mean of patches that look alike, and `which` (L,) of them the members are."""
-        power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
-        spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
-        own = spectrum.at(frame.radius(frame.frequencies))
-        rests = rests_of(frame, spectrum, own, mean)
-        return cls(members, frame, own, rests, LikelyKinds.of(frame, own, rests, spectra[:, :, which]))
-
-
-def _solve(looked: _Looked, chosen: NDArray[np.intp], moved: NDArray[np.bool_], spectra: Complexes) -> _Solved:
-    """The views of patches from their spectra (F, A, N), of the `chosen` kinds (N,); those at rest that have not
-    `moved` (N,) have no parallax that a patch could tell."""
-    frame, own, rests = looked.frame, looked.own, looked.rests
-    made = np.empty((len(own), frame.alone.shape[1], spectra.shape[2]), dtype=np.complex64)
-    variance, of_apart = np.empty(made.shape[1:]), np.empty(made.shape[2])
-    for number in np.unique(chosen):
-        kind = KINDS[number]
-        background = PatchBackground.of(rests[number], frame.alone, kind.alone * own)
-        left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
-        for still in (False, True):
-            members = np.flatnonzero((chosen == number) & (moved != still))
-            if not len(members):
-                continue
-            some = frame.ranges[MOTIONLESS_RANGE if still else kind.range]
-            of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
-            made[:, :, members], found = views_at_any(frame, some, own, background, spectra[:, :, members])
-            variance[:, members] = of_alone * left + of_rest * found
-    beyond = [number for number, kind in enumerate(KINDS) if kind.range == BEYOND]
-    return _Solved(made, variance, of_apart, np.isin(chosen, beyond))
+        """From the mean power (F,) of the first slice and the mean of all patches that look alike."""
+        radius = frame.radius(frame.frequencies)
+        spectrum = TexturePower.of(np.maximum(power - frame.noise[0], 0), radius)
+        rests = rests_of(frame, spectrum, spectrum.at(radius), mean)
+        return cls(members, frame, rests, LikelyKinds.of(frame, rests, spectra), spectra)

@@ -126,7 +126,7 @@ def _terms(
     workers: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.complex128], NDArray[np.intp]]:
     """The differences m (M, 2) of orders, the terms c (N, M) of each patch, and which patches these are."""
-    cut, means = patches.less_means(patches.cut(slices)[:, inner], model.common()[: len(slices)])
+    cut, means = patches.less_means(patches.cut(slices, inner), model.common()[: len(slices)])
     contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, patches.window**2)
     best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
     spectra = patches.spectra(cut[:, best])
@@ -138,7 +138,7 @@ def _terms(
     strength = (np.abs(spectra[1:, 0]) ** 2 / (own[1:, None] + frame.noise[0])).mean(axis=0)
     spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
     rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), _USUAL)
-    wholes = wholes_of(frame, own, rests, _USUAL)
+    wholes = wholes_of(frame, rests)
     whole = wholes[int(likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1).argmax())]
     inverse = np.linalg.inv(whole.astype(np.complex128)) * frame.weights[:, None, None]
     apart = model.orders[:, None] - model.orders[None, :]

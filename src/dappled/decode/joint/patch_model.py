@@ -64,13 +64,18 @@ KINDS: Sequence[PatchKind] = (
     PatchKind(USUAL, 1.0, 1.0, _ALONE_NATS),
     *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (FAR, BEYOND) for beyond in (0.1, 1.0, 4.0)),
 )
+_MOVES = np.array([kind.range != AT_REST for kind in KINDS])
 USUAL_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
 LEAST_NOISE = 1e-12  # variance: what a slice without noise counts as, so that its inverse is finite in double precision
 WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
+_TRIED = 3  # of so many frequencies one is looked at to choose the kind
+_UNSURE_NATS = 300.0  # by those: less is no choice
 _HYPOTHESES = 17  # disparities over a range, an eighth of the reach apart
+_AT_REST = 5  # over one next to 0: slices tell no more of them
 # In reaches: disparities of what folds in from beyond the band.
 _FOLDED = {AT_REST: np.linspace(-STILL, STILL, 3), USUAL: np.linspace(-0.6, 0.6, 5)}
 _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate
+_ROUNDING = 1e-9  # of the strongest direction's power: far below `_ERROR`
 _ERROR = 5e-4  # of a slice's power: what no light field explains
 _MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each slice
 
@@ -78,28 +83,37 @@ _MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each sl
 @dataclass(frozen=True, slots=True, eq=False)
 class DisparityRange:
     """Disparities that a patch may have, `disparities` (D·R,) in sensor columns over the aperture, ascending: `seen`
-    (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, R of them within each of D steps."""
+    (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, R of them within each of D steps. What is seen lies in
+    few directions: it is `within` (F, D, R, r) times a `basis` (F, r, A)."""
 
     disparities: Floats
     seen: Complexes
     viewed: Complexes
+    within: NDArray[np.complex128]
+    basis: NDArray[np.complex128]
 
     @classmethod
-    def of(cls, model: SliceModel, frequencies: Floats, nearest: float, farthest: float) -> DisparityRange:
-        """From |disparity| `nearest` to `farthest`, in sensor columns over the aperture."""
-        both = np.linspace(-farthest, farthest, _HYPOTHESES)
-        disparities = both
+    def of(
+        cls, model: SliceModel, frequencies: Floats, nearest: float, farthest: float, count: int = _HYPOTHESES
+    ) -> DisparityRange:
+        """From |disparity| `nearest` to `farthest`, in sensor columns over the aperture, `count` of them."""
+        disparities = np.linspace(-farthest, farthest, count)
         if nearest:
-            one = np.linspace(nearest, farthest, _HYPOTHESES // 2 + 1)[1:]
+            one = np.linspace(nearest, farthest, count // 2 + 1)[1:]
             disparities = np.concatenate([-one[::-1], one])
         step = disparities[1] - disparities[0]
         within = (disparities[:, None] + np.array(WITHIN) * step).ravel()
         shape = (len(disparities), len(WITHIN), len(frequencies), -1)
-        return cls(
-            within,
-            np.ascontiguousarray(model.seen(frequencies, within).reshape(shape).transpose(2, 0, 1, 3)),
-            np.ascontiguousarray(model.viewed(frequencies, within).reshape(shape).transpose(2, 0, 1, 3)),
+        seen, viewed = (
+            np.ascontiguousarray(part(frequencies, within).reshape(shape).transpose(2, 0, 1, 3))
+            for part in (model.seen, model.viewed)
         )
+        rows = seen.reshape(len(frequencies), -1, seen.shape[3]).astype(np.complex128)
+        strength, vectors = np.linalg.eigh(rows.swapaxes(1, 2) @ rows.conj())
+        count = int((strength > _ROUNDING * strength[:, -1:]).sum(axis=1).max())
+        vectors = vectors[:, :, -count:]
+        coefficients = (rows @ vectors.conj()).reshape(*seen.shape[:3], count)
+        return cls(within, seen, viewed, coefficients, vectors.swapaxes(1, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -144,7 +158,8 @@ class FrameModel:
 
         def make(number: int) -> None:
             near, far = RANGES[number]
-            found[number] = DisparityRange.of(model, frequencies, near * reach, far * reach)
+            count = _AT_REST if number in (AT_REST, MOTIONLESS_RANGE) else _HYPOTHESES
+            found[number] = DisparityRange.of(model, frequencies, near * reach, far * reach, count)
             if number in _FOLDED:
                 folds[number] = model.folds(frequencies, _FOLDED[number] * reach)
 
@@ -193,45 +208,76 @@ class TexturePower:
         return np.asarray(np.exp(inside) * (np.maximum(radius, self.edge) / self.edge) ** self.slope)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Rests:
+    """What is not the band's own detail in patches of some `kinds`: `plain` (F, A) variances of noise, covariances
+    (F, A, A) `from_beyond` the band, by range, and `lonely` (A, A) of what views have alone, over the power `own`
+    (F,)."""
+
+    kinds: Sequence[PatchKind]
+    plain: Floats
+    from_beyond: Mapping[int, Complexes]
+    lonely: Complexes
+    own: Floats
+
+    def of(self, number: int, some: slice = slice(None)) -> Complexes:
+        """The covariances (F, A, A) of a kind, at some frequencies."""
+        kind = self.kinds[number]
+        made = np.float32(kind.beyond) * self.from_beyond[min(kind.range, USUAL)][some]
+        made += np.float32(kind.alone) * self.own[some].astype(np.float32)[:, None, None] * self.lonely
+        diagonal = range(self.plain.shape[1])
+        made[:, diagonal, diagonal] += self.plain[some]
+        return made
+
+    def whole(self, number: int, detail: Complexes, some: slice = slice(None)) -> Complexes:
+        """The same with the `detail` (F, A, A) of the band itself."""
+        # More detail beyond the band than usual: there is as much more in it.
+        return self.of(number, some) + np.float32(max(1.0, self.kinds[number].beyond)) * detail
+
+    def variances(self, number: int) -> Floats:
+        """(F, A) of a kind: the diagonals of `of`."""
+        return np.asarray(np.einsum("faa->fa", self.of(number).real))
+
+
 def rests_of(
     frame: FrameModel, spectrum: TexturePower, own: Floats, mean: float, kinds: Sequence[PatchKind] = KINDS
-) -> list[Complexes]:
-    """Covariances (F, A, A) of what is not the band's own detail, one of each kind of patch."""
+) -> Rests:
+    """What is not the band's own detail, of each kind of patch."""
     size = len(frame.noise)
     through = (np.abs(frame.ranges[USUAL].seen) ** 2).mean(axis=(1, 2, 3)) * own
-    plain = np.zeros((len(own), size, size), dtype=np.complex64)
     own_noise = frame.noise + LEAST_NOISE + _ERROR * through[:, None]
     means = frame.lowest * (mean * SIDE) ** 2
     own_noise = own_noise + _MEAN_ERROR**2 * means[:, None] * np.abs(frame.model.transfers) ** 2
     own_noise[:, 1:] += frame.astray**2 * (own + means)[:, None]
-    plain[:, range(size), range(size)] = own_noise
     from_beyond = {
         number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size)
         for number, some in frame.folds.items()
     }
-    lonely = (frame.alone @ frame.alone.conj().T).astype(np.complex64) * own.astype(np.float32)[:, None, None]
-    return [
-        plain + np.float32(kind.beyond) * from_beyond[min(kind.range, USUAL)] + np.float32(kind.alone) * lonely
-        for kind in kinds
-    ]
+    lonely = (frame.alone @ frame.alone.conj().T).astype(np.complex64)
+    return Rests(kinds, own_noise, from_beyond, lonely, own)
 
 
-def detail_of(some: DisparityRange, own: Floats) -> Complexes:
-    """(F, A, A) covariance of the band's own detail, of all disparities of a range at once."""
-    flat = some.seen.reshape(len(own), -1, some.seen.shape[3]).transpose(0, 2, 1)
+def detail_of(seen: Complexes, own: Floats) -> Complexes:
+    """(F, A, A) covariance of the band's own detail, of all disparities of a range at once, `seen` (F, D, R, A)."""
+    flat = seen.reshape(len(own), -1, seen.shape[3]).transpose(0, 2, 1)
     waves = flat * np.sqrt(own / flat.shape[2]).astype(np.float32)[:, None, None]
     return np.asarray(waves @ waves.conj().transpose(0, 2, 1))
 
 
-def wholes_of(
-    frame: FrameModel, own: Floats, rests: list[Complexes], kinds: Sequence[PatchKind] = KINDS
-) -> list[Complexes]:
-    """Covariances (F, A, A) of slices, from those of the rest, one of each kind of patch."""
-    details = {number: detail_of(frame.ranges[number], own) for number in {kind.range for kind in kinds}}
-    # More detail beyond the band than usual: there is as much more in it.
-    return [
-        rest + np.float32(max(1.0, kind.beyond)) * details[kind.range] for rest, kind in zip(rests, kinds, strict=True)
-    ]
+def wholes_of(frame: FrameModel, rests: Rests, some: slice = slice(None)) -> list[Complexes]:
+    """Covariances (F, A, A) of slices at some frequencies, one of each kind of patch."""
+    ranges = {kind.range for kind in rests.kinds}
+    details = {number: detail_of(frame.ranges[number].seen[some], rests.own[some]) for number in ranges}
+    return [rests.whole(number, details[kind.range], some) for number, kind in enumerate(rests.kinds)]
+
+
+def usual_nats(frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra: Complexes) -> Floats:
+    """(N,) log likelihoods of patches (F, A, N) that are of these `kinds` (N,), all of the usual range."""
+    detail, found = detail_of(frame.ranges[USUAL].seen, rests.own), np.empty(len(kinds))
+    for number in map(int, np.unique(kinds)):
+        here = kinds == number
+        found[here] = likelihoods([rests.whole(number, detail)], spectra[:, :, here], frame.weights)[0]
+    return found
 
 
 def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
@@ -270,28 +316,45 @@ def likelihoods(wholes: list[Complexes], spectra: Complexes, weights: Singles, w
 class LikelyKinds:
     """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats hardly any parallax
     is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods tell badly: small
-    parallax, too, is explained better by folded detail in free amounts. `nats` (N,) is the log likelihood of the kind
-    with parallax."""
+    parallax, too, is explained better by folded detail in free amounts."""
 
     with_parallax: NDArray[np.intp]
     at_rest: NDArray[np.intp]
     moved: Floats
-    nats: Floats
 
     @classmethod
-    def of(cls, frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes) -> LikelyKinds:
+    def of(cls, frame: FrameModel, rests: Rests, spectra: Complexes) -> LikelyKinds:
         """Of patches (F, A, N) with these `rests_of` their group."""
-        nats = likelihoods(wholes_of(frame, own, rests), spectra, frame.weights)
-        nats -= np.array([[kind.nats] for kind in KINDS])
-        still = np.array([number for number, kind in enumerate(KINDS) if kind.range == AT_REST])
-        others = np.array([number for number, kind in enumerate(KINDS) if kind.range != AT_REST])
+        few = slice(None, None, _TRIED)
+        weights = frame.weights[few] * (frame.weights.sum() / frame.weights[few].sum())
+        tried = likelihoods(wholes_of(frame, rests, few), spectra[few], weights)
+        tried -= np.array([[kind.nats] for kind in KINDS])
+        with_parallax, at_rest = (
+            _most_likely(frame, rests, spectra, np.where(chosen[:, None], tried, -np.inf))
+            for chosen in (_MOVES, ~_MOVES)
+        )
         hardly, not_at_all = (
-            at_rest_nats(frame, some, own, rests, spectra)
+            at_rest_nats(frame, some, rests, spectra)
             for some in (frame.ranges[AT_REST], frame.ranges[MOTIONLESS_RANGE])
         )
-        best = others[nats[others].argmax(axis=0)]
-        at_rest = still[nats[still].argmax(axis=0)]
-        return cls(best, at_rest, hardly - not_at_all, nats[others].max(axis=0))
+        return cls(with_parallax, at_rest, hardly - not_at_all)
+
+
+def _most_likely(frame: FrameModel, rests: Rests, spectra: Complexes, tried: Floats) -> NDArray[np.intp]:
+    """(N,) the most probable kinds of patches (F, A, N), by the log likelihoods (B, N) of a few frequencies where these
+    are sure of it, else of all."""
+    likely = tried >= tried.max(axis=0) - _UNSURE_NATS
+    likely &= np.count_nonzero(likely, axis=0) > 1
+    nats = tried.copy()
+    details: dict[int, Complexes] = {}
+    for number in map(int, np.flatnonzero(likely.any(axis=1))):
+        kind, here = rests.kinds[number], likely[number]
+        if kind.range not in details:
+            details[kind.range] = detail_of(frame.ranges[kind.range].seen, rests.own)
+        whole = rests.whole(number, details[kind.range])
+        nats[number, here] = likelihoods([whole], spectra[:, :, here], frame.weights)[0] - kind.nats
+    unsure = likely.any(axis=0)
+    return np.asarray(np.where(unsure, np.where(likely, nats, -np.inf).argmax(axis=0), tried.argmax(axis=0)))
 
 
 def is_motionless(moved: Floats) -> bool:
@@ -299,20 +362,18 @@ def is_motionless(moved: Floats) -> bool:
     return float(np.median(moved)) < _MOVED_NATS
 
 
-def at_rest_nats(
-    frame: FrameModel, some: DisparityRange, own: Floats, rests: list[Complexes], spectra: Complexes
-) -> Floats:
+def at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra: Complexes) -> Floats:
     """(N,) log likelihoods of patches (F, A, N) whose disparities are in a range next to 0.
 
     Each slice then holds what is common to all views, and detail that folds in, in an amount of its own at each
     frequency: a straight edge has far more in one direction than in others, and looks like parallax where one amount
     is for all.
     """
-    common = frame.model.common()
+    common, own = frame.model.common(), rests.own
     seen = some.seen
     moved = (np.abs(seen - common.astype(np.complex64) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
     moved[:, 0] = own
-    base, once = (np.einsum("faa->fa", rest.real) for rest in rests[:2])  # without detail beyond the band, and with it
+    base, once = (rests.variances(number) for number in (0, 1))  # without detail beyond the band, and with it
     varied = once - base + moved
     found = np.zeros((len(_USUAL_AMOUNTS), spectra.shape[2]))
     for number, turn in enumerate(common):

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.array_types import Complexes, Floats, Singles
+from dappled.workers import spans
+
+_AT_A_TIME = 128  # patches: what is worked on stays small
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,11 +65,13 @@ class Patches:
         at = np.arange(self.side * columns) % columns
         return np.where((at == 0) | (2 * at == self.side), 1.0, 2.0)
 
-    def cut(self, images: NDArray[Any]) -> NDArray[Any]:
-        """(K, N, side, side) the patches of images (K, h, w), continued at their edges by reflection."""
-        n = self.side
+    def cut(self, images: NDArray[Any], which: NDArray[np.intp] | None = None) -> NDArray[Any]:
+        """(K, N, side, side) the patches of images (K, h, w), continued at their edges by reflection; or `which` (N,)
+        of them."""
+        n, corners = self.side, self.corners
         wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), mode="symmetric")
-        return np.stack([wide[:, top : top + n, left : left + n] for top, left in self.corners], axis=1)
+        chosen = corners if which is None else [corners[one] for one in which]
+        return np.stack([wide[:, top : top + n, left : left + n] for top, left in chosen], axis=1)
 
     def less_means(self, patches: Complexes, common: NDArray[np.complex128]) -> tuple[Complexes, Floats]:
         """The patches (K, N, side, side), in their place, without their means (N,) by the window: those of the first
@@ -81,10 +86,16 @@ class Patches:
         first's, scaled so that white noise keeps its variance."""
         columns = self.side // 2 + 1
         scaled = (self.window * (2 / self.side)).astype(np.float32)
-        whole = fft.fft2(patches * scaled)
-        mirrored = np.conj(np.roll(whole[1:, :, ::-1, ::-1], 1, axis=(-2, -1)))
-        both = np.concatenate([whole[..., :columns], mirrored[..., :columns]])
-        return np.ascontiguousarray(both.reshape(*both.shape[:2], -1).transpose(2, 0, 1))
+        back = -np.arange(self.side)
+        half = np.ix_(back, back[:columns])
+        count = len(patches)
+        found = np.empty((self.side * columns, 2 * count - 1, patches.shape[1]), dtype=np.complex64)
+        for some in spans(patches.shape[1], _AT_A_TIME):
+            whole = fft.fft2(patches[:, some] * scaled)
+            mirrored = whole[1:, :, half[0], half[1]].conj()
+            for at, part in ((slice(count), whole[..., :columns]), (slice(count, None), mirrored)):
+                found[:, at, some] = part.reshape(*part.shape[:2], len(found)).transpose(2, 0, 1)
+        return found
 
     def images(self, spectra: Complexes) -> Singles:
         """(N, V, side, side) the windowed patches of real images from their half spectra (F, V, N)."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,11 +75,8 @@ class SliceModel:
 
     def viewed(self, frequencies: Floats, disparities: Floats) -> Complexes:
         """(D, F, V·U) the same in the views. A view whose cell is closed sees what its middle would."""
-        at = (-disparities[:, None, None] * frequencies).reshape(-1, 2)
-        share = self.aperture.cells(np.zeros((1, 2)))[0].real
-        middle = np.exp(2j * np.pi * at @ self.aperture.points().T)
-        cells = np.where(share > 1e-6, self.aperture.cells(at) / np.maximum(share, 1e-6), middle)
-        return cells.reshape(len(disparities), len(frequencies), -1).astype(np.complex64)
+        found = _viewed(self.aperture, frequencies.tobytes(), disparities.tobytes())
+        return found.reshape(len(disparities), len(frequencies), -1)
 
     def folds(self, frequencies: Floats, disparities: Floats) -> list[Fold]:
         """Detail that folds in from beyond the band, at any of these disparities with equal odds."""
@@ -94,6 +92,20 @@ class SliceModel:
             waves = self.transfers[source] * through / np.sqrt(len(disparities))
             found.append(Fold(to, out, waves.astype(np.complex64).transpose(1, 2, 0)))
         return found
+
+
+@lru_cache(maxsize=8)  # the frames of a flight have these in common, whatever aperture each was fitted
+def _viewed(aperture: Aperture, frequencies: bytes, disparities: bytes) -> Complexes:
+    """(D·F, V·U) what the views hold of frequencies (F, 2) at disparities (D,), both float64."""
+    at = np.frombuffer(frequencies).reshape(-1, 2)
+    at = (-np.frombuffer(disparities)[:, None, None] * at).reshape(-1, 2)
+    share = aperture.cells(np.zeros((1, 2)))[0].real
+    closed = share <= 1e-6
+    cells = aperture.cells(at) / np.where(closed, 1, share)
+    cells[:, closed] = np.exp(2j * np.pi * at @ aperture.points()[closed].T)
+    made = cells.astype(np.complex64)
+    made.flags.writeable = False
+    return made
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,7 +19,7 @@ from scipy import ndimage
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.depth_map import nearest_known
 from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackground
-from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, nats_of
+from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, Rests, nats_of
 from dappled.decode.joint.patches import Patches
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
@@ -89,16 +89,16 @@ class ToldViews:
     nats: Floats
 
 
-def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: Complexes, shares: Floats) -> ToldViews:
-    """The views of patches (F, A, N) with the power `own` (F,) and the `rests_of` their group, which have these
-    `shares` (N, D), of sum 1, of the usual range's disparities."""
-    usual = frame.ranges[USUAL]
+def views_told(frame: FrameModel, rests: Rests, spectra: Complexes, shares: Floats) -> ToldViews:
+    """The views of patches (F, A, N) with the `rests_of` their group, which have these `shares` (N, D), of sum 1, of
+    the usual range's disparities."""
+    usual, own = frame.ranges[USUAL], rests.own
     size = np.sqrt(own).astype(np.float32)[:, None, None]
     seen, viewed = (part.reshape(len(own), -1, part.shape[3]) * size for part in (usual.seen, usual.viewed))
     nats = np.empty((len(USUAL_KINDS), len(shares)))
     few = slice(None, None, _TRIED)
     for number, one in zip(USUAL_KINDS, nats, strict=True):
-        background = PatchBackground.of(rests[number][few], frame.alone, KINDS[number].alone * own[few])
+        background = PatchBackground.of(rests.of(number, few), frame.alone, KINDS[number].alone * own[few])
         there = _Whitened.of(seen[few], background, spectra[few])
         one[:] = frame.weights[few] @ there.without
         for members, mix in _mixes(there, shares):
@@ -108,7 +108,7 @@ def views_told(frame: FrameModel, own: Floats, rests: list[Complexes], spectra: 
     rest, likely = np.empty(made.shape[1:]), np.empty(len(kinds))
     for number in np.unique(kinds):
         chosen = np.flatnonzero(kinds == number)
-        background = PatchBackground.of(rests[number], frame.alone, KINDS[number].alone * own)
+        background = PatchBackground.of(rests.of(number), frame.alone, KINDS[number].alone * own)
         there = _Whitened.of(seen, background, spectra[:, :, chosen])
         beside = (viewed - seen @ background.unmixed.transpose(0, 2, 1)).astype(np.complex64)
         coefficients = np.zeros((len(own), seen.shape[1], len(chosen)), dtype=np.complex64)
