@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -24,8 +25,10 @@ from tests.drivers.mavlink.true_logs import (
     BOOT_US,
     SPAN_S,
     UTC_US,
+    Row,
     add_px4_triggers,
     add_triggers,
+    rewritten,
     ulog_written,
     written,
 )
@@ -34,6 +37,7 @@ from tests.standing import failure
 
 TIMES_S = {number: 0.5 + 0.5 * number for number in range(1, 10)}  # 1.0 s to 5.0 s
 LINK_US = 20_000
+AGAIN_US = BOOT_US + 2_700_000  # since when an autopilot is on that has started again, in the first one's time
 OWN, STATION = "mavlink:1/1", "mavlink:255/190"
 _Shot = tuple[float, str, str, int | None]  # time on the path, source, kind, number
 
@@ -68,6 +72,7 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
         time_delays_s: Sequence[float] = (0.0,),
         ahead_s: float = 0.0,
         fired_by: str = "",
+        again_s: float = math.inf,
         fed_back: Sequence[tuple[float, int, int]] = (),
     ) -> Path:
         settings = {"camera": {"driver": "folder", "shutter": fired_by}} if fired_by else {}
@@ -76,9 +81,10 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
         packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
         for step in range(-2, round(2 * ends_s)):
             t_us = 250_000 + 500_000 * step
+            boot_us = BOOT_US + t_us - (AGAIN_US if t_us >= again_s * 1e6 else 0)
             utc_us = UTC_US + t_us + round((late_s + ahead_s) * 1e6)
             delay_us = round(time_delays_s[step % len(time_delays_s)] * 1e6)
-            message = mavlink.MAVLink_system_time_message(utc_us, (BOOT_US + t_us) // 1000)
+            message = mavlink.MAVLink_system_time_message(utc_us, boot_us // 1000)
             flight.telemetry.append(UTC_US + t_us + LINK_US + delay_us, pack(message, packer, version_1=False))
         for t_s, _, _, number in heard:
             command = mavlink.MAVLink_command_long_message(
@@ -338,6 +344,32 @@ def test_triggers_after_the_flight_are_counted_and_not_lost(fly: Callable[..., P
     add_triggers(bin_log, TIMES_S)
     found = three_books.reconcile(fly(requested({1: TIMES_S[1], 2: TIMES_S[2]}), ends_s=1.9), [bin_log])
     assert (found.triggers, found.elsewhere, found.balanced) == (2, 7, True)
+
+
+@pytest.mark.parametrize("lost", [(), (2, 7), (3, 4)])
+def test_each_trigger_around_a_restart_is_in_the_book_of_its_power_up(
+    fly: Callable[..., Path], bin_log: Path, tmp_path: Path, lost: tuple[int, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The autopilot crashed after four triggers and counted from 1 again within seconds: the second 1 to 4 seemed to be
+    the first ones again. Lost on the link are the triggers `lost`, of all nine."""
+    (tmp_path / "again").mkdir()
+
+    def later(name: str, row: Row) -> list[tuple[str, Row]]:
+        return [(name, (row[0] - AGAIN_US, *row[1:]))] if row[0] >= AGAIN_US else []
+
+    again = rewritten(written(tmp_path / "again")[0], later)
+    add_triggers(bin_log, {number: TIMES_S[number] for number in range(1, 5)})
+    add_triggers(again, {number - 4: TIMES_S[number] - AGAIN_US / 1e6 for number in range(5, 10)})
+    shots = [
+        (t_s, OWN, "IMAGE_START_CAPTURE", number if number < 5 else number - 4)
+        for number, t_s in TIMES_S.items()
+        if number not in lost
+    ]
+    flight = fly(shots, again_s=2.7)
+    code, said = report(capsys, flight, "--log", bin_log, "--log", again)
+    named = [line.split(" at ")[0] for line in said if line.startswith(("lost", "doubled", "phantom", "refused"))]
+    assert named == [f"lost: trigger {number if number < 5 else number - 4}" for number in lost]
+    assert code == bool(lost)
 
 
 def test_a_log_of_another_start_is_refused(

@@ -1,7 +1,8 @@
 """Reconcile three books after landing: the triggers in the autopilot's own log, the flight's shots, and its files.
 
 The log is placed in the flight by the autopilot's time (SYSTEM_TIME in the telemetry): a log of another boot is
-refused. A trigger and a shot are the same where the shot has the trigger's number, within `_NUMBERED_US`. Shots whose
+refused. A trigger and a shot are the same where the shot has the trigger's number, within `_NUMBERED_US` and in the
+same power-up of the autopilot, as numbers begin again with each. Shots whose
 message has no number (DO_DIGICAM_CONTROL, PX4's commands) belong to the triggers left by order and time (`in_order`),
 which may leave a doubt; shots of ground stations to one within `_BROADCAST_US`, which the autopilot executed too.
 """
@@ -13,8 +14,9 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import pairwise
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -110,13 +112,32 @@ class ThreeBooks:
 
 @dataclass(frozen=True, slots=True)
 class _Trigger:
-    """A trigger on the daemon's clock (`at_us`); `passed_over`: numbers since the one before it in the log."""
+    """A trigger on the daemon's clock (`at_us`), of one of `_PowerUps`; `passed_over`: numbers since the one before it
+    in the log."""
 
     logged: LoggedTrigger
+    power_up: int
     at_us: int
     utc_us: int
     numbered: frozenset[str]  # the kinds of messages that have its number
     passed_over: range = range(0)
+
+
+@dataclass(frozen=True, slots=True)
+class _PowerUps:
+    """When the autopilot started, µs on the daemon's clock, in order: as its logs say."""
+
+    starts_us: tuple[int, ...]
+
+    @classmethod
+    def of_logs(cls, boots_us: Sequence[int]) -> Self:
+        """Of the starts of several logs: one start may have several."""
+        ordered = sorted(boots_us)
+        return cls(tuple(b for a, b in pairwise([-(2**62), *ordered]) if b - a > _SAME_BOOT_US))
+
+    def of(self, at_us: int) -> int:
+        """The one that an instant is of, by place."""
+        return max(0, bisect_right(self.starts_us, at_us) - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,17 +213,21 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     read = [(path, _read(path, settings.mavlink.cam_idx, bounds)) for path in logs]
     logged = any(log.triggers for _, log in read)
     triggers: list[_Trigger] = []
-    spans, elsewhere, steady = [], 0, True
-    for path, log in read:
-        offsets, late_us = _placed(path, log, heard)
-        steady = steady and late_us <= _STEADY_US
+    spans, elsewhere = [], 0
+    placed = [_placed(path, log, heard) for path, log in read]
+    steady = all(late_us <= _STEADY_US for _, late_us in placed)
+    power_ups = _PowerUps.of_logs([_at_us(0, offsets) for offsets, _ in placed])
+    for (_, log), (offsets, _) in zip(read, placed, strict=True):
         if logged:
             spans.append((_at_us(log.begins_us, offsets), _at_us(log.ends_us, offsets)))
-        within = [one for one in _triggers(log, offsets) if (heard.first_us or 0) <= one.at_us <= heard.last_us]
+        power_up = power_ups.of(_at_us(0, offsets) + _SAME_BOOT_US)
+        within = [
+            one for one in _triggers(log, offsets, power_up) if (heard.first_us or 0) <= one.at_us <= heard.last_us
+        ]
         elsewhere += len(log.triggers) - len(within)
         triggers += within
     contacts = [log.contacts for _, log in read if log.contacts is not None]
-    pairs = _paired(triggers, found, steady=steady)
+    pairs = _paired(triggers, found, power_ups, steady=steady)
     made = [pairs.shots[place] for place in sorted(pairs.shots)]
     uncovered = tuple(
         index
@@ -220,7 +245,7 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
         elsewhere=elsewhere,
         uncovered=uncovered,
         imbalances=tuple(
-            _Comparison(triggers, pairs, found, heard, settings.camera.fired_outside).imbalances(uncovered)
+            _Comparison(triggers, pairs, found, heard, power_ups, settings.camera.fired_outside).imbalances(uncovered)
         ),
         findings=()
         if logged
@@ -300,26 +325,26 @@ def _at_us(boot_us: int, offsets: tuple[Floats, Floats]) -> int:
     return boot_us + int(begins) + round(float(np.interp(boot_us, boots_us, offsets_us - begins)))
 
 
-def _triggers(log: TriggerLog, offsets: tuple[Floats, Floats]) -> Iterator[_Trigger]:
+def _triggers(log: TriggerLog, offsets: tuple[Floats, Floats], power_up: int) -> Iterator[_Trigger]:
     kinds = ("CAMERA_TRIGGER",) if log.by == "PX4" else ("CAMERA_FEEDBACK", "IMAGE_START_CAPTURE")
     before: int | None = None
     for one in log.triggers:
         passed = range(0 if before is None else before + 1, 0 if before is None else one.number)
         at_us, utc_us = _at_us(one.boot_us, offsets), log.clock.utc_us(one.boot_us)
-        yield _Trigger(one, at_us, utc_us, frozenset(kinds), passed)
+        yield _Trigger(one, power_up, at_us, utc_us, frozenset(kinds), passed)
         before = one.number
 
 
-def _paired(triggers: Sequence[_Trigger], flight: _Flight, *, steady: bool) -> _Pairs:
+def _paired(triggers: Sequence[_Trigger], flight: _Flight, power_ups: _PowerUps, *, steady: bool) -> _Pairs:
     """What belongs together. `steady`: the links delay nothing much, so the log is placed well."""
     repeated: dict[int, int] = {}
-    last: dict[int, int] = {}
+    last: dict[tuple[int, int], int] = {}
     for place, one in enumerate(triggers):
-        earlier = last.get(one.logged.number)
+        earlier = last.get((one.power_up, one.logged.number))
         if earlier is not None and one.at_us - triggers[earlier].at_us <= _NUMBERED_US:
             repeated[place] = earlier
         else:
-            last[one.logged.number] = place
+            last[one.power_up, one.logged.number] = place
     shots = sorted(flight.rows, key=flight.at_us)
     numbered, nearby = [], []
     for place, one in enumerate(triggers):
@@ -329,7 +354,7 @@ def _paired(triggers: Sequence[_Trigger], flight: _Flight, *, steady: bool) -> _
         for index in shots[first : bisect_right(shots, one.at_us + _NUMBERED_US, key=flight.at_us)]:
             away_us = abs(flight.at_us(index) - one.at_us)
             number = _number(flight, index, one.numbered)
-            if number is not None and number == one.logged.number:
+            if number == one.logged.number and power_ups.of(flight.at_us(index)) == one.power_up:
                 numbered.append((away_us, place, index))
             elif away_us <= _BROADCAST_US and not flight.of_autopilot(index):
                 nearby.append((away_us, place, index))
@@ -382,13 +407,16 @@ class _Comparison:
     pairs: _Pairs
     flight: _Flight
     heard: _Heard
+    power_ups: _PowerUps
     outside: bool
 
     def imbalances(self, uncovered: Sequence[int]) -> Iterator[Imbalance]:
         """What does not balance, but for shots that no log covers."""
         kinds = frozenset[str]().union(*(one.numbered for one in self.triggers))
-        known = {one.logged.number for one in self.triggers}
-        known |= {number for index in self.flight.rows if (number := _number(self.flight, index, kinds)) is not None}
+        known = {(one.power_up, one.logged.number) for one in self.triggers}
+        for index in self.flight.rows:
+            if (number := _number(self.flight, index, kinds)) is not None:
+                known.add((self.power_ups.of(self.flight.at_us(index)), number))
         for place, one in enumerate(self.triggers):
             yield from _passed_over(one, known)
             yield from self._of_trigger(place, one)
@@ -426,7 +454,11 @@ class _Comparison:
     def _reached(self, one: _Trigger) -> bool:
         """Whether a message with a trigger's number reached the camera."""
         heard = (self.heard.numbers.get((kind, one.logged.number), []) for kind in one.numbered)
-        return any(abs(stamp_us - one.at_us) <= _NUMBERED_US for times in heard for stamp_us in times)
+        return any(
+            abs(stamp_us - one.at_us) <= _NUMBERED_US and self.power_ups.of(stamp_us) == one.power_up
+            for times in heard
+            for stamp_us in times
+        )
 
     def _of_shot(self, index: int) -> Iterator[Imbalance]:
         """A shot without a trigger of its own: a second one of a trigger, or the autopilot's without any."""
@@ -437,6 +469,7 @@ class _Comparison:
             one = self.triggers[place]
             away_us = abs(flight.at_us(index) - one.at_us - delay_us)
             same = _number(flight, index, one.numbered) == one.logged.number and away_us <= _NUMBERED_US
+            same = same and self.power_ups.of(flight.at_us(index)) == one.power_up
             if same or away_us <= _BROADCAST_US:
                 at, number = (one.utc_us * 1000, one.logged.place), one.logged.number
                 reason = finding(Code.TRIGGER_TWO_SHOTS, Subject("trigger", number))
@@ -450,7 +483,7 @@ class _Comparison:
             )
 
 
-def _passed_over(one: _Trigger, known: set[int]) -> Iterator[Imbalance]:
+def _passed_over(one: _Trigger, known: set[tuple[int, int]]) -> Iterator[Imbalance]:
     """Numbers before a trigger that neither its log nor a shot has."""
     number, at = one.logged.number, (one.utc_us * 1000, one.logged.place)
     if len(one.passed_over) > _MOST_PASSED_OVER:
@@ -458,7 +491,7 @@ def _passed_over(one: _Trigger, known: set[int]) -> Iterator[Imbalance]:
         yield Imbalance("lost", number, (), *at, set_back)
         return
     for missing in one.passed_over:
-        if missing not in known:
+        if (one.power_up, missing) not in known:
             reason = finding(Code.TRIGGER_PASSED_OVER, Subject("trigger", missing), before=number)
             yield Imbalance("lost", missing, (), *at, reason)
 
