@@ -16,7 +16,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.own_autopilot import SystemIdentity
 from dappled.daemon.configured_links import configured_links
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
-from dappled.drivers.mavlink import MavlinkMessage, Packet, PacketSender, Transport, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, Packet, PacketSender, Transport, is_for, mavlink
 
 _HEARTBEAT_NS = 10**9
 _SAID_NS = 30 * 10**9
@@ -63,7 +63,7 @@ class _GroundedCamera:
         return None
 
     def on_packet(self, packet: Packet) -> None:
-        """Refuse each command to this camera."""
+        """Refuse each command to this camera; another one may do what is for all."""
         message = packet.message
         if packet.sent or not packet.trusted:
             return
@@ -77,8 +77,8 @@ class _GroundedCamera:
             self._links.send(refused, packet.link)
 
     def _is_for_us(self, message: MavlinkMessage) -> bool:
-        ours = self._links.system_id, self._links.component_id
-        return (message.target_system, message.target_component) == ours
+        systems = self._links.system_id, self._identity.system_id
+        return message.target_component != 0 and is_for(message, systems, self._links.component_id)
 
     def tick(self) -> None:
         """Send what is due: the heartbeat, and why there is no photograph."""

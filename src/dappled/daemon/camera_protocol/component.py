@@ -34,7 +34,7 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.navigation.samples import CAPTURED, image_number, sent_us
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
-from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, Packet, is_for, mavlink
 from dappled.drivers.mavlink.log_budget import Rate
 from dappled.findings import Code, Finding, Subject, Value, finding, told
 
@@ -398,9 +398,7 @@ class Component:
         return not packet.exposed or self._answers.takes(count, self._clock.monotonic_ns())
 
     def _is_for_us(self, message: MavlinkMessage) -> bool:
-        """Our system or all, our component or all."""
-        systems = (0, self._links.system_id, self._identity.system_id)
-        return message.target_system in systems and message.target_component in (0, self._links.component_id)
+        return is_for(message, (self._links.system_id, self._identity.system_id), self._links.component_id)
 
     def _is_duplicate(self, packet: Packet) -> bool:
         return self._dedup.is_duplicate(packet, self._clock.monotonic_ns())

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.clock import Clock, SystemClock
-from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Transport, mavlink, open_signing
+from dappled.drivers.mavlink import MavlinkLinks, MavlinkMessage, Packet, Transport, is_for, mavlink, open_signing
 from dappled.errors import DappledError
 from dappled.workers import Loop
 
@@ -190,7 +190,7 @@ class GroundClient:
 
     def _mine(self, message: MavlinkMessage) -> bool:
         own = self._links.sender
-        return message.target_system in (0, own.system_id) and message.target_component in (0, own.component_id)
+        return is_for(message, (own.system_id,), own.component_id)
 
     def _listening(self) -> _Listening:
         return _Listening(self._changed, self._listeners, self._clock)

@@ -5,7 +5,7 @@ into packets, `signing` signs and verifies.
 """
 
 from dappled.drivers.mavlink.channels import LinkError, Transport, parse
-from dappled.drivers.mavlink.framing import Framed
+from dappled.drivers.mavlink.framing import Framed, is_for
 from dappled.drivers.mavlink.links import (
     LinkStatistics,
     MavlinkLinks,
@@ -44,6 +44,7 @@ __all__ = [
     "SigningStatistics",
     "Transport",
     "Unsigned",
+    "is_for",
     "make_key",
     "mavlink",
     "open_signing",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,6 +16,7 @@ __all__ = [
     "Framer",
     "MavlinkMessage",
     "PacketParser",
+    "is_for",
     "is_signed",
     "mavlink",
     "message_of",
@@ -28,6 +29,11 @@ SIGNATURE_BYTES = 13
 _MAGIC_1, _MAGIC_2 = 0xFE, 0xFD
 _SIGNED = 0x01
 _MAX_ID_1 = 255
+
+
+def is_for(message: MavlinkMessage, systems: Iterable[int], component: int) -> bool:
+    """Whether a message is addressed to this component, or all, of one of these systems, or all."""
+    return message.target_system in (0, *systems) and message.target_component in (0, component)
 
 
 class PacketParser:
