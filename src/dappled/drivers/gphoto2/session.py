@@ -6,7 +6,6 @@ Every call may block for as long as libgphoto2 waits for a silent camera (up to 
 from __future__ import annotations
 
 import contextlib
-import mmap
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -15,6 +14,7 @@ from typing import Any
 
 import gphoto2 as gp
 
+from dappled import durable
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -192,6 +192,7 @@ class GPhoto2Session:
             port=port,
         )
         self._in_pieces = True
+        self._buffer = memoryview(bytearray(_CHUNK_BYTES))
         self._read: dict[SettingName, Setting | None] = {}
         self.keeps_files = not (_set_target(camera, target) and target == "ram")
 
@@ -222,7 +223,7 @@ class GPhoto2Session:
         return news
 
     def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
-        """Fetch a file's bytes; from the card in pieces of 1 MiB straight into a memory file, each of which is told."""
+        """Fetch a file's bytes; from the card in pieces of 1 MiB into a memory file, each of which is told."""
         fd = os.memfd_create("camera file", os.MFD_CLOEXEC)  # the camera's own name may be too long for one
         try:
             size, taken_s = self._fill(fd, file, alive)
@@ -254,23 +255,22 @@ class GPhoto2Session:
         return got, taken_s
 
     def _pieces(self, fd: int, file: CameraFile, size: int, alive: Callable[[], None]) -> int | None:
-        """Read piece by piece; None where the body doesn't support that."""
-        os.ftruncate(fd, size)
+        """Read piece by piece; None where the body doesn't support that. The buffer is the same for all: a map of the
+        file would cost a page fault for every 4 KiB."""
         offset = 0
-        with mmap.mmap(fd, size) as whole, memoryview(whole) as view:
-            while offset < size:
-                with view[offset : offset + _CHUNK_BYTES] as piece:
-                    wanted = len(piece)
-                    try:
-                        got = self._camera.file_read(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL, offset, piece)
-                    except gp.GPhoto2Error as error:
-                        if error.code == gp.GP_ERROR_NOT_SUPPORTED and offset == 0:
-                            return None
-                        raise
-                offset += got
-                alive()
-                if got != wanted:
-                    break
+        while offset < size:
+            piece = self._buffer[: size - offset]
+            try:
+                got = self._camera.file_read(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL, offset, piece)
+            except gp.GPhoto2Error as error:
+                if error.code == gp.GP_ERROR_NOT_SUPPORTED and offset == 0:
+                    return None
+                raise
+            durable.write_all(fd, piece[:got])
+            offset += got
+            alive()
+            if got != len(piece):
+                break
         return offset
 
     def _whole(self, fd: int, file: CameraFile) -> int:
