@@ -171,6 +171,19 @@ def test_metres_focus_where_the_board_is(field: str, tmp_path: Path) -> None:
     assert np.nanmax(np.abs(b - c)) > 1e-3
 
 
+def test_a_volume_in_focus_is_one_picture(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    low, high = DISPARITY - 0.2, DISPARITY + 0.2
+    words = ["refocus", field, "--volume", str(low), str(high), "-o", str(tmp_path / "volume.npy"), "--json"]
+    assert main(words) == 0
+    assert json.loads(capsys.readouterr().out)["disparities_px"] == [low, high]
+    assert main(["refocus", field, "--disparity", str(DISPARITY), "-o", str(tmp_path / "plane.npy")]) == 0
+    volume, plane = np.load(tmp_path / "volume.npy"), np.load(tmp_path / "plane.npy")
+    inner = np.s_[8:-8, 8:-8]
+    assert np.abs(volume - plane)[inner].mean() < 0.1 * plane[inner].std()
+    assert main([*words[:5], "--eyes", "anaglyph", "-o", str(tmp_path / "a.png")]) == 2
+    assert "--volume doesn't go with --eyes" in capsys.readouterr().err
+
+
 def test_fourier_tells_how_far_the_sum_is(field: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["refocus", field, "--alpha", "1.03", "1", "--fourier", "-o", str(tmp_path / "a.png")]) == 0
     lines = capsys.readouterr().out.splitlines()

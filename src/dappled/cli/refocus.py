@@ -30,6 +30,7 @@ if not words_only:
         magnified,
         side_by_side,
     )
+    from dappled.decode.lightfield.volume_filter import within
     from dappled.products.exports import prints
     from dappled.products.maps.georeference import Survey
     from dappled.products.opened import OpenedLightField
@@ -59,6 +60,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         "dappled refocus frame.zarr --alpha 1 0.98 1.02 1.04 -o four.png   # Fig 39",
         "dappled refocus frame.zarr --distance 20 --focus inf -o at-20-m.png",
         "dappled refocus frame.zarr --stack 0 0.6 9 --all-in-focus -o sharp.png",
+        "dappled refocus frame.zarr --volume 0 0.6 -o clear.png   # without rain before it",
         "dappled refocus --flight FLIGHT --height 0 --combine median -o ground.tif   # through foliage",
     )
     notes = "Several planes become one picture with captions. .npy keeps the numbers: linear, 1.0 = sensor white."
@@ -76,6 +78,10 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
     )  # fmt: skip
     stack: tuple[float, float, float] | None = option(
         "--stack", "a focal stack at N disparities", None, metavar=("FROM", "TO", "N"), group=_FOCUS, alone="focus",
+    )  # fmt: skip
+    volume: tuple[float, float] | None = option(
+        "--volume", "all that lies between two disparities in focus: what lies before and behind it (rain, snow, haze) "
+        "and noise are weakened", None, metavar=("FROM", "TO"), group=_FOCUS, alone="focus",
     )  # fmt: skip
     magnify: bool = flag("--magnify", "with --alpha: follow Eq 28 exactly, so that the picture grows with α")
     aperture: float | None = option(
@@ -114,7 +120,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         self.check_source("flight", "height", "combine")
         if self.field is None:
             self._check_flight()
-        elif self._sharpest and (self.alpha or self.disparity or self.distance):
+        elif self._sharpest and (self.alpha or self.disparity or self.distance or self.volume):
             raise CallError("--all-in-focus chooses from planes through the scene, or those of --stack FROM TO N")
         if self.stack:
             count = self.stack[2]
@@ -129,6 +135,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         ways = {"--all-in-focus": self._sharpest, "--eyes": self.eyes is not None, "--fourier": self.fourier}
         chosen = [name for name, given in ways.items() if given]
         forms = {"--aperture": self.aperture is not None, "--tilt": any(self.tilt), "--magnify": self.magnify}
+        if self.volume:
+            chosen.insert(0, "--volume")
         unused = chosen[1:] + [name for name, given in forms.items() if given] if chosen else []
         if unused:
             raise CallError(f"{chosen[0]} doesn't go with {', '.join(unused)}: leave one of them out")
@@ -142,7 +150,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
     def _check_flight(self) -> None:
         """Refuse what only goes with a light field, and what goes with no flight. Raises CallError."""
         of_field = (
-            "alpha", "disparity", "distance", "stack", "aperture", "all_in_focus", "index", "fourier", "magnify",
+            "alpha", "disparity", "distance", "stack", "volume", "aperture", "all_in_focus", "index", "fourier",
+            "magnify",
         )  # fmt: skip
         unused = [f"--{way.replace('_', '-')}" for way in of_field if getattr(self, way) not in (None, False, ())]
         if unused:
@@ -164,6 +173,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         if self._sharpest:
             sharp, note = self._sharp(found, np.array([d for _, d in planes]))
             made, captions, notes, planes = [sharp], [""], [note], []
+        elif self.volume:
+            made, captions = [within(found.stack, *self.volume, workers=found.workers)], [" to ".join(captions)]
         elif self.eyes:
             made = [_seen(found.eyes(disparity=d), self.eyes) for _, d in planes]
         elif self.fourier:
@@ -231,8 +242,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         if self.stack:
             low, high, count = self.stack
             return [(f"{d:.3g} px/view", float(d)) for d in np.linspace(low, high, round(count))]
-        if self.disparity:
-            return [(f"{d:g} px/view", d) for d in self.disparity]
+        if given := self.disparity or self.volume:
+            return [(f"{d:g} px/view", d) for d in given]
         if self._sharpest:
             return [(f"{d:.3g} px/view", float(d)) for d in through_scene(found)]
         return [("as taken", 0.0)]
