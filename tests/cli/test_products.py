@@ -43,7 +43,8 @@ def test_views_that_the_model_did_not_make_are_told_with_the_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     plain = light_field()
-    told = {"views_model": "independent", "views_reason": "slices of 9 × 9 px are smaller than a patch of 24 px"}
+    small = finding(Code.VIEWS_SLICES_SMALL, FRAME, height_px=9, width_px=9, patch_px=24)
+    told = {"views_model": "independent", "views_reason": codec.plain(small)}
     quick = replace(plain, attributes={**plain.attributes, **told})
     light_files.save(tmp_path / "f.npz", quick)
     words = "views of each spatial frequency by itself: slices of 9 × 9 px are smaller than a patch of 24 px"

@@ -91,7 +91,7 @@ def _facts(target: Path, made: DecodeResult) -> dict[str, Any]:
         "carriers_from": made.report.carriers_from,
         "law": field.attributes["law"],
         "views_model": field.attributes.get("views_model"),
-        "views_reason": field.attributes.get("views_reason") or None,
+        "views_reason": field.attributes.get("views_reason"),
         "doubts": field.attributes["doubts"],
         "contradiction": codec.plain(made.contradiction),
     }

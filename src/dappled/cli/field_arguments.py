@@ -7,7 +7,7 @@ from pathlib import Path
 
 from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, argument, option
-from dappled.findings import Finding, Subject, of_subject
+from dappled.findings import Finding, Subject, of_subject, text
 
 if not words_only:
     from dappled.decode.depth import RANGING, Ranging
@@ -62,5 +62,5 @@ def views_words(field: LightField) -> str:
     """How the views of a light field were made, where that was not by the model of the light field; else ""."""
     if field.attributes.get("views_model") != "independent":
         return ""
-    reason = field.attributes.get("views_reason")
-    return f"views of each spatial frequency by itself{f': {reason}' if reason else ''}"
+    reason = field.views_reason
+    return f"views of each spatial frequency by itself{f': {text(reason)}' if reason else ''}"

@@ -51,15 +51,14 @@ from dappled.decode.spectrum.peaks import (
 )
 from dappled.decode.spectrum.slices import Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, padded_shape, transform
-from dappled.findings import Code, Finding
+from dappled.findings import FRAME, Code, Finding, finding
 
 CarriersFrom = Literal["measured", "calibrated", "predicted", "found"]
 ViewsFrom = Literal["calibration", "frame", "white", "none"]
 _ROTATION = 0.04  # of a carrier's frequency: the search without a calibration allows for 2.3°
 _UNKNOWN: Mapping[str, Any] = {
     **dict.fromkeys(("transfers", "aperture", "f_number_shown", "f_number_shown_sigma")),
-    **dict.fromkeys(("views_model", "views_shares", "mask_place")),
-    "views_reason": "",
+    **dict.fromkeys(("views_model", "views_reason", "views_shares", "mask_place")),
     "view_sigma": None,
     "views_unclipped": False,
 }
@@ -467,7 +466,7 @@ class MaskDecoder:
             "f_number_shown": shown,
             "f_number_shown_sigma": shown_sigma,
             "views_model": made.model,
-            "views_reason": made.reason or ("" if fits else "its carriers agree with no aperture"),
+            "views_reason": codec.plain(made.reason if fits else finding(Code.VIEWS_APERTURE_UNKNOWN, FRAME)),
             "views_shares": codec.plain(made.shares),
             "view_sigma": made.sigma,
             "views_unclipped": told,

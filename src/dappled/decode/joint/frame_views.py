@@ -42,7 +42,7 @@ _SOME_IN_BAND = 0.04  # of the patches hardly have any
 class FrameViews:
     """`views` float32 (V, U, h, w), by which model they were made, and their standard errors `sigma` float32
     (V, U, m, n), see `JointViews`, in the plane's unit; None where the model tells none. `findings` say
-    what may be wrong with them, `reason` why the joint model did not make them: "" where it did, or was not asked to;
+    what may be wrong with them, `reason` why the joint model did not make them: None where it did, or was not asked to;
     `shares` how it made which patches, None where it did not.
     """
 
@@ -50,7 +50,7 @@ class FrameViews:
     model: ViewsModel
     sigma: Singles | None
     findings: tuple[Finding, ...] = ()
-    reason: str = ""
+    reason: Finding | None = None
     shares: PatchShares | None = None
 
 
@@ -198,25 +198,24 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         px, views = FARTHEST * taken.samples_px[1], taken.aperture.views
         doubts = (finding(Code.VIEWS_OUT_OF_REACH, FRAME, share=shares.beyond, px=px, views=views),)
     if shares.beyond > _MOST_BEYOND:  # inverting supposes no range
-        reason = f"{shares.beyond:.0%} of the picture is nearer or farther than the model of the light field reaches"
-        return replace(independent, findings=doubts, reason=reason)
+        return replace(
+            independent, findings=doubts, reason=finding(Code.VIEWS_BEYOND_MODEL, FRAME, share=shares.beyond)
+        )
     cleaner = _CLEANER if shares.in_band > _SOME_IN_BAND else _CLEANER_FOLDED
     if np.mean(noise) < cleaner**2 * np.mean(found.sigma**2):
-        reason = "the frame has so little noise that the model of the light field would add errors"
-        return replace(independent, findings=doubts, reason=reason)
+        return replace(independent, findings=doubts, reason=finding(Code.VIEWS_LITTLE_NOISE, FRAME))
     if shares.contradict > _TOLD_CONTRADICTED:
         doubts += (finding(Code.VIEWS_CONTRADICTED, FRAME, share=shares.contradict),)
     return FrameViews(found.views, "joint", found.sigma, doubts, shares=shares)
 
 
-def _unfit(orders: int, shape: tuple[int, int], views: int) -> str:
-    """Why the joint model is not for a frame of so many orders and views, with slices of this shape; "" where it is."""
+def _unfit(orders: int, shape: tuple[int, int], views: int) -> Finding | None:
+    """Why the joint model is not for a frame of so many orders and views, with slices of this shape; None where it
+    is."""
     if views > _MOST_VIEWS:
-        return (
-            f"{views} × {views} views are more than the {_MOST_VIEWS} × {_MOST_VIEWS} that the model was measured with"
-        )
+        return finding(Code.VIEWS_TOO_MANY, FRAME, views=views, most=_MOST_VIEWS)
     if (needed := (views**2 + 1) // 2) > orders:
-        return f"the mask's {orders} usable carriers are fewer than the {needed} that the model needs"
+        return finding(Code.VIEWS_FEW_CARRIERS, FRAME, carriers=orders, needed=needed)
     if min(shape) < SIDE:
-        return f"slices of {shape[0]} × {shape[1]} px are smaller than a patch of {SIDE} px"
-    return ""
+        return finding(Code.VIEWS_SLICES_SMALL, FRAME, height_px=shape[0], width_px=shape[1], patch_px=SIDE)
+    return None

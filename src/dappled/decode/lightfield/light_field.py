@@ -51,6 +51,12 @@ class LightField:
         """What may be wrong with it; the attribute `doubts` has them as JSON."""
         return codec.read(tuple[Finding, ...], self.attributes.get("doubts") or ())
 
+    @property
+    def views_reason(self) -> Finding | None:
+        """Why its views are not of one model of the light field; None where they are, or none were asked for."""
+        reason = self.attributes.get("views_reason")
+        return None if reason is None else codec.read(Finding, reason)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ViewStack:
