@@ -40,7 +40,7 @@ def answer_meanwhile(
         links = configured_links(settings, clock, transport, times=Path(times))
         camera = _GroundedCamera(links.sender, settings, reason, clock)
         turn = threading.Event()
-        links.start(camera, camera)
+        links.start(camera)
         try:
             while not until():
                 camera.tick()
