@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import codec
-from dappled.decode.array_types import Singles
+from dappled.decode.array_types import Floats, Singles
 from dappled.decode.calibration.calibration import Calibration, LatticeFit, moved
 from dappled.decode.calibration.testimony import LatticeChange, lattice_change
 from dappled.decode.errors import DecodeError
@@ -62,8 +62,11 @@ _UNKNOWN: Mapping[str, Any] = {
     "view_sigma": None,
     "views_unclipped": False,
 }
+_BY_CHANCE = 3  # carriers, with the mean, that a scene may seem to show
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
 _UNLIKE = frozenset({Code.APERTURE_DISAGREES, Code.APERTURE_UNEXPLAINED})
+_FARTHEST_TURN = 0.035  # radians: patches of a mask turned farther tell nothing
+_ONLY_NOISE = 1.15  # of the noise's variance: frames of noise alone have 0.97 to 1.02
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
 
@@ -73,7 +76,7 @@ class MadeViews:
 
     `facts` say what each slice is of the light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was
     not used, and the `aperture` that it was taken through (see `Aperture.shape`). `findings` say what may be wrong with
-    aperture and views, `moved` how far the mask lies from its calibration.
+    aperture and views, `moved` how far the mask lies from its calibration, `unseen` that parallax shows none.
     """
 
     values: Views
@@ -82,6 +85,7 @@ class MadeViews:
     facts: Mapping[str, Any] = field(default_factory=lambda: _UNKNOWN)
     findings: tuple[Finding, ...] = ()
     moved: tuple[Finding, ...] = ()
+    unseen: tuple[Finding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +260,11 @@ class MaskDecoder:
         else:
             made = MadeViews(*no_views(slices.values.shape[1:]))
         place = made.moved or self._moved(slices, lattice, focal_length_mm)
+        if carriers_from == "calibrated" and sum(one is not None for one in measured) <= _BY_CHANCE:
+            if np.var(slices.values[0].real) < _ONLY_NOISE * noise**2 * slices.band:
+                place = (finding(Code.FRAME_ONLY_NOISE, FRAME),)
+            elif made.unseen:
+                place = made.unseen
         if carriers_from == "measured" and any(one.code in _UNLIKE for one in made.findings):
             change = self.change(spectrum, focal_length_mm, predicted, measured)  # the cause, rather than the aperture
             place = place if change is None else (change.finding, *place)
@@ -480,6 +489,7 @@ class MaskDecoder:
             facts,
             made.findings if strange is None else (strange, *made.findings),
             () if place is None else moved(place.periods, place.turn_rad, self.optics.mask.frequency_per_mm),
+            () if place is None or not place.unseen else (finding(Code.MASK_UNSEEN, FRAME, nats=place.nats),),
         )
 
     def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:
@@ -505,18 +515,32 @@ class MaskDecoder:
         if not self.joint_views:
             return found, width, None
         turned = cycles_per_radian(lattice, self.optics.sensor)
-        place = place_of(found.used(), turned, taken.samples_px, workers=self.workers)
+        place = self._own_place(found.used(), turned)
         if place is None or not place.moved:
             return found, width, place
         moved = replace(
             taken,
             values=place.undone(taken.values, taken.orders, turned, taken.samples_px),
+            rotation_rad=taken.rotation_rad + place.turn_rad,
             transfers=transfers * transfer(taken.orders, np.ones(len(transfers)), place.periods),
         )
         again = moved.width(distance_known=known.distance_fitted)
         if width.fits and not again.fits:
             return found, width, None
         return moved.through(again), again, place
+
+    def _own_place(self, taken: TakenSlices, turned: Floats) -> MaskPlace | None:
+        """Where slices place the mask: a turn at the edge of the search is taken back, and the rest of it searched."""
+        first = place = place_of(taken, turned, taken.samples_px, workers=self.workers)
+        turn = 0.0
+        while place is not None and place.at_edge and abs(turn) < _FARTHEST_TURN:
+            turn += place.turn_rad
+            values = place.undone(taken.values, taken.orders, turned, taken.samples_px)
+            taken = replace(taken, values=values, rotation_rad=taken.rotation_rad + place.turn_rad)
+            place = place_of(taken, turned, taken.samples_px, workers=self.workers)
+        if place is None or first is None or not turn:
+            return place
+        return replace(place, turn_rad=turn + place.turn_rad) if place.seen else first.nowhere(place.nats)
 
     def _shown(
         self, width: UsedAperture | None, turns: float, focal_length_mm: float

@@ -37,7 +37,7 @@ def _doubt(camera: Camera, known: Calibration, seed: int = 7, f_number: float = 
         MaskedOptics(SENSOR, MASK, "geometric", STATED_DISTANCE_MM), calibration=known, joint_views=False
     )
     _, report = decoder.decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=f_number)
-    return [one for one in report.doubts if one.code in (Code.MASK_SHIFTED, Code.MASK_TURNED)]
+    return [one for one in report.doubts if one.code in (Code.MASK_SHIFTED, Code.MASK_TURNED, Code.MASK_TURNED_FARTHER)]
 
 
 @pytest.mark.parametrize("seed", [7, 8])
@@ -51,6 +51,13 @@ def test_a_mask_that_moved_is_doubted_with_its_distance(calibrated: tuple[Camera
     told, *_ = _doubt(replace(camera, shift_mm=(y + 0.010, x - 0.0125)), known)
     assert told.code is Code.MASK_SHIFTED
     assert told.facts["by_um"] == pytest.approx(16, abs=1.5)
+
+
+def test_a_turn_at_the_edge_of_the_search_is_told_as_the_least(calibrated: tuple[Camera, Calibration]) -> None:
+    camera, known = calibrated
+    (told,) = _doubt(replace(camera, rotation_rad=camera.rotation_rad + np.radians(0.6)), known)
+    assert told.code is Code.MASK_TURNED_FARTHER
+    assert told.facts["by_deg"] == pytest.approx(0.4, abs=0.02)
 
 
 def test_a_mask_that_turned_is_doubted_with_its_angle(calibrated: tuple[Camera, Calibration]) -> None:

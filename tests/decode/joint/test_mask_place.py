@@ -86,7 +86,18 @@ def test_a_mask_that_moved_and_turned_is_placed_where_its_carriers_average_out()
 def test_a_mask_in_its_place_is_left_there() -> None:
     found = _place(_slices(2))
     assert not found.moved
+    assert found.seen
+    assert found.nats > 2 * found.patches
     assert moved(found.periods, found.turn_rad, 15.5) == ()
+
+
+def test_a_scene_alone_shows_no_mask() -> None:
+    chance = np.random.default_rng(5)
+    alone = np.fft.ifft2(np.fft.fft2(chance.normal(size=(len(ORDERS), *SHAPE))) * 0.01)
+    without = _slices(2)
+    without[1:] = alone[1:]  # each a part of the scene's spectrum of its own
+    place = _place(without)
+    assert (place.seen, place.unseen, place.moved) == (False, True, False)
 
 
 @pytest.mark.long

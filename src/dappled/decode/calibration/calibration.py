@@ -29,6 +29,7 @@ _SURE = 30.0  # chi², or log likelihood: clean frames reach 3
 _ALIKE = 1.0  # chi²: moves of a diagonal mask a quarter of a period apart differ by rounding alone
 _STEPS = 48  # of a period: how finely moves are tried, up to a quarter of a period
 _MOST_TURN, _TURNS = 0.007, 81  # radians to either side, and how many are tried
+_AT_EDGE = 0.95  # of the farthest turn: the best may be beyond it
 _LEAST_PERIODS, _LEAST_TURN = 0.03, 3e-4  # smaller moves cost next to nothing
 _LEAST_TRANSFER = 1e-3  # a carrier that the mask doesn't make tells nothing
 _FLOOR = 1e-3  # of the mean: what the scene adds to the mean of a slice, however still its blocks are
@@ -75,16 +76,20 @@ class MaskMove:
 
     def findings(self, frequency_per_mm: float) -> tuple[Finding, ...]:
         """The move of a frame's mask, as findings."""
-        return moved(self.periods, self.turn_rad, frequency_per_mm)
+        return moved(self.periods, self.turn_rad, frequency_per_mm, farther=abs(self.turn_rad) > _AT_EDGE * _MOST_TURN)
 
 
-def moved(periods: tuple[float, float], turn_rad: float, frequency_per_mm: float) -> tuple[Finding, ...]:
-    """How far a frame's mask of this frequency lies from where it was calibrated, in periods and radians."""
+def moved(
+    periods: tuple[float, float], turn_rad: float, frequency_per_mm: float, *, farther: bool = False
+) -> tuple[Finding, ...]:
+    """How far a frame's mask of this frequency lies from where it was calibrated, in periods and radians; `farther`:
+    turned at least so far."""
     found = []
     if any(periods):
         found.append(finding(Code.MASK_SHIFTED, FRAME, by_um=1e3 * math.hypot(*periods) / frequency_per_mm))
     if turn_rad:
-        found.append(finding(Code.MASK_TURNED, FRAME, by_deg=abs(math.degrees(turn_rad))))
+        code = Code.MASK_TURNED_FARTHER if farther else Code.MASK_TURNED
+        found.append(finding(code, FRAME, by_deg=abs(math.degrees(turn_rad))))
     return tuple(found)
 
 

@@ -7,18 +7,24 @@ the light field (`patch_model`) gives the slices' covariance C(f) in a patch, so
 
 a polynomial of few terms, m the differences of orders. Parallax tells δ even where the stop averages all carriers away
 (an even square stop at the mask's ideal aperture): slices of a shifted mask are those of views that change places.
+
+Without a mask a slice is detail of the scene alone, whose phases are as random as the places of its edges: each patch
+places the mask somewhere, with L(δ) over its mean over all δ as sharply as with a mask. So the odds of one place for
+all patches, against a place for each, say whether there is a mask, whatever the likelihood's scale. A scene without
+parallax, behind an even square stop at the ideal aperture, holds no trace of a mask, and tells none from its absence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats
 from dappled.decode.joint.patch_model import (
+    AT_REST,
     KINDS,
     SIDE,
     USUAL,
@@ -46,24 +52,50 @@ _LEAST_PERIODS, _LEAST_TURN = 0.03, 6e-4  # clean frames reach 0.017 periods and
 _SURE = 3.0  # standard deviations: patches that are more probable with the move, beyond half of all
 _LEAST_NATS = 3.0  # that the median patch must gain
 _LIKELY, _MANY_NATS = 2.0, 30.0  # or both of these: clean frames gain 14 nats at most, moved ones 33 and more
-_USUAL = [kind for kind in KINDS if kind.range == USUAL]
+_AT_EDGE = 0.95  # of the farthest turn: beyond it the best is elsewhere
+_ASTRAY = 0.5  # of the patches may lie in anything that places no mask: edges between depths, no parallax
+_SEEN = 0.0  # nats
+_SEEN_ELSEWHERE = 1.5  # nats of each patch: turned and moved masks have 3 to 5, one 0.3 % off in scale 0.7
+_UNSEEN = 0.25  # of the nats of patches that are all astray: frames without a mask have 0.35 to 1, others up to 0.22
 _OVERLAP = 2.0  # patches that count as one measurement: they overlap by half
 
 
 @dataclass(frozen=True, slots=True)
 class MaskPlace:
     """Where a frame's own slices place the mask, from where its calibration has it: `periods` (ky, kx) at the frame's
-    middle and `turn_rad`, 0 where the calibration's place explains the frame as well; and their standard errors."""
+    middle and `turn_rad`, 0 where the calibration's place explains the frame as well; and their standard errors.
+    `nats` are the log odds of a mask there against none, by `patches`."""
 
     periods: tuple[float, float]
     periods_sigma: tuple[float, float]
     turn_rad: float
     turn_sigma_rad: float
+    nats: float
+    patches: int
 
     @property
     def moved(self) -> bool:
         """Whether it is anywhere else."""
         return bool(any(self.periods) or self.turn_rad)
+
+    @property
+    def at_edge(self) -> bool:
+        """Whether the turn is as far as was searched: it may be farther."""
+        return abs(self.turn_rad) > _AT_EDGE * _MOST_TURN
+
+    @property
+    def seen(self) -> bool:
+        """Whether a mask there is more probable than none."""
+        return self.nats > _SEEN
+
+    def nowhere(self, nats: float) -> MaskPlace:
+        """It without any move, and with these odds: a turn at the search's edge that led nowhere."""
+        return replace(self, periods=(0.0, 0.0), turn_rad=0.0, nats=nats)
+
+    @property
+    def unseen(self) -> bool:
+        """Whether the patches, sharp as they are, agree on no place: there is no mask, or nothing has parallax."""
+        return self.nats < _UNSEEN * _astray(self.patches)
 
     def undone(
         self, slices: Complexes, orders: Sequence[Order], turned: Floats, steps_px: tuple[float, float]
@@ -77,6 +109,11 @@ class MaskPlace:
             for along, side, px in zip(cycles.T, slices.shape[1:], steps_px, strict=True)
         )
         return np.asarray(slices * down[:, :, None] * across[:, None, :])
+
+
+def _astray(patches: int) -> float:
+    """The log odds of so many patches that all lie in what places no mask."""
+    return patches / _OVERLAP * float(np.log(_ASTRAY))
 
 
 def cycles_per_radian(lattice: Lattice, sensor: Sensor) -> Floats:
@@ -106,12 +143,16 @@ def mask_place(
     inner = np.flatnonzero(~patches.at_edges)
     if len(inner) < _FEWEST:
         return None
-    differences, terms, used = _terms(
-        slices, model, patches, inner, samples_px=samples_px, noise=noise, reach=reach, workers=workers
-    )
-    corners = np.array(patches.corners)[used] - SIDE
-    middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
-    return _Likelihood(differences, terms, (middles * np.array(steps_px)) @ turned.T).place()
+    for ranges in ((USUAL,), (USUAL, AT_REST)):  # at rest only where it matters: it costs half as much again
+        differences, terms, used = _terms(
+            slices, model, patches, inner, ranges, samples_px=samples_px, noise=noise, reach=reach, workers=workers
+        )
+        corners = np.array(patches.corners)[used] - SIDE
+        middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
+        place = _Likelihood(differences, terms, (middles * np.array(steps_px)) @ turned.T).place()
+        if place.seen:
+            break
+    return place
 
 
 def _terms(
@@ -119,6 +160,7 @@ def _terms(
     model: SliceModel,
     patches: Patches,
     inner: NDArray[np.intp],
+    ranges: tuple[int, ...],
     *,
     samples_px: tuple[float, float],
     noise: Floats,
@@ -131,13 +173,14 @@ def _terms(
     best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
     spectra = patches.spectra(cut[:, best])
     both = np.concatenate([noise, noise[1:]])
-    frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=(USUAL,), workers=workers)
+    frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=ranges, workers=workers)
+    kinds = [kind for kind in KINDS if kind.range in ranges]
     power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
     spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
     own = spectrum.at(frame.radius(frame.frequencies))
     strength = (np.abs(spectra[1:, 0]) ** 2 / (own[1:, None] + frame.noise[0])).mean(axis=0)
     spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
-    rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), _USUAL)
+    rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), kinds)
     wholes = wholes_of(frame, rests)
     whole = wholes[int(likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1).argmax())]
     inverse = np.linalg.inv(whole.astype(np.complex128)) * frame.weights[:, None, None]
@@ -156,6 +199,12 @@ def _terms(
 
     each(add, spans(len(terms), _AT_A_TIME), workers)
     return differences, terms, inner[best]
+
+
+def _tried() -> Floats:
+    """(S², 2) the moves that are tried, evenly over a period."""
+    axis = np.arange(_STEPS) / _STEPS - 0.5
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,10 +228,33 @@ class _Likelihood:
             apart = np.zeros(3)
         if np.hypot(*found[:2]) < _LEAST_PERIODS or not self._sure(found, apart):
             found = apart
+        nats = self._nats(found)
+        if (
+            found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP
+        ):  # patches that gain, each for a reason of its own
+            found = np.zeros(3)
+            nats = self._nats(found)
         sigma = self._sigma(found)
         return MaskPlace(
-            (float(found[0]), float(found[1])), (float(sigma[0]), float(sigma[1])), float(found[2]), float(sigma[2])
+            (float(found[0]), float(found[1])),
+            (float(sigma[0]), float(sigma[1])),
+            float(found[2]),
+            float(sigma[2]),
+            nats,
+            len(self.terms),
         )
+
+    def _nats(self, move: Floats) -> float:
+        """The log odds of a mask there, against a place for each patch."""
+        with_place = np.any(self.differences != 0, axis=1)
+        terms, differences = self.terms[:, with_place], self.differences[with_place]
+        waves = np.exp(2j * np.pi * differences @ _tried().T).astype(np.complex64)
+        anywhere = (terms.astype(np.complex64) @ waves).real
+        most = anywhere.max(axis=1)
+        mean = most + np.log(np.exp(anywhere - most[:, None]).mean(axis=1))
+        at = move[:2] + move[2] * self.turned
+        here = (terms * np.exp(2j * np.pi * at @ differences.T)).real.sum(axis=1)
+        return float(np.logaddexp(np.log1p(-_ASTRAY) + here - mean, np.log(_ASTRAY)).sum() / _OVERLAP)
 
     def patches(self, move: Floats) -> Floats:
         """(N,) log likelihoods at (ky, kx, radians)."""
@@ -194,8 +266,7 @@ class _Likelihood:
 
     def _best(self, turns: Floats) -> Floats:
         """The most probable move with one of these turns, or near it: (ky, kx, radians)."""
-        axis = np.arange(-_STEPS // 2, _STEPS // 2 + 1) / _STEPS
-        tried = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+        tried = _tried()
         sums = np.stack([self._waves(np.array([0.0, 0.0, turn])).sum(axis=0) for turn in turns], axis=1)
         found = (np.exp(2j * np.pi * tried @ self.differences.T) @ sums).real
         shift, turn = np.unravel_index(int(found.argmax()), found.shape)
