@@ -53,7 +53,7 @@ def judged(shot: Drawn) -> Judged:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("number", "most_short_db"), [(5, 0.5), (35, 0.2), (50, 3.0), (90, 0.2), (155, 1.5), (185, 0.3)]
+    ("number", "most_short_db"), [(2, -1.5), (5, -3), (20, -6), (46, -0.8), (50, 2.7), (52, -2), (72, -1), (155, 1.3)]
 )
 def test_a_drawn_picture_is_about_as_good_as_the_better_of_true_shadow_and_band(
     number: int, most_short_db: float
@@ -64,8 +64,8 @@ def test_a_drawn_picture_is_about_as_good_as_the_better_of_true_shadow_and_band(
 @pytest.mark.slow
 def test_shares_within_one_and_two_sigma_where_detail_ends_before_the_noise() -> None:
     shares = judged(draw()[20]).shares
-    assert 0.6 < shares[0] < 0.78
-    assert 0.9 < shares[1] < 0.99
+    assert 0.6 < shares[0] < 0.85
+    assert 0.9 < shares[1] < 0.997
 
 
 @pytest.mark.long
@@ -77,7 +77,8 @@ def test_two_hundred_drawn_pictures() -> None:
         assert min(levels.values()) >= 20
     assert {one.mask for one in drawn} == set(FILMS)
     found = [judged(one) for one in drawn]
-    for deep in (True, False):
+    for deep, tenth in ((True, -2.0), (False, -0.5)):
         short = np.array([one.short_db for one in found if (one.depth > 0.1) == deep])
-        assert np.median(short) > -0.5, deep
-        assert np.quantile(short, 0.1) > -4, deep
+        assert np.median(short) > 1, deep
+        assert np.quantile(short, 0.1) > tenth, deep
+        assert short.min() > -6, deep

@@ -51,8 +51,10 @@ def _picture(shot: Shot, mosaic: MosaicPlane | None = None) -> UnmaskedPicture:
     ids=repr,
 )
 def test_raw_over_its_own_shadow_is_as_good_as_over_the_true_one(shot: Shot, least_db: float) -> None:
-    found = psnr(_picture(shot).plane, shot.truth)
+    picture = _picture(shot)
+    found = psnr(picture.plane, shot.truth)
     assert found >= psnr(shot.frame / shot.shadow, shot.truth) - 0.4
+    assert (picture.soft_share > 0.1) == (shot.disparity_px > 0.5)
     assert found >= least_db
     assert found > psnr(shot.frame, shot.truth) + 8
 
@@ -60,8 +62,8 @@ def test_raw_over_its_own_shadow_is_as_good_as_over_the_true_one(shot: Shot, lea
 @pytest.mark.parametrize(
     ("disparity_px", "exponent", "least_db"),
     [
-        (1.0, 1.1, 36),
-        pytest.param(1.0, 1.5, 42, marks=pytest.mark.slow),
+        (1.0, 1.1, 37),
+        pytest.param(1.0, 1.5, 45, marks=pytest.mark.slow),
         (2.0, 1.1, 43),
         pytest.param(3.3, 1.5, 55, marks=pytest.mark.slow),
     ],
@@ -78,7 +80,7 @@ def test_out_of_focus_it_is_no_worse_than_sharp_picture_and_band(
     measured = psnr(found.plane, shot.truth)
     assert measured >= max(psnr(one, shot.truth) for one in others) - 0.3
     assert measured >= least_db
-    assert (found.soft_share > 0.9) == (disparity_px > 1)
+    assert found.soft_share > 0.7
 
 
 def test_the_lattice_is_found_where_the_print_stands() -> None:
