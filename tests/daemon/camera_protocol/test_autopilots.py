@@ -632,8 +632,10 @@ def test_telemetry_that_comes_too_seldom_is_named_with_its_rate_until_it_comes_a
 
     fly(12, 50, 10)
     assert slow() == [("ATTITUDE_QUATERNION", 10, 50)]
-    fly(16, 5, 50)
-    assert slow() == [("GLOBAL_POSITION_INT", 5, 50)]
+    fly(16, 4, 50)
+    assert slow() == [("GLOBAL_POSITION_INT", 4, 50)]
+    fly(16, 5, 15)  # enough: more was asked for
+    assert slow() == []
     fly(6, 50, 50)
     assert slow() == []
     fly(12, 0, 50)  # nothing at all is another finding

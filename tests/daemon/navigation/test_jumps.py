@@ -126,6 +126,18 @@ def test_a_position_that_comes_to_where_the_receiver_stayed_is_in_doubt_no_longe
     assert telemetry.statistics().jumps == 1
 
 
+def test_a_doubt_ends_a_minute_after_the_receiver_has_come_back_where_the_position_is() -> None:
+    """The estimator flew blind for 13 s, and was set anew to its receiver: the doubt lasted for the flight."""
+    telemetry, number = Telemetry(), 0
+    for t_s, message in messages(PATH, stepped(12.0), 5.0, AT_S + 80):
+        if message.get_type() == "GPS_RAW_INT" and AT_S - 13 < t_s < AT_S + 1:
+            continue
+        telemetry.feed(number, START_NS // 1000 + round(t_s * 1e6) + 3000, message)
+        number += 1
+    assert sigma_m(telemetry, AT_S + 50) > 11
+    assert sigma_m(telemetry, AT_S + 70) < 1
+
+
 def test_a_jump_in_height_is_one_of_height() -> None:
     telemetry = telemetry_of(changed=stepped(0.0, up_m=-12.0))
     pose = at(telemetry, AT_S + 3)

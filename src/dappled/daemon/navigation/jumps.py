@@ -3,7 +3,7 @@
 A receiver that has lost its way, or an estimator that was reset, moves the position by metres while the velocity says
 nothing of it. Which side of a jump is right can't be known: a position near one is in doubt by its size, and all those
 after it are until there is evidence that it is over. It is over when the position has jumped back, or is where a
-receiver is that has not jumped itself.
+receiver is that has not jumped itself: since before the jump, or for a minute since it came back from a gap.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ _STALE_S = 0.25  # by which a position may be older than its time says: a receiv
 _BETWEEN_M_S2 = 2.5  # × time²: there and back at 10 m/s² between two samples with the same velocity
 _BACK = 0.1  # of the largest doubt: so near to where it was is back
 _APART_M, _APART_S = 5.0, 0.6  # by which estimator and receiver may differ; the age of a receiver's message
+_ANEW_NS = 60 * 10**9  # how long a receiver that was not heard before a jump has to agree with all velocities
 _UNKNOWN_M_S = 60.0  # of a vehicle whose messages have no velocity (exactly 0, 0, 0)
 _NONE: Vector3 = (0.0, 0.0, 0.0)
 
@@ -41,16 +42,16 @@ class JumpFinder:
         self._last: PositionSample | None = None
         self._sums: deque[_Sum] = deque()
         self._widest_m, self.standing_m = 0.0, _NONE
-        self.since = self.begun = (
-            0  # packets: of the first of the positions without a gap, and of the doubt's first jump
-        )
+        self.since = self.since_ns = 0  # packet and arrival of the first of the positions without a gap
+        self.begun = 0  # packet of the doubt's first jump
 
     def jump(self, sample: PositionSample, first: int) -> Jump | None:
         """Take the next position; `first` is the first packet of the autopilot's boot. The jump that ends there, if
         any."""
         last, self._last = self._last, sample
         if last is None or last.number < first or sample.boot_ns - last.boot_ns > NEAREST_NS:
-            self._sums, self.since = deque([_Sum(sample.boot_ns, (0.0, 0.0, 0.0), 0.0)]), sample.number
+            self._sums = deque([_Sum(sample.boot_ns, (0.0, 0.0, 0.0), 0.0)])
+            self.since, self.since_ns = sample.number, sample.stamp_ns
             return None
         moved, allowed_m = _unexplained(last, sample)
         before = self._sums[-1]
@@ -97,8 +98,8 @@ class ReceiverTrack:
 
     def confirms(self, heard: GnssSample, estimate: PositionSample, first: int, begun: int, doubt_m: Vector3) -> bool:
         """Take the receiver's place with a fix, once for each position. Whether it has not jumped since before packet
-        `begun`, and the last position is there as well: in the plane, in height, or both, as far as it is in doubt. A
-        barometer's height may be metres from a receiver's."""
+        `begun`, or for a minute, and the last position is there as well: in the plane, in height, or both, as far as it
+        is in doubt. A barometer's height may be metres from a receiver's."""
         if estimate.number == self._compared:
             return False
         self._compared = estimate.number
@@ -118,7 +119,7 @@ class ReceiverTrack:
             return False
         if doubt_m[2] and (own_upright_m or abs(upright_m) > near_m):
             return False
-        return self._finder.since < begun
+        return self._finder.since < begun or heard.stamp_ns - self._finder.since_ns >= _ANEW_NS
 
 
 def _unexplained(a: PositionSample, b: PositionSample) -> tuple[Vector3, float]:
