@@ -268,8 +268,7 @@ def _is_copied(name: str) -> bool:
 
 
 def _refuse_unready(folder: FlightFolder) -> None:
-    """Raise FlightError for a flight that is not closed, or that an early version pruned, and OutsideError where the
-    ledger names a file outside it."""
+    """Raise FlightError for a flight that is not closed, and OutsideError where the ledger names a file outside it."""
     with LedgerReader.open(folder.ledger) as ledger:
         facts = ledger.facts()
         for row in ledger.files():
