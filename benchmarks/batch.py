@@ -88,7 +88,7 @@ def flight(folder: Path, count: int, scale: float) -> list[Job]:
         station = photographs.station(frame, tag, Mounting())
         options = Options(crs="EPSG:32615")
         jobs.append(
-            Job(str(folder / "flight"), frame, tag, station, "", path.home_altitude_msl_m, recipe, options, KINDS,
+            Job(str(folder / "flight"), frame, tag, station, path.home_altitude_msl_m, recipe, options, KINDS,
                 str(folder / "out"), f"{index}")
         )  # fmt: skip
     return jobs

@@ -60,7 +60,7 @@ def words(flight: Flown, output: Path, *more: str) -> list[str]:
 
 def job(name: str, key: str = "") -> Job:
     frame = Frame(0, name, name, 0, "", 0)
-    return Job("flight", frame, None, None, "", None, RECIPE, Options(), (), "out", key or name)
+    return Job("flight", frame, None, DappledError("no position"), None, RECIPE, Options(), (), "out", key or name)
 
 
 RECIPE = Recipe("reference-36mm", "reference-5x5")
@@ -181,7 +181,7 @@ def test_frames_with_the_same_bytes_are_jobs_of_their_own(
 
 def test_a_frame_without_a_place_still_becomes_a_light_field(flight: Flown, tmp_path: Path) -> None:
     (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz", "cog"], tmp_path)
-    lost = replace(first, station=None, why="no position is known for frames/000000.dng")
+    lost = replace(first, station=DappledError("no position is known for frames/000000.dng"))
     done = batch.make(lost)
     assert done.error == "no position is known for frames/000000.dng"
     assert (dict(done.refused), [one.kind for one in done.outputs]) == ({"cog": done.error}, ["npz"])

@@ -45,15 +45,14 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One frame and all that is to be made of it. `station` is None where its position isn't known, for the reason
-    `why`; `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on.
+    """One frame and all that is to be made of it. `station` is the error where its position isn't known;
+    `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on.
     `utc_ns` is mid-exposure, corrected; None where UTC was never known."""
 
     flight: str
     frame: Frame
     tag: Tag | None
-    station: Station | None
-    why: str
+    station: Station | DappledError
     level_m: float | None
     recipe: Recipe
     options: Options
@@ -120,14 +119,14 @@ def plan(
     if options.frames is not None:
         frames = [frame for frame in frames if frame.index in options.frames]
     stations: dict[int, Station] = {}
-    reasons: dict[int, str] = {}
+    unplaced: dict[int, DappledError] = {}
     for frame in frames:
         try:
             station = photographs.station(frame, tags.get(frame.index), options.mounting)
             known = placed[frame.index].camera if frame.index in placed else None
             stations[frame.index] = station if known is None else replace(station, camera=known)
         except DappledError as error:
-            reasons[frame.index] = str(error)
+            unplaced[frame.index] = error
     level = None
     if set(kinds) & {*MAPS, *forms.MAPPED} and stations:
         level = georeference.level_of(list(stations.values()), options)
@@ -153,8 +152,8 @@ def plan(
         key = hashlib.sha256(codec.canonical(said)).hexdigest()
         jobs.append(
             Job(
-                str(flight.absolute()), frame, tag, stations.get(frame.index), reasons.get(frame.index, ""), level,
-                recipe, options, tuple(kinds), str(output.absolute()), key, utc_ns,
+                str(flight.absolute()), frame, tag, stations.get(frame.index) or unplaced[frame.index], level, recipe,
+                options, tuple(kinds), str(output.absolute()), key, utc_ns,
             )
         )  # fmt: skip
     return jobs
@@ -200,8 +199,8 @@ class _Making:
         job = self.job
         if kind not in PLACED:
             return [self._light_field(kind)]
-        if job.station is None:
-            raise DappledError(job.why)
+        if isinstance(job.station, DappledError):
+            raise job.station
         assert job.options.crs is not None
         projection = _projection(job.options.crs)
         folder = Path(job.output) / Path(job.flight).name
@@ -245,8 +244,8 @@ class _Making:
 def _making(job: Job) -> _Making:
     """A job's frame. Raises DappledError where nothing that is wanted could be made of it."""
     durable.make_folder(Path(job.output) / Path(job.flight).name)
-    if job.station is None and set(job.kinds) <= set(PLACED):
-        raise DappledError(job.why)
+    if isinstance(job.station, DappledError) and set(job.kinds) <= set(PLACED):
+        raise job.station
     given = {"focal_length_mm": job.options.focal_length_mm, "f_number": job.options.f_number}
     return _Making(job, _laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given))
 
