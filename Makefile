@@ -59,14 +59,15 @@ coverage: setup ## run the default tests and report which lines they reach (a th
 test-slow: everything ## the tests at real seams; those that watch a clock run with no other beside them
 	@$(BUDGET) "make test-slow" 480 900 $(MAKE) -s both TIER="slow and not long"
 
-test-long: everything peers ## soaks, sweeps, matrices and benchmarks
-	@$(BUDGET) "make test-long" 2400 4800 $(MAKE) -s both TIER=long
+test-long: everything peers ## soaks, sweeps, matrices and benchmarks, and properties over many examples
+	@$(BUDGET) "make test-long" 2400 4800 $(MAKE) -s both TIER=long PROPERTIES=many
 
 both:
 	@failed=0; \
 	$(BIN)/mypy || failed=1; \
 	$(BIN)/pytest -q --no-header -m "$(TIER) and not alone" --durations=25 $(BESIDE) || failed=1; \
 	$(BIN)/pytest -q --no-header -m "$(TIER) and alone" --durations=15 || failed=1; \
+	[ -z "$(PROPERTIES)" ] || $(BIN)/pytest -q --no-header -m "hypothesis and not slow" --hypothesis-profile $(PROPERTIES) $(BESIDE) || failed=1; \
 	exit $$failed
 
 long: ## what is too long for each change: the long tests, arm64, the README in both bare roots; as root

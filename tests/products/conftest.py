@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import hashlib
 import pickle
+import threading
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 
 from dappled.decode import decoder
 from dappled.decode.joint import frame_views
-from dappled.decode.joint.frame_views import FrameViews
+from dappled.decode.joint.frame_views import FrameViews, TakenSlices
 from tests import shared
 from tests.products import flown
 from tests.products.flown import Flown
+
+_quick = threading.Event()
+
+
+@pytest.fixture(autouse=True)
+def quick_views(request: pytest.FixtureRequest, views_made_once: None) -> Iterator[None]:
+    """Default tests of this room say what is made of views, and not how good these are: each is an inverse of slices.
+    Slow tests have those of the joint model, which takes seconds a frame."""
+    if not request.node.get_closest_marker("slow"):
+        _quick.set()
+    yield
+    _quick.clear()
 
 
 @pytest.fixture(scope="session")
@@ -30,10 +42,10 @@ def views_made_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     few frames some sixty times, and views are most of a decode. What views are like, tests of `decode` say."""
     folder = shared.folder_of_run(tmp_path_factory)
 
-    def kept(*words: Any, **names: Any) -> FrameViews:
-        names_that_count = {name: value for name, value in names.items() if name != "workers"}
-        key = hashlib.sha256(pickle.dumps((words, sorted(names_that_count.items())), protocol=5)).hexdigest()
-        return shared.once(folder, f"views-{key}", lambda: frame_views.views_of(*words, **names))
+    def kept(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews:
+        joint = joint and not _quick.is_set()
+        key = hashlib.sha256(pickle.dumps((taken, joint), protocol=5)).hexdigest()
+        return shared.once(folder, f"views-{key}", lambda: frame_views.views_of(taken, joint=joint, workers=workers))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(decoder, "views_of", kept)

@@ -14,21 +14,21 @@ from dappled.cli import main
 from dappled.errors import DappledError
 from dappled.products.exports import light_files
 from dappled.products.opened import OpenedFlight, OpenError
-from tests.products.flown import Flown, fly
+from tests.products.flown import Flown
 
 
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
-    return fly(tmp_path_factory.mktemp("flown"), seed=3, times_s=(1.0,))
+@pytest.fixture
+def flown(short_flight: Flown) -> Flown:
+    return short_flight
 
 
 def test_a_flight_is_its_frames(flown: Flown) -> None:
     flight = dappled.open(flown.folder, **{k: v for k, v in asdict(flown.recipe).items() if v})
     assert isinstance(flight, OpenedFlight)
-    assert len(flight) == 1
-    assert repr(flight) == f"<flight {flown.folder.name}: 1 safe frame, reference-5x5>"
+    assert len(flight) == 2
+    assert repr(flight) == f"<flight {flown.folder.name}: 2 safe frames, reference-5x5>"
     assert "<td>50 mm, f/" in flight._repr_html_()
-    (frame,) = flight
+    frame = next(iter(flight))
     assert frame.index is not None
     assert flight[frame.index].path == frame.path
     assert frame.tag is not None
@@ -55,7 +55,7 @@ def test_without_a_mask_frames_cannot_be_looked_at(flown: Flown) -> None:
 def test_points_lie_on_the_ground_below(flown: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flight = dappled.open(flown.folder, **{k: v for k, v in asdict(flown.recipe).items() if v})
     assert isinstance(flight, OpenedFlight)
-    (frame,) = flight
+    frame = next(iter(flight))
     light_files.save(tmp_path / "f.npz", frame.light_field.field)
     words = ["depth", str(tmp_path / "f.npz"), "--focus", "inf", "--flight", str(flown.folder), "--most-sigma", "0.5"]
     words += ["--frame", str(frame.index), "--window", "25", "--method", "contrast", "--json"]

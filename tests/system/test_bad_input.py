@@ -181,7 +181,9 @@ def test_a_camera_that_another_program_holds_is_taken_when_it_is_free(body: Simu
         assert daemon.shoot().frame is not None
 
 
-@pytest.mark.parametrize("fault", ["busy 0.3", "drop-transfer", "short"])
+@pytest.mark.parametrize(
+    "fault", ["drop-transfer", *(pytest.param(one, marks=pytest.mark.slow) for one in ("busy 0.3", "short"))]
+)
 def test_a_fault_that_passes_costs_no_frame(body: SimulatedBody, here: Path, fault: str) -> None:
     with flying(before(body, here)) as daemon:
         daemon.until_ready()
@@ -288,7 +290,7 @@ def test_a_raw_that_is_no_raw_is_kept_and_not_decoded(here: Path, caplog: pytest
     assert "Traceback" not in caplog.text
 
 
-@pytest.mark.parametrize("share", [0.0001, 0.5])
+@pytest.mark.parametrize("share", [pytest.param(0.0001, marks=pytest.mark.slow), 0.5])
 def test_a_truncated_raw_is_kept_and_not_decoded(frame: Path, here: Path, tmp_path: Path, share: float) -> None:
     cut = tmp_path / "cut.dng"
     data = frame.read_bytes()

@@ -167,7 +167,7 @@ def test_a_new_recipe_writes_beside_the_old_results(copied: Path) -> None:
     for words in (["--run", "again"], []):
         verified = dappled("replay", str(copied), "--verify", *words)
         assert verified.returncode == 0, verified.stdout + verified.stderr
-    assert "again: 3 frames decoded again" in dappled("flight", "show", str(copied)).stdout
+    assert f"again: {FRAMES} frames decoded again" in dappled("flight", "show", str(copied)).stdout
     with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger_file, ledger_file:
         ledger_file.execute("DELETE FROM results WHERE idx = 1 AND run = 'again'")
     ledger_file.close()

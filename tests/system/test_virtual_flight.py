@@ -20,6 +20,7 @@ from tests.simulated.virtual_flight import Plan, VirtualFlight, fly
 from tests.system.flying import assert_whole
 
 TEN_MINUTES = Plan(seed=1, frames=60, interval_s=9.8, hz=5.0, cuts=((100.0, 112.0), (400.0, 403.0)))
+TWO_MINUTES = replace(TEN_MINUTES, frames=20, interval_s=5.8, cuts=((20.0, 32.0), (80.0, 83.0)))
 
 
 HOUR = Plan(
@@ -81,11 +82,12 @@ def lawful(plan: Plan, folder: Path) -> VirtualFlight:
     return flown
 
 
-def test_ten_minutes_over_a_bad_link_are_lawful(tmp_path: Path) -> None:
-    """60 requests, two cuts of the links, packets lost, doubled and late, and every fiftieth shot a failure."""
-    flown = lawful(TEN_MINUTES, tmp_path)
-    assert flown.seconds > 580
-    assert sum(one.ok for one in flown.outcomes) > 50
+@pytest.mark.parametrize("plan", [TWO_MINUTES, pytest.param(TEN_MINUTES, marks=pytest.mark.slow)], ids=["2", "10"])
+def test_minutes_over_a_bad_link_are_lawful(plan: Plan, tmp_path: Path) -> None:
+    """Two cuts of the links, packets lost, doubled and late, and every fiftieth shot a failure."""
+    flown = lawful(plan, tmp_path)
+    assert flown.seconds > 0.98 * plan.frames * plan.interval_s
+    assert sum(one.ok for one in flown.outcomes) > 0.84 * plan.frames
 
 
 def by_seed(plan: Plan, folder: Path) -> VirtualFlight:

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.clock import SystemClock
@@ -67,7 +67,6 @@ def arrivals(way: Way, gap_s: float, confirms: bool, seed: int) -> list[tuple[fl
 
 
 @given(WAYS, st.sampled_from([0.05, 0.2, 1.5]), st.booleans(), st.integers(0, 2**32))
-@settings(max_examples=150)
 def test_loss_duplication_and_reordering_make_exactly_one_shot_of_every_wish_that_came(
     way: Way, gap_s: float, confirms: bool, seed: int
 ) -> None:
@@ -95,7 +94,6 @@ def test_loss_duplication_and_reordering_make_exactly_one_shot_of_every_wish_tha
     st.sampled_from([0.0, 0.3, 0.6]),
     st.integers(0, 2**32),
 )
-@settings(max_examples=150)
 def test_a_trigger_that_nobody_answers_is_one_shot_over_two_links_of_which_one_is_two_seconds_behind(
     kind: str, gaps_s: list[float], behind_s: float, loss: float, seed: int
 ) -> None:
@@ -138,7 +136,6 @@ HEARD = [0, 76, 75, 112, 180, 110, 320, 321, 323, 111, 33, 30, 31, 24, 2, 77, 25
         max_size=12,
     )
 )
-@settings(max_examples=200)
 def test_any_payload_of_any_length_in_a_sound_packet_crashes_nothing(packets: list[tuple[int, bytes, bool]]) -> None:
     rig = Rig()
     rig.tick(4)

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Sequence
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from dappled.daemon.camera_protocol.camera_status import Captured
@@ -160,7 +160,6 @@ times = st.floats(WARM_UP_S, LAST_S).map(lambda at_s: round(at_s, 2))
 outages = st.tuples(st.integers(0, 1), times, st.floats(0.5, 9.0)).map(lambda one: (one[0], one[1], one[1] + one[2]))
 
 
-@settings(max_examples=40, deadline=None)
 @given(
     st.tuples(st.booleans(), st.booleans()),
     st.lists(outages, max_size=3),

@@ -11,7 +11,7 @@ from pathlib import Path as File
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.daemon.navigation import Telemetry, first_position_utc_ns
@@ -196,7 +196,6 @@ def test_answers_meant_for_others_are_not_taken() -> None:
 
 
 @given(st.floats(-50, 50), st.floats(1, 80), st.floats(0, 0.03), st.integers(0, 99))
-@settings(max_examples=40, deadline=None)
 def test_the_timesync_filter_finds_offset_and_drift(ppm: float, seconds: float, jitter_s: float, seed: int) -> None:
     rng = random.Random(seed)  # noqa: S311 (a simulation)
     answers = []
@@ -264,7 +263,7 @@ def test_a_real_flight_predicts_each_of_its_samples_from_the_neighbours(shared_d
     kinds = {"GLOBAL_POSITION_INT", "ATTITUDE"}
     errors, angles, reboots = [], [], 0
     chosen = [i for i, p in enumerate(packets) if p[2].get_type() in kinds and p[1] * 1000 > first + 60 * 10**9][::97]
-    for place in chosen[:50]:
+    for place in chosen[:50:3]:
         left_out = packets[place]
         boot_ns = left_out[2].time_boot_ms * 10**6 + 500_000
         window = [p for p in packets[max(0, place - 1500) : place + 400] if p is not left_out]
@@ -288,14 +287,10 @@ def test_a_real_flight_predicts_each_of_its_samples_from_the_neighbours(shared_d
                     (pose.longitude_rad - math.radians(left_out[2].lon / 1e7)) * east,
                 )
             )
-    assert len(errors) + len(angles) >= 40
+    assert len(errors) + len(angles) >= 14
     assert np.median(errors) < 0.3
     assert np.percentile(errors, 90) < 2.0
     assert np.median(angles) < 3.0
-
-
-def test_a_real_flights_reboot_is_seen_once(shared_data: File) -> None:
-    assert fed(list(real_flight(shared_data))).statistics().reboots == 1
 
 
 def test_history_is_bounded_in_time_whatever_stands_between_its_packets() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import pytest
-from hypothesis import assume, example, given, settings
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock
@@ -103,7 +103,6 @@ def _traffic(draw: st.DrawFn) -> list[tuple[float, str, float | None, float | No
     )
 
 
-@settings(max_examples=40, deadline=None)
 @given(_traffic(), st.sampled_from([START, DIGICAM]), st.sampled_from([("ardupilot", "mavlink"), ("px4", "mavlink")]))
 @example([(1.2, "one", 0.0, 0.001, True), (1.2, "autopilot", None, 0.0, False)], START, ("ardupilot", "mavlink"))
 def test_requests_and_shots_are_the_same_number(
@@ -130,7 +129,6 @@ def test_requests_and_shots_are_the_same_number(
     assert field_.run() == expected
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.floats(0.0, 0.24), st.permutations(["one", "other", "first", "second"]), st.floats(0, 0.02))
 @example(0.238, ["one", "other", "first", "second"], 0.015)
 @example(0.238, ["one", "first", "other", "second"], 0.005)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -326,7 +326,6 @@ def scripts(draw: st.DrawFn) -> list[tuple[str, int]]:
     return draw(st.lists(st.tuples(st.sampled_from(PIECES), st.integers(0, 2)), max_size=5))
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.lists(st.tuples(scripts(), st.booleans(), st.booleans()), min_size=1, max_size=5))
 def test_a_request_is_one_shot_and_each_shot_ends_once(
     plan: list[tuple[list[tuple[str, int]], bool, bool]],

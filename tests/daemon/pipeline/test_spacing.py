@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field, replace
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock
@@ -99,7 +99,6 @@ def gaps(rig: Rig) -> list[float]:
     return [b - a for a, b in zip(rig.shots_m, rig.shots_m[1:], strict=False)]
 
 
-@settings(max_examples=40, deadline=None)
 @given(st.floats(1.0, 20.0), st.floats(2.0, 30.0), st.floats(0, 2 * math.pi), st.sampled_from([2.0, 5.0, 10.0, 50.0]))
 def test_photographs_are_a_distance_apart_whatever_speed_course_and_rate(
     speed: float, distance: float, course: float, hz: float

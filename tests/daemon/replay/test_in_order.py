@@ -6,7 +6,7 @@ import itertools
 import random
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.daemon.replay.in_order import Pairing, paired_in_order
@@ -36,9 +36,9 @@ def flown(
     return found, {place: shot for shot, place in enumerate(kept)}
 
 
-@pytest.mark.parametrize("delay_s", [-0.6, -0.25, 0.02, 0.25, 0.6, 1.3])
-@pytest.mark.parametrize("interval_s", [0.2, 0.5, 1.0])
-@pytest.mark.parametrize("lost", [set(), {12}, {4, 5}, {3, 20}])
+@pytest.mark.parametrize("delay_s", [-0.6, 0.02, 0.6, 1.3])
+@pytest.mark.parametrize("interval_s", [0.2, 1.0])
+@pytest.mark.parametrize("lost", [set(), {4, 5}, {3, 20}])
 def test_a_trigger_lost_between_others_is_named_whatever_the_delay(
     delay_s: float, interval_s: float, lost: set[int]
 ) -> None:
@@ -75,7 +75,6 @@ def test_at_5_hz_an_end_is_never_certain(lost: int) -> None:
 
 
 @given(st.integers(0, 29), st.floats(-1.0, 1.0), st.integers(0, 1000))
-@settings(max_examples=40, deadline=None)
 def test_uneven_triggers_are_certain_at_any_delay(lost: int, delay_s: float, seed: int) -> None:
     found, true = flown({lost}, uneven=0.4, delay_s=delay_s, seed=seed)
     assert (found.pairs, found.triggers) == (true, {lost: ()})
@@ -133,7 +132,6 @@ def test_with_nothing_to_pair_all_is_left_over(triggers: list[int], shots: list[
 
 
 @given(st.lists(st.integers(0, 8_000_000), min_size=1, max_size=5), st.lists(st.integers(0, 8_000_000), max_size=5))
-@settings(max_examples=60, deadline=None)
 def test_pairs_are_in_order_and_everything_is_paired_or_left_over(triggers: list[int], shots: list[int]) -> None:
     found = paired_in_order(sorted(triggers), sorted(shots), known_us=100_000, late_us=LATE_US)
     assert list(found.pairs.values()) == sorted(set(found.pairs.values()))

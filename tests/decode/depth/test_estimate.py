@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.depth import estimate, evidence, stereo
@@ -174,7 +174,6 @@ def test_a_wall_without_detail_does_not_widen_the_range() -> None:
 
 
 @given(st.floats(-0.9, 0.9), st.floats(0.05, 0.2))
-@settings(max_examples=30, deadline=None)
 def test_a_peak_is_read_off_between_samples(where: float, width: float) -> None:
     grid = np.linspace(-1.5, 1.5, 61)
     likelihood = np.exp(-(((grid - where) / (4 * width)) ** 2)).astype(np.float32)[:, None, None]

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer, used_aperture
@@ -23,7 +23,6 @@ def _slices(kappa: float, rotation: float, aperture: Aperture, texture: float, s
     return np.asarray((TRANSFERS * through)[:, None, None] * scene + own, dtype=np.complex64)
 
 
-@settings(max_examples=30, deadline=None)
 @given(kappa=st.floats(0.3, 1.15), off=st.floats(-0.03, 0.03), rotation=st.floats(-0.035, 0.035))
 def test_the_aperture_is_found_behind_a_rounded_f_number(kappa: float, off: float, rotation: float) -> None:
     found = used_aperture(

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
@@ -64,7 +64,6 @@ def test_a_lineariser_serves_frame_after_frame() -> None:
     assert first.tobytes() == again.tobytes()
 
 
-@settings(max_examples=25, deadline=None)
 @given(first=st.integers(0, 9), count=st.integers(1, 60))
 def test_rows_can_be_read_from_any_period_on(first: int, count: int) -> None:
     mosaic = _mosaic((120, 90), BAYER)

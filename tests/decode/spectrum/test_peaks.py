@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.decoder import MaskDecoder
@@ -26,7 +26,6 @@ def _wave(fy: float, fx: float, amplitude: float, phase: float, noise: float = 0
     return transform(plane.astype(np.float32))
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     fy=st.floats(-0.45, 0.45),
     fx=st.floats(-0.45, 0.45),

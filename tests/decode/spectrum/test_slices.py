@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
@@ -21,7 +21,6 @@ def _frame(fy: float, fx: float, factor: complex) -> tuple[np.ndarray, np.ndarra
     return picture, (picture * (1 + carrier)).astype(np.float32)
 
 
-@settings(max_examples=25, deadline=None)
 @given(fy=st.floats(0.1, 0.4), fx=st.floats(-0.4, 0.4), phase=st.floats(-3, 3))
 def test_a_slice_is_the_picture_times_the_carriers_amplitude(fy: float, fx: float, phase: float) -> None:
     factor = 0.3 * np.exp(1j * phase)
@@ -123,7 +122,6 @@ def test_bad_calls_are_refused_in_words() -> None:
 UNEVEN = np.random.default_rng(8).random((151, 203)).astype(np.float32)
 
 
-@settings(max_examples=60, deadline=None)
 @given(
     fy=st.floats(-0.49, 0.49),
     fx=st.floats(-0.49, 0.49),

@@ -103,7 +103,14 @@ def running(camera: GPhoto2Camera) -> Iterator[GPhoto2Camera]:
         camera.stop()
 
 
-@pytest.mark.parametrize(("f_number", "shown"), [(None, "2.8"), (14.8, "14"), (22.0, "22"), (59.2, "32")])
+@pytest.mark.parametrize(
+    ("f_number", "shown"),
+    [
+        (None, "2.8"),
+        (14.8, "14"),
+        *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((22.0, "22"), (59.2, "32"))),
+    ],
+)
 def test_the_simulated_lens_is_set_to_the_stop_of_its_pictures(f_number: float | None, shown: str) -> None:
     with (
         SimulatedBody.start(BodyOptions(picture="pattern:1000:dng", f_number=f_number)) as body,
@@ -242,7 +249,7 @@ def test_a_camera_held_by_another_program_is_named_and_taken_when_it_is_free(mak
     until_state(camera, "ready")
 
 
-@pytest.mark.parametrize("target", ["card", "ram"])
+@pytest.mark.parametrize("target", ["card", pytest.param("ram", marks=pytest.mark.slow)])
 def test_a_busy_body_is_asked_again(ready: Make, body: SimulatedBody, target: str) -> None:
     camera = ready(capture_target=target)
     body.fault("busy 0.3")
@@ -719,7 +726,7 @@ def starved(body: SimulatedBody, target: str, code: str) -> None:
     subprocess.run(words, check=True, timeout=100)
 
 
-@pytest.mark.parametrize("target", ["card", "ram"])
+@pytest.mark.parametrize("target", ["card", pytest.param("ram", marks=pytest.mark.slow)])
 def test_without_descriptors_a_file_waits_and_comes_when_there_are_some_again(body: SimulatedBody, target: str) -> None:
     starved(
         body,

@@ -106,8 +106,14 @@ def test_receiver_messages_with_a_wrong_time_move_no_others(tmp_path: Path) -> N
     assert stamps == sorted(stamps)
 
 
-@pytest.mark.parametrize("off_s", [-37, 1, 3600])
-@pytest.mark.parametrize("steps", [5, 20, 40])
+@pytest.mark.parametrize(
+    ("steps", "off_s"),
+    [
+        (5, -37),
+        (40, 3600),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((5, 1), (20, -37), (20, 3600), (40, 1))),
+    ],
+)
 def test_a_receiver_whose_time_is_put_right_counts_as_it_says_from_then_on(
     tmp_path: Path, steps: int, off_s: int
 ) -> None:

@@ -73,7 +73,9 @@ def changed(log: Path, name: str, at: int, place: int, value: float, *, in_a_row
     return rewritten(log, change)
 
 
-@pytest.mark.parametrize("at", [13, 25, 37])  # at the exposures of `poses`, or just before
+@pytest.mark.parametrize(  # at the exposures of `poses`, or just before
+    "at", [25, *(pytest.param(at, marks=pytest.mark.slow) for at in (13, 37))]
+)
 @pytest.mark.parametrize(
     ("name", "place", "value"),
     [
@@ -97,8 +99,14 @@ def test_one_bad_value_is_missing_at_its_time_and_counted(
         assert turn_rad(here.attitude, there.attitude) < 0.02
 
 
-@pytest.mark.parametrize("in_a_row", [2, 3])
-@pytest.mark.parametrize("at", [0, 13, 25])
+@pytest.mark.parametrize(
+    ("in_a_row", "at"),
+    [
+        (2, 0),
+        (3, 13),
+        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 13), (2, 25), (3, 0), (3, 25))),
+    ],
+)
 @pytest.mark.parametrize(
     ("name", "place", "value"),
     [

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from dappled.drivers.raw import lytro, reading
@@ -133,7 +133,6 @@ def test_metadata_that_makes_no_sense_is_told_in_a_sentence(old: bytes, new: byt
     assert "\n" not in str(told.value)
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.data())
 def test_any_damage_gives_a_frame_or_a_sentence(data: st.DataObject) -> None:
     whole = bytearray(container(_values(12), metadata(SHAPE)))
@@ -144,7 +143,6 @@ def test_any_damage_gives_a_frame_or_a_sentence(data: st.DataObject) -> None:
         reading.read(bytes(whole), "a.lfp")
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.binary(max_size=200))
 def test_any_bytes_after_the_beginning_give_a_sentence(data: bytes) -> None:
     with pytest.raises(DappledError):

@@ -77,7 +77,7 @@ def test_maps_of_pictures_in_doubt_say_so(
 
 def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = sorted(path for path in short_flight.folder.rglob("*"))
-    more = ["--each", "--as", "kmz", "cog", "footprints", "--refine", "neighbours"]
+    more = ["--each", "--as", "kmz", "cog", "footprints", "--refine", "neighbours", "--gsd", "0.05"]
     assert main(words(short_flight, tmp_path, *more)) == 0
     said = capsys.readouterr().out
     assert "2 frames on EPSG:32615" in said
@@ -404,7 +404,7 @@ def decoded(short_flight: Flown) -> tuple[Station, LightField, CameraProfile]:
     """The first frame of the flight."""
     (frame, *_), tags = photographs.recorded(short_flight.folder)
     darkroom = Darkroom(short_flight.recipe)
-    made = darkroom.decode(short_flight.folder / frame.name)
+    made = darkroom.decode(short_flight.folder / frame.name, joint_views=False)
     station = photographs.station(frame, tags[frame.index], Mounting())
     return station, made.light_field, darkroom.camera(made.raw.camera_model or "")
 
