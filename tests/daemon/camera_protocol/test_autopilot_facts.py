@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import re
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,69 @@ FACTS: dict[str, tuple[tuple[str, str], ...]] = {
     ),
 }
 
+HOSTS = "daemon/health/test_host_checks.py"
+JUMPS, SORTIES = "daemon/navigation/test_jumps.py", "daemon/camera_protocol/test_sorties.py"
+FLOWN = ("daemon/navigation/test_flown_autopilot.py", "test_replayed_positions_are_true_or_in_doubt")
+MISSED: dict[str, tuple[tuple[str, str], ...]] = {  # what flights with a real autopilot showed to be wrong
+    "A request that the link held is late, in tag and books": (
+        FLOWN,
+        (STEPS, "test_a_request_that_a_link_held_is_known_as_late"),
+        (BOOKS, "test_requests_that_a_link_has_held_are_late_unless_the_autopilot_fires_the_camera"),
+    ),
+    "Frames that EXIF places elsewhere than their log are in doubt": (
+        ("daemon/replay/test_replay.py", "test_pictures_that_say_another_time_than_where_they_are_placed_are_in_doubt"),
+    ),
+    "The doubt of a jump outlives a step of the clock, and ends by evidence": (
+        FLOWN,
+        (JUMPS, "test_a_doubt_of_the_position_outlives_steps_of_the_clock_and_ends_when_it_is_back"),
+        (JUMPS, "test_a_doubt_ends_a_minute_after_the_receiver_has_come_back_where_the_position_is"),
+    ),
+    "Right after a step there is a pose": ((STEPS, "test_right_after_the_answer_that_shows_a_step_there_is_a_pose"),),
+    "A contact keeps its time between steps": ((STEPS, "test_contacts_between_steps_keep_their_times"),),
+    "A repeated broadcast is one frame": ((COMPONENT, "test_a_request_that_says_that_it_repeats_is_no_second_shot"),),
+    "Interval 0, count 0 is one photograph": ((COMPONENT, "test_a_request_with_zeros_alone_is_one_photograph"),),
+    "Camera ids": ((COMPONENT, "test_a_command_for_another_camera_is_denied_and_not_done"),),
+    "PX4's own report of a contact is a shot": (
+        (PROTOCOL, "test_each_contact_that_px4_reports_is_one_shot_whether_a_trigger_has_told_of_it_or_not"),
+    ),
+    "PX4's counter that was set back": (
+        (PROTOCOL, "test_triggers_that_are_lost_after_px4s_counter_was_set_back_are_named"),
+    ),
+    "A crash and restart of the autopilot": (
+        (PROTOCOL, "test_an_autopilot_without_time_that_starts_again_begins_its_numbers_again"),
+        (PROTOCOL, "test_a_contact_of_a_new_start_is_a_shot_before_anything_else_shows_it"),
+        (BOOKS, "test_each_trigger_around_a_restart_is_in_the_book_of_its_power_up"),
+        (SORTIES, "test_some_sorties_miss_nothing"),
+    ),
+    "Two ports of one autopilot count once": (
+        (BOOKS, "test_what_two_ports_of_the_autopilot_have_brought_is_counted_once"),
+        (ROUTES, "test_a_report_is_sent_on_one_port_where_both_lead_to_the_same_stations"),
+    ),
+    "A log without triggers": ((BOOKS, "test_a_log_without_a_trigger_is_in_doubt_and_says_what_to_set"),),
+    "Which rate is missing": (
+        (PROTOCOL, "test_telemetry_that_comes_too_seldom_is_named_with_its_rate_until_it_comes_as_requested"),
+    ),
+    "A clock that is not real time": ((STEPS, "test_a_clock_that_runs_fast_gives_no_confident_pose"),),
+    "CAMn_COMPID": ((PROTOCOL, "test_a_component_that_is_not_this_one_in_ardupilots_parameters_is_told"),),
+    "262 asked for each second": ((COMPONENT, "test_a_station_that_asks_each_second_is_answered_each_time"),),
+    "Relays as triggers": ((HOSTS, "test_a_relay_that_is_switched_by_itself_is_no_shot_where_something_else_fires"),),
+    "What is declared is obeyed: zoom, and no video": (
+        (COMPONENT, "test_what_is_declared_is_obeyed_and_what_is_not_is_refused"),
+        (COMPONENT, "test_a_continuous_zoom_goes_on_until_it_is_stopped_or_at_the_end"),
+    ),
+    "A zoom is answered by the settings": (
+        (COMPONENT, "test_an_accepted_zoom_is_answered_with_the_settings_and_again_when_the_body_has_it"),
+    ),
+    "263: orientation, height above ground": (
+        (COMPONENT, "test_a_photograph_is_told_with_the_cameras_orientation_and_its_height_above_the_ground"),
+    ),
+    "A test shot isn't counted": ((PROTOCOL, "test_a_test_shot_is_a_photograph_that_covers_no_lost_trigger"),),
+    "The storage's id": ((COMPONENT, "test_the_disk_is_storage_1_and_there_is_no_other"),),
+    "CAM_CAP_REPORT 0 where dappled fires": (
+        (NAVIGATION, "test_px4s_own_report_of_a_photograph_has_the_time_of_the_contact_or_of_the_trigger"),
+        (PROTOCOL, "test_a_report_of_px4s_own_trigger_is_that_photograph_and_stands_in_for_it"),
+    ),
+}
 
 LINES = 14  # of the note
 
@@ -103,6 +167,12 @@ def test_each_line_is_here_once_with_tests_of_its_own() -> None:
     for fact, tests in FACTS.items():
         assert len(set(tests)) == len(tests), fact
         assert {place for place, _ in tests} - {"matrix"}, f"{fact}: the matrix alone does not say what it holds"
+
+
+@pytest.mark.parametrize("fact", MISSED)
+def test_each_thing_that_was_missed_has_its_tests(fact: str) -> None:
+    for place, name in MISSED[fact]:
+        assert runs(TESTS / place, name), f"{place} has no test {name} that runs"
 
 
 @pytest.mark.parametrize("fact", FACTS)
@@ -117,10 +187,15 @@ def test_each_fact_has_its_tests(fact: str) -> None:
             assert runs(TESTS / place, name), f"{place} has no test {name} that runs"
 
 
+@cache
+def functions(path: Path) -> list[ast.FunctionDef]:
+    return [node for node in ast.parse(path.read_text("utf-8")).body if isinstance(node, ast.FunctionDef)]
+
+
 def runs(path: Path, name: str) -> bool:
     """Whether a file of tests has this one, neither skipped nor expected to fail."""
-    for node in ast.parse(path.read_text("utf-8")).body:
-        if isinstance(node, ast.FunctionDef) and node.name == name:
+    for node in functions(path):
+        if node.name == name:
             return not any(word in ast.unparse(mark) for mark in node.decorator_list for word in ("skip", "xfail"))
     return False
 

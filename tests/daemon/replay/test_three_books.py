@@ -73,6 +73,7 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
         ahead_s: float = 0.0,
         fired_by: str = "",
         again_s: float = math.inf,
+        ports: int = 1,
         fed_back: Sequence[tuple[float, int, int]] = (),
     ) -> Path:
         settings = {"camera": {"driver": "folder", "shutter": fired_by}} if fired_by else {}
@@ -85,12 +86,16 @@ def fly(tmp_path: Path) -> Callable[..., Path]:
             utc_us = UTC_US + t_us + round((late_s + ahead_s) * 1e6)
             delay_us = round(time_delays_s[step % len(time_delays_s)] * 1e6)
             message = mavlink.MAVLink_system_time_message(utc_us, boot_us // 1000)
-            flight.telemetry.append(UTC_US + t_us + LINK_US + delay_us, pack(message, packer, version_1=False))
+            for port in range(ports):
+                stamp_us = UTC_US + t_us + (1 + port) * LINK_US + delay_us
+                flight.telemetry.append(stamp_us, pack(message, packer, version_1=False))
         for t_s, _, _, number in heard:
             command = mavlink.MAVLink_command_long_message(
                 1, 100, mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 0, 1, number or 0, 0, 0, 0
             )
-            flight.telemetry.append(UTC_US + round(t_s * 1e6) + LINK_US, pack(command, packer, version_1=False))
+            for port in range(ports):
+                stamp_us = UTC_US + round(t_s * 1e6) + (1 + port) * LINK_US
+                flight.telemetry.append(stamp_us, pack(command, packer, version_1=False))
         for t_s, number, camera in fed_back:
             report = mavlink.MAVLink_camera_feedback_message(0, 1, camera, number, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0)
             flight.telemetry.append(UTC_US + round(t_s * 1e6) + LINK_US, pack(report, packer, version_1=False))
@@ -162,6 +167,15 @@ def test_each_trigger_that_is_not_in_all_three_is_named(
     assert "shot 4 at 2026-11-21T10:15:07.0Z" in phantom
     assert "number 7); the log has no such trigger" in phantom
     assert said[-1].startswith("THE THREE BOOKS DO NOT BALANCE: 1 lost, 1 refused, 1 without a file")
+
+
+def test_what_two_ports_of_the_autopilot_have_brought_is_counted_once(
+    fly: Callable[..., Path], bin_log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    add_triggers(bin_log, TIMES_S)
+    code, said = report(capsys, fly(requested(), heard=requested(), ports=2), "--log", bin_log)
+    assert (code, said[-2].split()[0]) == (0, "9")
+    assert not any(line.startswith("doubled") for line in said)
 
 
 @pytest.mark.parametrize("removed", [3, None])

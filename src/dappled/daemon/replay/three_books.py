@@ -26,9 +26,8 @@ from dappled.config.settings import MavlinkSettings
 from dappled.daemon.navigation import recorded_vehicles
 from dappled.daemon.replay.in_order import paired_in_order
 from dappled.daemon.replay.replay import own_log
-from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import PacketParser, mavlink
-from dappled.drivers.mavlink.log_packets import LoggedTrigger, TriggerLog
+from dappled.drivers.mavlink.log_packets import BootMap, LoggedTrigger, TriggerLog
 from dappled.drivers.utc_choice import LOGS_FROM_NS, UtcBounds
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Subject, finding, text
@@ -216,14 +215,12 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
     spans, elsewhere = [], 0
     placed = [_placed(path, log, heard) for path, log in read]
     steady = all(late_us <= _STEADY_US for _, late_us in placed)
-    power_ups = _PowerUps.of_logs([_at_us(0, offsets) for offsets, _ in placed])
-    for (_, log), (offsets, _) in zip(read, placed, strict=True):
+    power_ups = _PowerUps.of_logs([here.utc_us(0) for here, _ in placed])
+    for (_, log), (here, _) in zip(read, placed, strict=True):
         if logged:
-            spans.append((_at_us(log.begins_us, offsets), _at_us(log.ends_us, offsets)))
-        power_up = power_ups.of(_at_us(0, offsets) + _SAME_BOOT_US)
-        within = [
-            one for one in _triggers(log, offsets, power_up) if (heard.first_us or 0) <= one.at_us <= heard.last_us
-        ]
+            spans.append((here.utc_us(log.begins_us), here.utc_us(log.ends_us)))
+        power_up = power_ups.of(here.utc_us(0) + _SAME_BOOT_US)
+        within = [one for one in _triggers(log, here, power_up) if (heard.first_us or 0) <= one.at_us <= heard.last_us]
         elsewhere += len(log.triggers) - len(within)
         triggers += within
     contacts = [log.contacts for _, log in read if log.contacts is not None]
@@ -294,9 +291,9 @@ def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside
     return found
 
 
-def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[tuple[Floats, Floats], float]:
-    """The daemon's time minus the time since boot, at times since boot: (n,) µs each; and by how much the link delays
-    half of its messages. Raises DappledError where the flight heard no such boot."""
+def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[BootMap, float]:
+    """The autopilot's time since boot on the daemon's clock; and by how much the link delays half of its messages.
+    Raises DappledError where the flight heard no such boot."""
     mine = [
         (boot_us, stamp_us - boot_us)
         for boot_us, unix_minus_boot_us, stamp_us in heard.times
@@ -306,7 +303,7 @@ def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[tuple[Floats, F
         boots_us, offsets_us = np.array(sorted(mine), dtype=np.float64).T
         near = zip(*(np.searchsorted(boots_us, boots_us + way * _WINDOW_US) for way in (-1, 1)), strict=True)
         least_us = np.array([offsets_us[begins : ends + 1].min() for begins, ends in near])
-        return (boots_us, least_us), float(np.median(offsets_us - least_us))
+        return BootMap(boots_us, least_us), float(np.median(offsets_us - least_us))
     if not heard.times:
         raise DappledError(
             "the flight's telemetry has no time of the autopilot (SYSTEM_TIME with UTC), so no log can be placed in it"
@@ -318,19 +315,12 @@ def _placed(path: Path, log: TriggerLog, heard: _Heard) -> tuple[tuple[Floats, F
     )
 
 
-def _at_us(boot_us: int, offsets: tuple[Floats, Floats]) -> int:
-    """A time since boot on the daemon's clock."""
-    boots_us, offsets_us = offsets
-    begins = offsets_us[0]  # small numbers keep their digits
-    return boot_us + int(begins) + round(float(np.interp(boot_us, boots_us, offsets_us - begins)))
-
-
-def _triggers(log: TriggerLog, offsets: tuple[Floats, Floats], power_up: int) -> Iterator[_Trigger]:
+def _triggers(log: TriggerLog, here: BootMap, power_up: int) -> Iterator[_Trigger]:
     kinds = ("CAMERA_TRIGGER",) if log.by == "PX4" else ("CAMERA_FEEDBACK", "IMAGE_START_CAPTURE")
     before: int | None = None
     for one in log.triggers:
         passed = range(0 if before is None else before + 1, 0 if before is None else one.number)
-        at_us, utc_us = _at_us(one.boot_us, offsets), log.clock.utc_us(one.boot_us)
+        at_us, utc_us = here.utc_us(one.boot_us), log.clock.utc_us(one.boot_us)
         yield _Trigger(one, power_up, at_us, utc_us, frozenset(kinds), passed)
         before = one.number
 

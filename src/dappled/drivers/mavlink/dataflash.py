@@ -25,7 +25,7 @@ from dappled.drivers.gps_time import GPS_EPOCH, gps_to_utc
 from dappled.drivers.mavlink import log_evidence, log_packets
 from dappled.drivers.mavlink.dataflash_reader import WHERE
 from dappled.drivers.mavlink.log_evidence import Chosen, LoggedPlaces, Missing, Receiver
-from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
+from dappled.drivers.mavlink.log_packets import AutopilotLogError, BootMap, LoggedTrigger, Timed, TriggerLog
 from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import UtcBounds, rollovers
 from dappled.errors import first_line
@@ -126,7 +126,7 @@ def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
 
 def _clock(
     path: Path, rows: dict[str, list[Any]], bounds: UtcBounds | None
-) -> tuple[LogClock, list[tuple[Receiver, Chosen]], list[Finding]]:
+) -> tuple[BootMap, list[tuple[Receiver, Chosen]], list[Finding]]:
     """The autopilot's clock, the receiver's messages that count, and what is to be said of both. Raises DataFlashError
     without a fix."""
     receivers = list(_receivers(rows))

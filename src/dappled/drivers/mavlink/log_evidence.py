@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dappled.clock import TimeOfDayClock
 from dappled.decode.array_types import Floats
 from dappled.drivers.mavlink import log_packets
-from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, LogClock, ReceiverFix, Timed
+from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, BootMap, ReceiverFix, Timed
 from dappled.drivers.mavlink.sample_judge import (
     FASTEST_M_S,
     HIGHEST_M,
@@ -225,11 +225,11 @@ def _away_us(times_us: NDArray[np.int64], others_us: NDArray[np.int64]) -> NDArr
 
 def utc_clock(
     path: Path, ranked: Sequence[tuple[Receiver, Chosen]], others: Sequence[Receiver], bounds: UtcBounds | None
-) -> tuple[LogClock, list[Finding]]:
+) -> tuple[BootMap, list[Finding]]:
     """The autopilot's clock by the receiver that counts; where that one told no UTC that can be true, by the best other
     one. Raises AutopilotLogError without any."""
     bounds = bounds or UtcBounds.of_log(TimeOfDayClock().utc_ns())
-    doubted: tuple[LogClock, list[Finding]] | None = None
+    doubted: tuple[BootMap, list[Finding]] | None = None
     any_fix = False
     others = sorted(others, key=Receiver._rank, reverse=True)
     of_others = [[(one, np.ones(len(one.boots_us), dtype=bool))] for one in others]
@@ -263,7 +263,7 @@ def utc_clock(
     raise AutopilotLogError(f"{path} holds no fix of a satellite receiver: its time in UTC is not known")
 
 
-def _contradicting(path: Path, clock: LogClock, others: Sequence[Receiver], bounds: UtcBounds) -> Iterator[Finding]:
+def _contradicting(path: Path, clock: BootMap, others: Sequence[Receiver], bounds: UtcBounds) -> Iterator[Finding]:
     """The receivers with a fix whose UTC is another one than the clock's at the end of what they say."""
     for one in others:
         boots_us, utc_us, later_us = (each[one.fixed] for each in (one.boots_us, one.utc_us, one.later_us))

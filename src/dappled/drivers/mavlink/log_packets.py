@@ -45,9 +45,10 @@ class ReceiverFix:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LogClock:
-    """UTC minus time since boot, `offsets_us` (n,), at `boots_us` (n,), which increase. `step_us`: how much later the
-    receiver's UTC was before these than it would be by them; 0 where it was the same."""
+class BootMap:
+    """UTC, by a receiver or as this machine has it, minus time since boot: `offsets_us` (n,) at `boots_us` (n,), which
+    increase. `step_us`: how much later the receiver's UTC was before these than it would be by them; 0 where it was
+    the same."""
 
     boots_us: Floats
     offsets_us: Floats
@@ -81,11 +82,11 @@ class TriggerLog:
     contacts: int | None
     begins_us: int
     ends_us: int
-    clock: LogClock
+    clock: BootMap
     records: str
 
 
-def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> LogClock:
+def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> BootMap:
     """The clock by a receiver's messages, (n,) each: when they were logged, and UTC minus that.
 
     A message is logged some time after it holds, so of messages near each other the largest offset is the truest. What
@@ -113,7 +114,7 @@ def log_clock(boots_us: NDArray[np.int64], offsets_us: NDArray[np.int64]) -> Log
     values = (offsets - begins).astype(np.float64)
     since = np.maximum.accumulate(values + rising) - rising
     until = np.maximum.accumulate((values - rising)[::-1])[::-1] + rising
-    return LogClock(times, np.maximum(since, until) + begins, step_us)
+    return BootMap(times, np.maximum(since, until) + begins, step_us)
 
 
 def _since_its_last_step(offsets_us: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -135,7 +136,7 @@ def tell(path: Path, found: Iterable[Finding], report: Callable[[Finding], objec
         report(finding(Code.LOG_CUT_SHORT, Subject("log", str(path))))
 
 
-def packets(messages: Iterable[Timed], clock: LogClock) -> Iterator[tuple[int, int, bytes]]:
+def packets(messages: Iterable[Timed], clock: BootMap) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time."""
     packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     for number, (boot_us, message) in enumerate(sorted(messages, key=lambda one: one[0])):
@@ -156,7 +157,7 @@ def attitude(boot_us: int, turned: Quaternion) -> Timed:
     return boot_us, mavlink.MAVLink_attitude_quaternion_message(boot_us // 1000, *turned, *unknown)
 
 
-def receiver(fix: ReceiverFix, clock: LogClock) -> Iterator[Timed]:
+def receiver(fix: ReceiverFix, clock: BootMap) -> Iterator[Timed]:
     """A GPS_RAW_INT and a SYSTEM_TIME."""
     at = fix.boot_us
     of_mm = [0, 0, 0] if fix.accuracy is None else [round(1000 * value) for value in fix.accuracy]

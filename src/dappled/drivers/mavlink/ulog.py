@@ -26,7 +26,7 @@ from dappled.drivers.mavlink.log_evidence import (
     Missing,
     Receiver,
 )
-from dappled.drivers.mavlink.log_packets import AutopilotLogError, LogClock, LoggedTrigger, Timed, TriggerLog
+from dappled.drivers.mavlink.log_packets import AutopilotLogError, BootMap, LoggedTrigger, Timed, TriggerLog
 from dappled.drivers.mavlink.sample_judge import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds, rollovers
@@ -180,7 +180,7 @@ def _opened(path: Path, names: Sequence[str]) -> dict[tuple[str, int], dict[str,
 
 def _clock(
     path: Path, log: _Topics, bounds: UtcBounds | None
-) -> tuple[LogClock, list[tuple[Receiver, Chosen]], list[Finding]]:
+) -> tuple[BootMap, list[tuple[Receiver, Chosen]], list[Finding]]:
     """The autopilot's clock, the receiver's messages that count, and what is to be said of both. What PX4 chose or
     blended (`vehicle_gps_position`) counts where it has a fix, else the best of its receivers; UTC is of the first that
     has it. Raises AutopilotLogError without one."""
