@@ -105,7 +105,7 @@ faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=
 	  $(BIN)/pytest -q -p no:cacheprovider -m "" tests/system/test_camera_faults.py || exit 1; done
 
 bench: everything ## run the benchmarks, print one table with the limits, write docs/performance.md; REPEATS=n
-	@$(BIN)/python benchmarks/table.py --page --repeats $(or $(REPEATS),1)
+	@$(BIN)/python benchmarks/table.py --page --repeats $(or $(REPEATS),5)
 
 lock: setup ## resolve the locks anew from pyproject.toml: everything, what demo and default tests need, the peers of tests, the documents, what flies, what builds it, and uv
 	@uv=$$(command -v uv || echo .tools/bin/uv); $$uv pip compile -q --universal --python-version 3.11 --generate-hashes \

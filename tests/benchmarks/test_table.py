@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,7 @@ from tests.benchmarks import FOLDER
 sys.path.insert(0, str(FOLDER))
 
 from limits import Limit, flat, read_limits  # once their folder is known
-from table import Row, added, measured, page, with_stored  # the same
+from table import Row, added, main, measured, page, with_stored  # the same
 
 
 def limit(at_most: float | None = None, at_least: float | None = None, noise: float = 0.1) -> Limit:
@@ -58,7 +59,7 @@ def test_median_spread_and_what_no_run_gave() -> None:
     other = Limit("decode", "gone", "", "", None, None, 0.1)
     rows, missing = measured([limit(), other], {"decode": [{"ratio": 1.0}, {"ratio": 1.4}, {"ratio": 1.1}]}, {})
     assert [row.value for row in rows] == [1.1]
-    assert [row.spread for row in rows] == pytest.approx([0.2])
+    assert [row.spread for row in rows] == pytest.approx([0.1])  # one outlier is not the spread
     assert missing == ["decode.gone"]
 
 
@@ -89,20 +90,24 @@ def test_the_page_marks_what_is_missed() -> None:
 
 def test_figures_of_a_run_apart_are_added_and_named(tmp_path: Path) -> None:
     on: dict[str, str | int | float] = {"model": "m", "cores": 2, "python": "3", "date": "one day", "load_before": 0}
-    later = on | {"date": "another day", "repeats": 3}
+    later = on | {"date": "another day", "repeats": 3, "load_after": 0.2}
     first, second = limit(at_most=2.0), Limit("depth", "ratio", "depth", "OpenCV", 2.0, None, 0.1)
     path = tmp_path / "baseline.json"
     path.write_text(json.dumps({"machine": on, "figures": {"decode.ratio": 1.0, "decode.gone": 1.0}}), encoding="utf-8")
-    now = [Row(second, 1.5, 0.0, None)]
+    now = [Row(second, 1.5, 0.05, None)]
     stored = added(path, [first, second], now, later)
     assert json.loads(path.read_text(encoding="utf-8")) == stored
     assert stored["figures"] == {"decode.ratio": 1.0, "depth.ratio": 1.5}
-    rows = with_stored(now, [first, second], stored["figures"])
-    assert [row.name for row in rows] == ["decode.ratio", "depth.ratio"]
+    assert stored["spreads"] == {"depth.ratio": 0.05}
+    rows = with_stored(now, [first, second], stored)
+    assert [(row.name, row.spread) for row in rows] == [("decode.ratio", 0.0), ("depth.ratio", 0.05)]
+    assert with_stored([], [second], stored)[0].spread == 0.05
     before, after = page(rows, stored["machine"], 1, stored["apart"]).split("## depth")
     assert "one day" in before
     assert "another day" not in before
-    assert "Measured apart: m, 2 cores, Python 3, another day; load before the run 0; median of 3." in after
+    assert (
+        "Measured apart: m, 2 cores, Python 3, another day; load before the run 0, after it 0.2; median of 3." in after
+    )
 
 
 def test_the_page_says_what_no_pi_told() -> None:
@@ -130,3 +135,11 @@ def test_a_benchmark_that_fails_ends_1(tmp_path: Path) -> None:
     assert "bad.ratio was not measured" in done.stderr
     assert "good.ratio is 3, asked is at most 2" in done.stderr
     assert json.loads(out.read_text(encoding="utf-8"))["figures"] == {"good.ratio": 3.0}
+
+
+def test_nothing_is_written_down_from_a_busy_machine(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 0.0, 0.0))
+    monkeypatch.setattr(sys, "argv", ["table.py", "decode", "--add", "--baseline", str(tmp_path / "baseline.json")])
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert not (tmp_path / "baseline.json").exists()
