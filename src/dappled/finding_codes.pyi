@@ -343,6 +343,7 @@ class Code(StrEnum):
     SERIES_NO_HEIGHT = "series.no_height"
     SERIES_NO_POSITION = "series.no_position"
     SERIES_OLD_POSITION = "series.old_position"
+    SERIES_TOO_FAST = "series.too_fast"
     SERIES_TOO_LOW = "series.too_low"
     SERVICE_STOPPING = "service.stopping"
     SETTINGS_DIFFER = "settings.differ"

@@ -159,7 +159,8 @@ class TriggerSettings:
     )
     overlap: float = setting(
         0.0,
-        "Share of a photograph's ground, along the way, that the next one sees too; 0: by distance_m",
+        "Share of a photograph's ground, along the way, that the next one sees too; 0: by distance_m. A vehicle "
+        "too fast for it is told, whoever asks for the photographs",
         low=0,
         high=0.95,
     )

@@ -47,6 +47,7 @@ from dappled.daemon.pipeline.capture import Observer, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.overlap import OverlapWatch
 from dappled.daemon.pipeline.pipeline import Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
@@ -66,7 +67,7 @@ from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report, sentence
 from dappled.findings import Code, Finding, Level, Subject
-from dappled.flight import Recording, seal_key
+from dappled.flight import Recording, Tag, seal_key
 from dappled.flight import recording as flights
 
 log = logging.getLogger(__name__)
@@ -108,6 +109,7 @@ class FlightParts:
     shutter: Shutter
     autopilot: OwnAutopilot
     distance: DistanceTrigger
+    overlap: OverlapWatch
     gnss: GnssPort | None
     body: BodyPlan
     parameters: Parameters
@@ -257,6 +259,7 @@ class Service:
             camera.use_autopilot(autopilot.command)
         survey = LiveSurvey(navigation, reported, shots)
         distance = distance_trigger(shutter, survey, clock, settings)
+        overlap = OverlapWatch(survey, settings.pose.mount, settings.trigger.overlap)
         gnss = gnss_port(settings.gnss, TelemetryNotebook(sender, navigation, clock), clock)
         body = BodyPlan(settings.body, settings.camera.capture_target, camera)
         parameters = self._settable(body, shots, writer, shutter, names, decodes=recipe is not None)
@@ -322,6 +325,7 @@ class Service:
             shutter,
             autopilot,
             distance,
+            overlap,
             gnss,
             body,
             parameters,
@@ -446,7 +450,10 @@ class Service:
     def _follow_body(self) -> None:
         """Compare what has come from the camera with the plan; here, so that no frame waits for that."""
         while self.parts.events.of_body:
-            if drift := self.parts.body.take(self.parts.events.of_body.popleft()):
+            news = self.parts.events.of_body.popleft()
+            if isinstance(news, Tag):
+                self.parts.overlap.take(news)
+            if drift := self.parts.body.take(news):
                 self._logbook.add(str(findings.text(drift)), "warning")
 
     def _follow_vehicle(self) -> None:
@@ -466,7 +473,8 @@ class Service:
 
     def health(self) -> dict[str, Any]:
         """The state of everything, as published."""
-        navigation = self.parts.navigation
+        navigation, utc_ns = self.parts.navigation, self._clock.utc_ns()
+        shutter, series = self.parts.shutter.statistics(), self.parts.distance.statistics()
         viewers: list[HasThreads] = [
             self.parts.publisher,
             self.parts.answers,
@@ -480,20 +488,20 @@ class Service:
             *self.parts.links.findings(),
             None if self.parts.gnss is None else self.parts.gnss.problem(),
             *self.parts.body.unseen(),
+            self.parts.overlap.trouble(utc_ns) if series is None else None,  # a series by distance tells it itself
             *(task.failing for task in self._tasks),
         )
         return health.record(
             self._settings.now,
-            ServiceTime(
-                self._clock.utc_ns(), self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known
-            ),
+            ServiceTime(utc_ns, self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known),
             ShootingState(
                 self.parts.shots,
-                self.parts.shutter.statistics(),
+                shutter,
                 self.parts.control.lost_triggers,
-                self.parts.distance.statistics(),
+                series,
                 self.parts.body.report(),
                 codec.plain(self.parts.parameters.all()),
+                self.parts.overlap.last(utc_ns),
             ),
             VehicleState(
                 self.parts.links.statistics(),

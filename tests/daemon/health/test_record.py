@@ -10,11 +10,13 @@ from typing import Any, cast
 import jsonschema
 import pytest
 
+from dappled import codec
 from dappled.config.settings import DecodeSettings, MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
 from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
 from dappled.daemon.navigation import BootClock, Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
+from dappled.daemon.pipeline.overlap import FrameOverlap
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.pipeline.spacing import Spacing, SpacingStatistics
@@ -58,7 +60,7 @@ def record(
         stage.put(number)
     shots = PendingShots(FakeCamera())
     shots.state, shots.reason = cast(BodyState, state), more.pop("reason", "")
-    of_shots = {name: more.pop(name) for name in ("series", "body", "parameters") if name in more}
+    of_shots = {name: more.pop(name) for name in ("series", "body", "parameters", "overlap") if name in more}
     telemetry = replace(Telemetry().statistics(), positions=more.pop("positions", 0))
     stream = PublisherStatistics({}, {}, 0, 0, 0)
     links = [link, *more.pop("links", ())]
@@ -94,6 +96,10 @@ def test_instruments_are_in_the_record_and_what_is_not_known_is_null(tmp_path: P
     powered = record(tmp_path, battery=VehicleBattery(24.83, None, None))
     assert powered["vehicle_battery"] == {"voltage_v": 24.83, "remaining_percent": None, "low": None}
     jsonschema.validate({**ENVELOPE, **powered}, schema("health"))
+    overlap = FrameOverlap(7, 2.0, 0.75, 4.0)
+    followed = record(tmp_path, overlap=overlap)
+    assert (unknown["overlap"], followed["overlap"]) == (None, codec.plain(overlap))
+    jsonschema.validate({**ENVELOPE, **followed}, schema("health"))
     old = record(tmp_path, vehicle=replace(without_a_place, gnss=replace(receiver, age_ms=9000.0)))
     assert old["gnss"] is None
 

@@ -15,6 +15,7 @@ from dappled.daemon.health import go_no_go
 from dappled.daemon.health.standing import ALL_IS_WELL, StandingFindings, in_record
 from dappled.daemon.navigation import BootClock, TelemetryStatistics
 from dappled.daemon.pipeline.capture import PendingShots
+from dappled.daemon.pipeline.overlap import FrameOverlap
 from dappled.daemon.pipeline.pipeline import DecodeFailures
 from dappled.daemon.pipeline.shutter import ShutterStatistics
 from dappled.daemon.pipeline.spacing import SpacingStatistics
@@ -74,7 +75,7 @@ class ServiceTime:
 class ShootingState:
     """Camera and shots. `lost` counts the autopilot's triggers that became no request. `series` are photographs by
     distance, None while none run; `body` is how the camera's settings stand to the plan, None while no camera is ready.
-    `parameters` are the settings of body and decoder."""
+    `parameters` are the settings of body and decoder, `overlap` is that of the last two photographs of a series."""
 
     shots: PendingShots
     shutter: ShutterStatistics
@@ -82,6 +83,7 @@ class ShootingState:
     series: SpacingStatistics | None = None
     body: BodyReport | None = None
     parameters: Sequence[Mapping[str, Any]] = ()
+    overlap: FrameOverlap | None = None
 
     def facts(self) -> dict[str, Any]:
         """The values, as JSON has them."""
@@ -99,6 +101,7 @@ class ShootingState:
             },
             "interval_s": shutter.interval_s,
             "interval": _interval(shutter, self.series),
+            "overlap": codec.plain(self.overlap),
             "settings": list(self.parameters),
         }
 

@@ -213,7 +213,7 @@ class DistanceTrigger:
             if place is None:
                 return _LOOK_S
             way.spacing_m, way.height, way.trouble = self._spacing(way.wanted, pose)
-            apart_m = math.inf if way.last is None else _apart_m(way.last, place)
+            apart_m = math.inf if way.last is None else over_ground_m(way.last, place)
             if way.last is None and not way.at_once:
                 way.last = place
                 return _LOOK_S
@@ -316,7 +316,7 @@ def _is_stale(pose: Pose) -> bool:
     return pose.age_ms is None or pose.age_ms > _STALE_MS
 
 
-def _apart_m(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
+def over_ground_m(a: tuple[float, float, float], b: tuple[float, float, float]) -> float:
     """Over ground."""
     north_m, east_m = metres_per_radian(a[0], a[2])
     return math.hypot((b[0] - a[0]) * north_m, math.remainder(b[1] - a[1], 2 * math.pi) * east_m)

@@ -128,6 +128,7 @@ function showInstruments(health, findings, framesLeft, area) {
     cell("photo", newest === undefined ? "none yet" : `#${newest}`, true, photoAt()),
     cell("space", free === null ? "" : `${fixed(free / 1e9, 1, "GB")}`, free !== null, heardAt),
     cell("frames left", framesLeft === null ? "" : framesLeft.toLocaleString("en").replaceAll(",", "\u202f"), framesLeft !== null),
+    ...(health.overlap ? [cell("overlap", overlapWords(health.overlap))] : []),
     ...(area ? [cell("area seen", areaWords(area), area.share !== null)] : []),
     histogramCell(),
   );
@@ -160,6 +161,8 @@ function fixWords({ fix_type: type, satellites }) {
 function powerWords({ voltage_v: volts, remaining_percent: percent, low }) {
   return [percent === null ? "" : `${percent} %`, volts === null ? "" : `${fixed(volts, 1)} V`, low ? "low" : ""].filter(Boolean).join(", ");
 }
+
+const overlapWords = ({ share, apart_m: apart }) => (share < 0 ? `none, ${fixed(apart, 1)} m apart` : `${Math.floor(100 * share)} %, ${fixed(apart, 1)} m apart`);
 
 // Rounded down: 100 % has no hole.
 function areaWords({ share, frames: count }) {
