@@ -130,3 +130,27 @@ def test_a_body_that_is_too_slow_for_the_mission_is_told() -> None:
     vehicle.trigger.serve = told  # type: ignore[method-assign]
     vehicle.fly(plan)
     assert any("fly slower" in problem for problem in problems if problem)
+
+
+@pytest.mark.slow
+def test_after_a_battery_change_the_mission_is_the_rest_of_the_plan_by_what_was_really_taken() -> None:
+    rng = np.random.default_rng(5)
+    area, planned = square(80), survey(rng, 80, lost=0.0)
+    first = planned[: len(planned) // 2]  # then the battery was empty; two of them came to nothing
+    taken = [one for number, one in enumerate(first) if number not in (10, 11)]
+    survived = seen(taken)
+    before = coverage.cover(survived, grid(), area)
+    rest = refly.plan(survived, before)
+    assert rest is not None
+    whole = refly.plan(seen(taken[:1]), coverage.cover(seen(taken[:1]), grid(), area))
+    assert whole is not None
+    assert length_m(rest) < 0.75 * length_m(whole), "what was taken is not flown again"
+    vehicle = Vehicle(rng, 1000)
+    vehicle.fly(json.loads(json.dumps(refly.qgc_plan(rest))))
+    assert coverage.cover(seen([*taken, *vehicle.stations]), grid(), area).holes().sum() == 0
+
+
+def length_m(mission: refly.Refly) -> float:
+    """Of all lines."""
+    ends = [[np.array(PROJECTION.to_map(*at)) for at in (one.begin, one.end)] for one in mission.lines]
+    return float(sum(np.linalg.norm(end - begin) for begin, end in ends))
