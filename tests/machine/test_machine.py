@@ -3,28 +3,31 @@
 from __future__ import annotations
 
 import hashlib
-import time
 from collections.abc import Callable
 
 import pytest
 
 from dappled.mocks.body.body import pattern
-from tests.machine.conftest import SIZE, Scene
+from tests.machine.conftest import FLIGHTS, SIZE, Scene
 
 pytestmark = [pytest.mark.long, pytest.mark.machine, pytest.mark.alone, pytest.mark.timeout(3600)]
 Make = Callable[..., Scene]
+CGROUP = "/sys/fs/cgroup/system.slice/dappled.service"
 
 
 def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
-    scene: Make, record_property: Callable[..., None]
+    scene: Make, table: Callable[[str, object], None]
 ) -> None:
     flown = scene()
     flown.configure()
-    began = time.monotonic()
+    flown.machine.run("systemctl start dappled")
+    began_us, ready_us = (int(flown.shown(f"{name}TimestampMonotonic")) for name in ("InactiveExit", "ActiveEnter"))
+    table("READY=1, s from the start of the unit", (ready_us - began_us) / 1e6)
     flown.begin()
-    record_property("ready_s", round(time.monotonic() - began, 1))
     for _ in range(20):
         flown.station.shoot()
+    table("most memory of the service, MB", int(flown.machine.run(f"cat {CGROUP}/memory.peak")) / 1e6)
+    table("installed, MB", flown.machine.run("du -sm /usr/lib/dappled | cut -f1").strip())
     pictures = {hashlib.sha256(pattern(number, SIZE)).hexdigest() for number in range(1, 21)}
     assert set(flown.frames().values()) == pictures
     assert sorted(flown.frames()) == sorted(flown.station.captured) == list(range(20))
@@ -36,13 +39,17 @@ def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
     assert "holds" not in doctor  # its own camera process is nobody who is in the way
 
 
-def test_half_a_gigabyte_of_memory_records_every_frame(scene: Make) -> None:
+def test_half_a_gigabyte_of_memory_records_every_frame(scene: Make, table: Callable[[str, object], None]) -> None:
     flown = scene(memory_mb=512)
     flown.configure()
     flown.begin()
     for _ in range(60):
         flown.station.shoot()
     assert len(flown.frames()) == len(flown.station.captured) == 60
+    table(
+        "most memory of the service in a machine of 512 MB, MB",
+        int(flown.machine.run(f"cat {CGROUP}/memory.peak")) / 1e6,
+    )
     assert flown.shown("NRestarts") == "0"
 
 
@@ -55,3 +62,31 @@ def test_a_read_only_root_leaves_a_camera_that_answers_and_says_why(scene: Make)
     flown.station.request()
     flown.station.until(lambda it: it.refused_s, "a refusal")
     assert flown.shown("NRestarts") == "0"
+
+
+def test_what_is_killed_comes_back_and_its_flight_stays(scene: Make) -> None:
+    flown = scene()
+    flown.configure()
+    flown.begin()
+    flown.station.shoot()
+    flown.machine.run("pkill -KILL -f '[g]photo2.process'; sleep 3")
+    flown.begin()
+    flown.station.shoot()
+    flown.machine.run("systemctl kill -s KILL --kill-whom=main dappled; sleep 3")
+    flown.begin()
+    flown.station.shoot()
+    assert flown.shown("NRestarts") == "1"
+    assert len(flown.machine.run(f"ls {FLIGHTS}/*/frames/*.cr2").split()) == 3
+
+
+def test_the_package_is_taken_out_and_the_flights_stay(scene: Make) -> None:
+    flown = scene()
+    flown.configure()
+    flown.begin()
+    flown.station.shoot()
+    flown.machine.run("systemctl restart dappled")
+    flown.begin()
+    flown.machine.run("dpkg --purge dappled 2>&1", timeout_s=300)
+    assert len(flown.frames()) == 1
+    left = flown.machine.run("ls /usr/lib/systemd/system /usr/lib/udev/rules.d /etc | grep dappled || true")
+    assert "dappled" not in left
