@@ -112,7 +112,11 @@ def summary(made: DecodeResult) -> str:
         whole += f": {told(made.unsettled, FRAME)}"
     elif not made.observable:
         whole += f", not observable at this aperture: no carriers in this frame, cut at the {whose} prediction"
-    elif made.carriers_found == 0 and (odds := (field.attributes.get("mask_place") or {}).get("nats", 0.0)) > 0:
+    elif (
+        made.carriers_found == 0
+        and not made.doubts
+        and (odds := (field.attributes.get("mask_place") or {}).get("nats", 0.0)) > 0
+    ):
         whole += f": the stop averages them away, and parallax shows the mask (log odds {odds:.0f})"
     elif made.carriers_found == 0:
         whole += (
