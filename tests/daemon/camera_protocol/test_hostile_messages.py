@@ -335,6 +335,9 @@ def test_five_thousand_messages_a_second_drown_no_wish_and_fill_no_memory(second
             flood.kill()
             code = flood.wait()
         assert code == 0, "the flood did not end by itself"
+        gcs.command(2000, 0, 0, 1, requests, confirmation=20)  # where all was lost, a slow machine heard none
+        gcs.until(lambda m: m.get_type() == "COMMAND_ACK" and m.result == ACCEPTED, "ack", 20.0)
+        camera.idle()
         grown_mb = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
         assert [cause.sequence for cause in camera.causes] == list(range(1, requests + 1))
         assert camera.failures() == 0
