@@ -237,11 +237,13 @@ class _ShownClock:
 
     A time that is not where the clock should be by now counts when the messages have kept to it for `CONFIRM_NS`. One
     that is far behind, but later than an autopilot could show that has started again meanwhile, counts after
-    `STEADY_NS`: so long a slow second link may bring old packets alone.
+    `STEADY_NS`: so long a slow second link may bring old packets alone. That a clock still runs is shown by the first
+    message with a time, and not by copies of it, which may come after those of its next start.
     """
 
     def __init__(self) -> None:
         self._shown: tuple[int, int] | None = None
+        self._newest: tuple[int, int] = 0, 0  # its latest time, and when that came first
         self._doubted: tuple[int, int] | None = None
         self._first: tuple[int, int] = 0, 0  # of those in doubt
 
@@ -251,6 +253,7 @@ class _ShownClock:
         shown = self._shown
         if shown is None or shown[0] - STALE_US <= time_us <= _runs_to(shown, now_ns) + STALE_US:
             self._shown, self._doubted = (time_us, now_ns), None
+            self._newest = max(self._newest, (time_us, now_ns), key=lambda one: one[0])
             return None
         if self._doubted is None or abs(time_us - _runs_to(self._doubted, now_ns)) > STALE_US:
             self._first = time_us, now_ns
@@ -259,8 +262,9 @@ class _ShownClock:
         certain = time_us > shown[0] or first_us <= (since_ns - shown[1]) // 1000 + _BOOTED_US
         if now_ns - since_ns < (CONFIRM_NS if certain else STEADY_NS):
             return None
+        newest_ns, self._newest = self._newest[1], self._doubted
         self._shown, self._doubted = self._doubted, None
-        return max(shown[1], since_ns - first_us * 1000) if time_us < shown[0] else None
+        return max(newest_ns, since_ns - first_us * 1000) if time_us < shown[0] else None
 
     def is_about(self, time_us: int, now_ns: int) -> bool | None:
         """Whether a time is within `STALE_US` of now, perhaps one of 32 bits; None where the clock is not known."""

@@ -92,6 +92,7 @@ class Gimbals:
 
 
 M = TypeVar("M", PositionSample, AttitudeSample)
+S = TypeVar("S", bound=Sample)
 
 
 class Steady(Generic[M]):
@@ -171,11 +172,12 @@ class VehicleHistory:
         return self.time.clock(limit, (self._positions, self._attitudes), utc_ns)
 
     def feedbacks(self, limit: int, utc_ns: int, *, beside: bool) -> Sequence[Feedback]:
-        """Messages about the hot shoe, from the packets below `limit` of the epoch of an instant; `beside`: contacts of
-        those beside it too."""
+        """Messages about the hot shoe, from the packets below `limit` of the epoch of an instant, as far as it is
+        certain: a later one may have a time of the next one's clock. `beside`: contacts of those beside it too."""
         first, end = self.time.span(limit, utc_ns)
         if not beside:
-            return telemetry_samples.with_commands(between(self._feedbacks, first, end))
+            certain = _until(between(self._feedbacks, first, end), self.time.certain_ns(limit, utc_ns))
+            return telemetry_samples.with_commands(certain)
         known = telemetry_samples.with_commands(between(self._feedbacks, self.time.boot_first(first + 1), limit))
         return [one for one in known if one.contact or first <= one.number < end]
 
@@ -246,9 +248,7 @@ class VehicleHistory:
 
         def samples(history: Sequence[M]) -> Sequence[M]:
             """Those of its epoch, as far as it is certain; where there are none, the nearest one, as it came."""
-            known = between(history, first, limit)
-            if certain_ns is not None:
-                known = known[: bisect_left(known, certain_ns + 1, key=lambda one: one.stamp_ns)]
+            known = _until(between(history, first, limit), certain_ns)
             if known:
                 return known
             near = beside(between(history, 0, upto), utc_ns, NEAREST_NS)
@@ -394,6 +394,11 @@ def _moving(sample: PositionSample) -> tuple[Sequence[float], Sequence[float]]:
 def _rises(history: Sequence[Sample], sample: Sample, first: int) -> bool:
     """Whether a sample is later than the last one of its epoch."""
     return not history or history[-1].number < first or sample.boot_ns > history[-1].boot_ns
+
+
+def _until(samples: Sequence[S], stamp_ns: int | None) -> Sequence[S]:
+    """Those that came until then; None: all."""
+    return samples if stamp_ns is None else samples[: bisect_left(samples, stamp_ns + 1, key=lambda one: one.stamp_ns)]
 
 
 def _is_after(sample: Sample, first: int, boot_ns: int) -> bool:
