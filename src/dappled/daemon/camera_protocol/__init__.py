@@ -1,1 +1,1 @@
-"""The MAVLink camera: commands, messages, parameters, files, and which message is a repeat."""
+"""The MAVLink camera: commands, messages, parameters, files."""
