@@ -78,7 +78,9 @@ class Daemon:
     ) -> None:
         self.clock: RecordedClock = before.clock if before else RecordedClock(START_NS, START_NS - 10**12)
         next_index: int = before.shutter.statistics().next_index if before else 0
-        self.telemetry = Telemetry(component_id=US[1], cam_idx=camera)
+        self.telemetry: Telemetry = Telemetry(
+            component_id=US[1], cam_idx=camera, doubt=before.telemetry.position_doubt() if before else None
+        )
         self.shutter: Shutter = Shutter(self, self.clock, next_index=next_index, capacity=1000, fires=not outside)
         self.latency = BodyLatency(LATENCY_MS, LATENCY_SIGMA_MS, fired_outside=outside)
         self.named = 0

@@ -29,7 +29,6 @@ _APART = (
     {"reboots", "clock steps"},
     {"autopilot crashes", "clock steps"},
     _CRASHES,
-    {"glitch", "daemon crashes"},  # a daemon that starts while the receiver is off can't know it
 )
 _WITH_PIN = {"contacts lost", "contacts doubled"}
 

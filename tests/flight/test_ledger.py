@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from dappled.clock import RecordedClock
-from dappled.daemon.navigation import recorded_vehicles
+from dappled.daemon.navigation import recorded_doubt, recorded_vehicles
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, ShotRow, ShotState, Stray
 from dappled.flight.ledger import advance
 from dappled.flight.stored_rows import ledger_damage
@@ -206,6 +206,7 @@ def test_a_record_that_is_no_text_is_told(tmp_path: Path) -> None:
         ("began_utc_ns", LedgerReader.began_utc_ns),
         ("utc_correction", LedgerReader.utc_correction_ns),
         ("vehicles", recorded_vehicles),
+        ("position_doubt_before", recorded_doubt),
     ],
 )
 def test_a_fact_of_another_kind_is_told(

@@ -458,6 +458,7 @@ class Service:
 
     def _follow_vehicle(self) -> None:
         self.parts.navigation.belongs_to(self.parts.component.vehicle)
+        self.parts.navigation.note_doubt()
 
     def _publish_health(self) -> None:
         record = self.health()

@@ -180,7 +180,8 @@ class Recorder:
 class Recording:
     """A flight that is being recorded, with its open parts; `close` ends them all.
 
-    `next_index` is the image index of the first shot. `recovered` says what was repaired in earlier flights.
+    `next_index` is the image index of the first shot. `recovered` says what was repaired in earlier flights,
+    `before` is the name of the last one that is there.
     """
 
     folder: FlightFolder
@@ -191,6 +192,7 @@ class Recording:
     index: ImageIndex
     next_index: int
     recovered: tuple[Finding, ...]
+    before: str | None
     _lock: FlightsLock
     _clock: Clock
     _key: SealKey | None
@@ -274,6 +276,7 @@ def begin(
         next_index = index.next_index()
         began_utc_ns = clock.utc_ns()
         start_utc_ns = began_utc_ns if utc_known else None
+        before = next((name for name in reversed(index.flights()) if (root / name).is_dir()), None)
         folder = layout.create(root, start_utc_ns, facts)
         stack.callback(shutil.rmtree, folder.path, ignore_errors=True)  # a flight that could not begin
         telemetry = TelemetryLog(folder.telemetry, clock=clock)
@@ -291,7 +294,18 @@ def begin(
             ledger.add_event("recovery", findings.json_text(one))
         recorder = Recorder(folder, ledger)
         opened = Recording(
-            folder, journal, ledger, recorder, telemetry, index, next_index, tuple(recovered), lock, clock, seal_key
+            folder,
+            journal,
+            ledger,
+            recorder,
+            telemetry,
+            index,
+            next_index,
+            tuple(recovered),
+            before,
+            lock,
+            clock,
+            seal_key,
         )
         stack.pop_all()
     return opened

@@ -12,11 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.daemon.navigation import Telemetry
+from dappled.clock import RecordedClock
+from dappled.config.settings import Settings
+from dappled.daemon.live_settings import LiveSettings
+from dappled.daemon.navigation import Navigation, Telemetry, recorded_doubt
 from dappled.decode.geometry import Pose, metres_per_radian, turn_rad
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.findings import Code, Finding, text
-from dappled.flight import digest, log_reading
+from dappled.flight import Recording, digest, log_reading, recording
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 
@@ -35,9 +38,10 @@ def telemetry_of(
     rate_hz: float = 10.0,
     seconds: float = 60.0,
     delay_s: Callable[[], float] = lambda: 0.003,
+    into: Telemetry | None = None,
 ) -> Telemetry:
     """What is known of a simulated flight, `changed` (by time and true pose) in its telemetry."""
-    telemetry, at_us = Telemetry(), 0
+    telemetry, at_us = into or Telemetry(), 0
     for number, (t_s, message) in enumerate(messages(path, changed, rate_hz, seconds)):
         at_us = max(at_us, START_NS // 1000 + round((t_s + delay_s()) * 1e6))
         telemetry.feed(number, at_us, message)
@@ -361,3 +365,33 @@ def test_a_real_flight_has_one_reboot_and_jumps_only_where_its_home_is_set(share
             jumps += [one for one in telemetry.doubts() if one.code is Code.POSITION_JUMPED]
     assert [one.facts["by_m"] for one in jumps] == pytest.approx([3.3, 588.0, 590.0], abs=0.05)
     assert telemetry.statistics().reboots == 1
+
+
+def test_a_doubt_is_over_by_evidence_and_not_by_the_next_flight(tmp_path: File) -> None:
+    """A daemon starts again, twice, while the receiver is 33 m off, as its own messages can't tell."""
+    clock = RecordedClock(START_NS)
+
+    def flown(changed: Changed, seconds: float) -> tuple[Telemetry, Telemetry]:
+        """One more flight: what was known of it, and what a replay knows."""
+        flight: Recording = recording.begin(tmp_path, clock)
+        clock.advance_to(clock.utc_ns() + 10**9)
+        navigation = Navigation(LiveSettings(Settings()), clock, flight, utc_known=True)
+        navigation.note_doubt()  # before a vehicle is heard
+        telemetry_of(changed=changed, rate_hz=5.0, seconds=seconds, into=navigation.telemetry)
+        navigation.note_doubt()
+        told = Telemetry(doubt=recorded_doubt(flight.ledger))
+        flight.close()
+        return navigation.telemetry, telemetry_of(changed=changed, rate_hz=5.0, seconds=seconds, into=told)
+
+    def off(_: float, pose: TruePose) -> TruePose:
+        return moved(pose, 33.0)
+
+    assert sigma_m(flown(stepped(33.0), 25.0)[0], 22.0) > 30
+    live, replayed = flown(off, 2.0)
+    assert sigma_m(live, 1.0) > 30
+    assert digest(at(live, 1.0)) == digest(at(replayed, 1.0))
+    live, replayed = flown(off, 75.0)
+    assert sigma_m(live, 50.0) > 30
+    assert sigma_m(live, 70.0) < 1  # for a minute the receiver has agreed with all velocities
+    assert digest(at(live, 50.0)) == digest(at(replayed, 50.0))
+    assert sigma_m(flown(off, 2.0)[0], 1.0) < 1

@@ -38,10 +38,11 @@ class _Sum:
 class JumpFinder:
     """Compares each position with the velocities since those of the last second."""
 
-    def __init__(self) -> None:
+    def __init__(self, standing_m: Vector3 = _NONE) -> None:
+        """`standing_m` is in doubt from the beginning: by jumps that an earlier flight has seen."""
         self._last: PositionSample | None = None
         self._sums: deque[_Sum] = deque()
-        self._widest_m, self.standing_m = 0.0, _NONE
+        self._widest_m, self.standing_m = norm(standing_m), standing_m
         self.since = self.since_ns = 0  # packet and arrival of the first of the positions without a gap
         self.begun = 0  # packet of the doubt's first jump
 

@@ -7,6 +7,7 @@ floats, also when it has read on already (by less than a minute of flight).
 
 from __future__ import annotations
 
+import logging
 import math
 import threading
 from collections import deque
@@ -35,6 +36,7 @@ from dappled.daemon.navigation.samples import (
     Around,
     AttitudeSample,
     Counts,
+    PositionDoubt,
     PositionSample,
     TelemetryStatistics,
     UtcCorrection,
@@ -58,13 +60,17 @@ from dappled.decode.geometry import (
     turned_by_heading,
 )
 from dappled.drivers.mavlink import MavlinkMessage, Packet
+from dappled.errors import DappledError
 from dappled.findings import Finding
 from dappled.flight import LedgerReader, Recording
+
+log = logging.getLogger(__name__)
 
 HISTORY_NS = TIMESYNC_WINDOW_NS + 60 * 10**9
 AHEAD_NS = 10**9  # a body's latency and half an exposure; an exposure further ahead is not waited for
 RATES_GAP_NS, TURN_GAP_NS = 150_000_000, 60_000_000  # a multicopter sways within more; without rates in the messages
 JUMP_BEFORE_NS = 10 * 10**9  # so long before a jump a position is in doubt
+_DOUBT, _DOUBT_BEFORE = "position_doubt", "position_doubt_before"  # the ledger's facts, PositionDoubt
 _VEHICLES = "vehicles"  # the ledger's fact: [number of the first packet, system id] of each vehicle followed
 _HINT_NS = 50_000_000  # a new fit while one frame waits changes the clock by less
 _PRUNE_EVERY, _LOOK_S = 256, 0.005
@@ -80,7 +86,8 @@ class Telemetry:
 
     `vehicles` are (packet number, system id) in order, as a recorded flight followed them. `component_id` is our own
     (see AutopilotTime), `cam_idx` our camera's number in CAMERA_FEEDBACK. `attitude_sigma_rad` is how well the
-    autopilot knows its attitude, where it doesn't say; 0 is not known. All methods may be called from any thread.
+    autopilot knows its attitude, where it doesn't say; 0 is not known. `doubt` is how far a vehicle's position was in
+    doubt before. All methods may be called from any thread.
     """
 
     def __init__(
@@ -90,8 +97,9 @@ class Telemetry:
         component_id: int = 100,
         cam_idx: int = 0,
         attitude_sigma_rad: float = 0.0,
+        doubt: PositionDoubt | None = None,
     ) -> None:
-        self._turns = deque(vehicles)
+        self._turns, self._doubt = deque(vehicles), doubt
         self._component_id, self._cam_idx, self._attitude_sigma_rad = component_id, cam_idx, attitude_sigma_rad
         self._lock = threading.Lock()
         self._packets = self._prune_at = 0
@@ -122,7 +130,9 @@ class Telemetry:
                     history.prune(stamp_us * 1000 - HISTORY_NS)
 
     def _of(self, system_id: int, counts: Counts | None = None) -> VehicleHistory:
-        return VehicleHistory(system_id, self._component_id, counts or Counts(), cam_idx=self._cam_idx)
+        return VehicleHistory(
+            system_id, self._component_id, counts or Counts(), cam_idx=self._cam_idx, doubt=self._doubt
+        )
 
     def _heard(self, message: MavlinkMessage) -> list[VehicleHistory]:
         """All vehicles that may be the camera's, while that is not known; the only one counts for now."""
@@ -260,6 +270,12 @@ class Telemetry:
         with self._lock:
             return tuple(doubts(self._history))
 
+    def position_doubt(self) -> PositionDoubt | None:
+        """How far the vehicle's position is in doubt now; the doubt from before while it isn't known which vehicle
+        counts."""
+        with self._lock:
+            return self._doubt if self._history.system_id == _NOBODY else self._history.position_doubt
+
     def utc_correction(self) -> UtcCorrection | None:
         """This machine's UTC against that of the autopilot's satellites; None while either is unknown."""
         with self._lock:
@@ -302,9 +318,11 @@ class Navigation:
             component_id=now.mavlink.component_id,
             cam_idx=now.mavlink.cam_idx,
             attitude_sigma_rad=math.radians(now.pose.attitude_sigma_deg),
+            doubt=self._doubt_before(),
         )
         self.utc = UtcLearner(recording, known=utc_known)
         self._vehicles, self._vehicles_noted = list[tuple[int, int]](), 0
+        self._doubt_noted: PositionDoubt | None = None
 
     def log_packet(self, stamp_us: int, raw: bytes) -> int | None:
         """Write a packet to the telemetry log."""
@@ -325,6 +343,30 @@ class Navigation:
         if self._vehicles_noted != len(self._vehicles):
             self._recording.ledger.set_fact(_VEHICLES, self._vehicles)
             self._vehicles_noted = len(self._vehicles)
+
+    def note_doubt(self) -> None:
+        """Record how far the position is in doubt: the next flight begins with that. Raises DappledError when it can't
+        be recorded; the next call tries again."""
+        doubt, noted = self.telemetry.position_doubt(), self._doubt_noted
+        if doubt is not None and doubt != noted and (noted is not None or any(doubt.standing_m)):
+            self._recording.ledger.set_fact(_DOUBT, doubt)
+            self._doubt_noted = doubt
+
+    def _doubt_before(self) -> PositionDoubt | None:
+        """The doubt with which the flight before ended, in order or not; recorded for a replay."""
+        before = self._recording.before
+        if before is None:
+            return None
+        try:
+            with LedgerReader.open(self._recording.index.flight(before).ledger) as ledger:
+                doubt = ledger.fact(PositionDoubt, _DOUBT)
+        except DappledError as error:
+            log.warning("whether the position was in doubt before is not known: %s", error)
+            return None
+        if doubt is None or not any(doubt.standing_m):
+            return None
+        self._recording.ledger.set_fact(_DOUBT_BEFORE, doubt)
+        return doubt
 
     def look_for_utc(self) -> None:
         """Learn UTC from the autopilot if it is known by now. Raises DappledError when it can't be recorded; the next
@@ -351,6 +393,11 @@ class Navigation:
 def recorded_vehicles(ledger: LedgerReader) -> list[tuple[int, int]]:
     """The vehicles that a flight followed, (number of the first telemetry packet, system id), for `Telemetry`."""
     return ledger.fact(list[tuple[int, int]], _VEHICLES) or []
+
+
+def recorded_doubt(ledger: LedgerReader) -> PositionDoubt | None:
+    """The doubt of the position that a flight began with, for `Telemetry`."""
+    return ledger.fact(PositionDoubt, _DOUBT_BEFORE)
 
 
 def pose_around(at: Around, *, packets: int, attitude_sigma_rad: float = 0.0) -> Pose:

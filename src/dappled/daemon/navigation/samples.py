@@ -88,6 +88,14 @@ class Jump:
 
 
 @dataclass(frozen=True, slots=True)
+class PositionDoubt:
+    """How far (north, east, down) the position of a vehicle is in doubt by jumps that are not over."""
+
+    system_id: int
+    standing_m: Vector3
+
+
+@dataclass(frozen=True, slots=True)
 class AttitudeSample:
     """One ATTITUDE_QUATERNION, ATTITUDE or ATTITUDE_QUATERNION_COV. Rates are of the body, None where the autopilot
     gave none; `sigma_rad` is of the whole rotation, None where it isn't given."""

@@ -27,6 +27,7 @@ from dappled.daemon.navigation.samples import (
     GnssSample,
     GroundSample,
     Jump,
+    PositionDoubt,
     PositionSample,
     Sample,
     keep,
@@ -128,7 +129,7 @@ class VehicleHistory:
     """Samples of position, attitude, receiver, gimbal and hot shoe of one vehicle.
 
     `system_id` is the vehicle's, and its autopilot is component 1. `component_id` is our own (see
-    AutopilotTime), `cam_idx` our camera's number at the autopilot. Not thread-safe.
+    AutopilotTime), `cam_idx` our camera's number at the autopilot, `doubt` is from before. Not thread-safe.
     """
 
     def __init__(
@@ -138,12 +139,17 @@ class VehicleHistory:
         counts: Counts,
         *,
         cam_idx: int = 0,
+        doubt: PositionDoubt | None = None,
     ) -> None:
         self.system_id, self.counts, self._cam_idx = system_id, counts, cam_idx
         self.time = AutopilotTime(component_id)
         self.gimbals = Gimbals()
         self._positions: list[PositionSample] = []
         self._finder, self._receiver_track, self._jumps = JumpFinder(), ReceiverTrack(), list[Jump]()
+        if doubt is not None and doubt.system_id == system_id:
+            self._finder = JumpFinder(doubt.standing_m)
+            self._jumps.append(Jump(0, 0, 0, (0.0, 0.0, 0.0), doubt.standing_m))
+            counts.jump_m = norm(doubt.standing_m)
         self._attitudes: list[AttitudeSample] = []
         self._receiver: list[GnssSample] = []
         self._second: list[GnssSample] = []  # of another receiver: it counts while the first one has no fix
@@ -194,6 +200,11 @@ class VehicleHistory:
     def displaced(self) -> bool:
         """Whether a jump of the position is not over."""
         return norm(self._finder.standing_m) > 0
+
+    @property
+    def position_doubt(self) -> PositionDoubt:
+        """By how much its position is in doubt until there is evidence."""
+        return PositionDoubt(self.system_id, self._finder.standing_m)
 
     def rate(self) -> float | None:
         """How many times as fast as ours its clock runs, where each two of the last ten seconds say that it is another

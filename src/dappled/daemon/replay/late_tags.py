@@ -11,7 +11,7 @@ from pathlib import Path
 
 from dappled.clock import Clock
 from dappled.config import settings as configuration
-from dappled.daemon.navigation import BodyLatency, ExposureTime, recorded_vehicles
+from dappled.daemon.navigation import BodyLatency, ExposureTime, recorded_doubt, recorded_vehicles
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import playback, replay
 from dappled.daemon.replay.playback import FlownWith
@@ -102,6 +102,7 @@ def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None,
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as reader:
         followed, tags = {system for _, system in recorded_vehicles(reader)}, reader.tags()
+        doubt = recorded_doubt(reader)
     if followed == {wanted} or (followed and wanted is None):
         return None, []
     system, told = _logged(folder, wanted)
@@ -109,7 +110,7 @@ def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None,
         return None, []
     facts = layout.read_facts(folder)
     settings = configuration.of_tables(facts.get("settings", {}), str(folder.settings))
-    telemetry = RecordedTelemetry.flown(settings, folder.telemetry, {}, [(0, system)])
+    telemetry = RecordedTelemetry.flown(settings, folder.telemetry, {}, [(0, system)], doubt=doubt)
     made = {}
     for tag in sorted(tags.values(), key=lambda one: one.utc_ns):
         exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)

@@ -18,7 +18,7 @@ from typing import Any
 from dappled import durable
 from dappled.clock import Clock
 from dappled.config import settings as configuration
-from dappled.daemon.navigation import BodyLatency, clocks, recorded_vehicles
+from dappled.daemon.navigation import BodyLatency, clocks, recorded_doubt, recorded_vehicles
 from dappled.daemon.pipeline import tagging
 from dappled.daemon.pipeline.tagging import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry
@@ -163,9 +163,9 @@ def bring(
     names = facts.get("names", {})
     latency = BodyLatency.of(settings.camera)
     with LedgerReader.open(folder.ledger) as reader:
-        turns = recorded_vehicles(reader)
+        turns, before = recorded_vehicles(reader), recorded_doubt(reader)
     log = folder.telemetry if folder.telemetry.is_file() else None
-    telemetry = RecordedTelemetry.flown(settings, log, {}, turns)
+    telemetry = RecordedTelemetry.flown(settings, log, {}, turns, doubt=before)
     frames: list[Frame] = []
     zooms: list[Finding] = []
     companions = 0

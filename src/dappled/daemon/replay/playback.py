@@ -70,6 +70,7 @@ def run(
             recording.vehicles,
             report=report,
             bounds=recording.bounds,
+            doubt=recording.doubt,
         )
         publisher = None
         if publish is not None:

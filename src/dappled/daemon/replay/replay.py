@@ -15,7 +15,8 @@ from typing import Self
 from dappled import __version__, codec, confined, durable, picture_order
 from dappled.clock import RecordedClock, TimeOfDayClock
 from dappled.config.settings import Settings
-from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_vehicles
+from dappled.daemon.navigation import ExposureTime, Telemetry, first_position_utc_ns, recorded_doubt, recorded_vehicles
+from dappled.daemon.navigation.samples import PositionDoubt
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
 from dappled.daemon.replay.vehicle_choice import VehicleError, vehicle_of
@@ -65,6 +66,7 @@ class RecordedFlight:
     elsewhere: str | None = None
     findings: tuple[Finding, ...] = ()
     bounds: UtcBounds | None = None
+    doubt: PositionDoubt | None = None
 
 
 def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
@@ -77,7 +79,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         digests = {table: ledger.digests(table) for table in ("poses", "tags")}
         results = ledger.results(run)
         events = [event for event in ledger.events() if event.index is not None]
-        turns = recorded_vehicles(ledger)
+        turns, doubt = recorded_vehicles(ledger), recorded_doubt(ledger)
         tags = ledger.tags()
         made_by = ledger.facts().get(f"run:{run}", {}) if run != LIVE else layout.read_facts(flight)
     texts: dict[int | None, dict[str, str]] = defaultdict(dict)
@@ -108,7 +110,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
     horizons = {index: pose.telemetry_packets for index, pose in poses.items()}
     elsewhere = _elsewhere(made_by.get("software", {}))
     shots = [row.shot for row in rows]
-    return RecordedFlight(folder, shots, files, expected, telemetry, horizons, turns, elsewhere)
+    return RecordedFlight(folder, shots, files, expected, telemetry, horizons, turns, elsewhere, doubt=doubt)
 
 
 def _elsewhere(recorded: Mapping[str, str]) -> str | None:
@@ -266,15 +268,17 @@ class RecordedTelemetry:
         attitude_sigma_rad: float = 0.0,
         report: Callable[[Finding], object] = lambda _: None,
         bounds: UtcBounds | None = None,
+        doubt: PositionDoubt | None = None,
     ) -> None:
-        """`vehicles`, `component_id`, `cam_idx` and `attitude_sigma_rad` are those that the recording daemon had.
-        `report` gets what is to be said of the log."""
+        """`vehicles`, `component_id`, `cam_idx`, `attitude_sigma_rad` and `doubt` are those that the recording
+        daemon had. `report` gets what is to be said of the log."""
         self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
         self._telemetry = Telemetry(
             vehicles=vehicles,
             component_id=component_id,
             cam_idx=cam_idx,
             attitude_sigma_rad=attitude_sigma_rad,
+            doubt=doubt,
         )
         self._path, self._report = path, report
         self._packets = packets(path, self._found, bounds) if path else iter(())
@@ -293,6 +297,7 @@ class RecordedTelemetry:
         *,
         report: Callable[[Finding], object] = lambda _: None,
         bounds: UtcBounds | None = None,
+        doubt: PositionDoubt | None = None,
     ) -> Self:
         """As the daemon of these settings had it."""
         return cls(
@@ -305,6 +310,7 @@ class RecordedTelemetry:
             attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
             report=report,
             bounds=bounds,
+            doubt=doubt,
         )
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
