@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +71,6 @@ def override(raw: RawFile, recipe: Recipe) -> RawFile:
     return replace(raw, **changed) if changed else raw
 
 
-@lru_cache(maxsize=64)  # each frame asks, and finding a model reads every profile
 def camera_profile(recipe: Recipe, model: str) -> CameraProfile:
     """Return the camera's profile: the recipe's, or by model. Raises DappledError where no profile knows the model."""
     if recipe.camera != "auto":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -113,6 +114,7 @@ def _inside(folder: Path, name: str) -> Path:
     return confined.path(folder.parent, f"{folder.name}/{name}", f"the flight {folder.parent}")
 
 
+@lru_cache(maxsize=64)  # each frame asks, and finding a model reads every profile
 def camera_name(camera: str, model: str | None) -> str:
     """Return what a camera is called: its profile, by name or by model; else the model, or "unknown"."""
     if camera != "auto":
