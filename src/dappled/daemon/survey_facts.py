@@ -25,11 +25,7 @@ class LiveSurvey:
 
     def height(self) -> Height | None:
         """Now; None where it is unknown."""
-        pose = self._navigation.pose_now()
-        if pose.ground is not None:
-            return Height(pose.ground.metres, pose.ground.source)
-        above_m = pose.height_above_home_m
-        return None if above_m is None else Height(above_m, "above the take-off place")
+        return Height.of(self._navigation.pose_now())
 
     def field(self) -> tuple[float, float] | None:
         """The sensor's (height, width) over the focal length; None where one is unknown."""

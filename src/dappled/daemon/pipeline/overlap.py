@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dappled.daemon.pipeline.spacing import SurveyFacts, over_ground_m, seen_m
+from dappled.daemon.pipeline.spacing import LEAST_HEIGHT_M, Height, SurveyFacts, over_ground_m, seen_m
 from dappled.decode.geometry import Pose
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Tag
 
 _SERIES_NS = 15 * 10**9  # photographs farther apart in time are none of one series
-_LEAST_HEIGHT_M = 2.0
 _TOO_FAR = 1.25  # of the wanted way from one to the next
 
 
@@ -86,6 +85,6 @@ def _place(pose: Pose) -> tuple[float, float, float] | None:
 
 
 def _height_m(pose: Pose) -> float | None:
-    """Above the ground, or else above the take-off place; None where unknown, or too low."""
-    height = pose.height_above_home_m if pose.ground is None else pose.ground.metres
-    return None if height is None or not math.isfinite(height) or height < _LEAST_HEIGHT_M else height
+    """None where unknown, or too low."""
+    height = Height.of(pose)
+    return None if height is None or not LEAST_HEIGHT_M <= height.metres < math.inf else height.metres

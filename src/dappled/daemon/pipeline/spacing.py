@@ -13,7 +13,7 @@ import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, Self
 
 from dappled.clock import Clock
 from dappled.daemon.pipeline.repeats import CaptureRequest
@@ -32,7 +32,7 @@ _LOOK_S, _WATCH_S, _IDLE_S, _AGAIN_S = 0.02, 0.2, 60.0, 1.0
 _LOWER = 0.8
 _STALE_MS = 1000.0
 _LATE = 1.25  # spacings
-_LEAST_HEIGHT_M = 2.0  # a barometer's height is no better
+LEAST_HEIGHT_M = 2.0  # a barometer's height is no better
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,6 +58,14 @@ class Height:
 
     metres: float
     source: str
+
+    @classmethod
+    def of(cls, pose: Pose) -> Self | None:
+        """By what measures it, else above the take-off place; None where both are unknown."""
+        if pose.ground is not None:
+            return cls(pose.ground.metres, pose.ground.source)
+        above_m = pose.height_above_home_m
+        return None if above_m is None else cls(above_m, "above the take-off place")
 
 
 class SurveyFacts(Protocol):
@@ -256,7 +264,7 @@ class DistanceTrigger:
         if wanted.distance_m:
             return wanted.distance_m, None, None
         height, field = self._around.height(), self._around.field()
-        if height is None or height.metres < _LEAST_HEIGHT_M:
+        if height is None or height.metres < LEAST_HEIGHT_M:
             code = Code.SERIES_NO_HEIGHT if height is None else Code.SERIES_TOO_LOW
             return None, height, finding(code, _SERIES)
         if field is None:
