@@ -102,8 +102,6 @@ class RunDaemon(SettingsArgument, Verb):
             world = World(seed=self.seed, autopilot=self.simulate == _ALL, real=True)
             simulation = Simulation(world, settings, Path(folder))
             remark(f"simulating {simulation.rig}{', an autopilot' if world.autopilot else ''} and a ground station")
-            if simulation.rig.other_law:
-                remark(simulation.rig.other_law)
             with simulation as simulated:
                 checked = settings_check.checked(replace(file, settings=simulated), starting=True)
                 return serve(checked, plan, simulation)

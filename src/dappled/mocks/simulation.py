@@ -50,7 +50,6 @@ class World:
     real: bool = False
 
 
-_RAYS = "geometric"  # the law of the simulated lens
 _ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
 
 
@@ -72,17 +71,6 @@ class SimulatedCamera:
 
     def __str__(self) -> str:
         return f"a Canon EOS 450D with {self.mask}" if self.profile == EOS_450D else "a masked camera"
-
-    @property
-    def other_law(self) -> str:
-        """What differs from the camera's profile: rays obey geometry, whatever law the profile has; "" for nothing."""
-        law = profiles.camera(self.profile).law
-        if law == _RAYS:
-            return ""
-        return (
-            f"its rays obey the law {_RAYS}, which its calibration finds; the profile {self.profile} says {law}, by "
-            "which dappled plan tells the size of views: its warning tells both"
-        )
 
     def on_a_bench(self, world: World) -> MaskedCamera:
         """The camera before a white card. Raises DappledError for a mask that can't be simulated."""
@@ -255,7 +243,6 @@ def write_calibration(camera: MaskedCamera, folder: Path, profile_name: str = CA
             profile.law,
             profile.mask_distance_mm,
         ),
-        choose_law=profile_name == EOS_450D,  # its profile's law is not that of rays
     )
     path = folder / "calibration.toml"
     path.write_text(tomli_w.dumps(found.to_dict()), encoding="utf-8")

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dappled.config import profiles
 from dappled.decode.array_types import Singles
 from dappled.decode.optics import Lattice, Mask, Sensor
 from dappled.mocks.autopilot.path import FlightPath, TruePose
@@ -263,14 +264,15 @@ def eos450d_camera(
 ) -> MaskedCamera:
     """The thesis' Canon EOS 450D with a 50 mm lens and a printed mask 1.01 mm before its chip; DNG files of 24.5 MB.
 
-    The rays obey geometry, as in any camera; the profile's law is `fd`. The lens opens until the aperture is one period
-    of the mask wide. `scene`, `path` and `real` as in `reference_camera`. Raises ValueError for a mask whose carriers
-    lie too near together or too far apart to be simulated.
+    Its carriers stand where the law of its profile puts them. The lens opens until the aperture is one period of the
+    mask wide. `scene`, `path` and `real` as in `reference_camera`. Raises ValueError for a mask whose carriers lie too
+    near together or too far apart to be simulated.
     """
     distance_mm, focal_length_mm = 1.01, 50.0
     widest_mm = focal_length_mm / (mask.frequency_per_mm * distance_mm)
     film = as_printed(mask) if real else mask
-    optics = Optics(focal_length_mm, focal_length_mm / widest_mm, widest_mm, film, distance_mm)
+    law = profiles.camera("canon-eos-450d").law
+    optics = Optics(focal_length_mm, focal_length_mm / widest_mm, widest_mm, film, distance_mm, law=law)
     sensor = SensorModel((2856, 4290), 0.0051948051948, white=15319)
     camera = MaskedCamera(seed, WhiteCard(), optics, sensor, None, epoch_utc_s=epoch_utc_s, name=EOS_450D, real=real)
     return _before(scene, camera, path)

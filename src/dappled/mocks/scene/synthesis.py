@@ -54,10 +54,10 @@ class Grid:
         spacing = math.hypot(*lattice.ky), math.hypot(*lattice.kx)
         half_band = spacing[0] / 2, spacing[1] / 2
         step = math.floor(0.4 / max(half_band))
-        if not 2 <= step <= 32:
+        if not 2 <= step <= 128:
             raise ValueError(
                 f"carriers {spacing[0]:.4f} × {spacing[1]:.4f} cycles/pixel apart can't be simulated: "
-                "they must be between 0.025 and 0.4"
+                "they must be between 0.003125 and 0.4"
             )
         if sharp:
             step = max(2, math.floor(step / SHARPER))
