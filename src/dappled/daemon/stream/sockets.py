@@ -8,12 +8,12 @@ import logging
 import os
 import socket
 import stat
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import zmq
-from zmq.utils.monitor import recv_monitor_message
 
 from dappled.clock import Clock
 from dappled.daemon.stream import curve
@@ -34,6 +34,7 @@ _HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long
 _PATH_BYTES = 107  # of sockaddr_un
 _BEGIN_S = 10.0
 _OWN_MODE = 0o600
+_EVENT = struct.Struct("=HI")  # of a monitor: its kind and value; zmq.utils.monitor, which reads it too, loads asyncio
 
 
 class Sockets:
@@ -104,7 +105,7 @@ class Sockets:
         """Answer ZeroMQ about the keys of new peers, and give new readers more kernel memory."""
         for monitor in self._monitors:
             while monitor.poll(0):
-                _give_room(recv_monitor_message(monitor)["value"])
+                _give_room(_EVENT.unpack(monitor.recv_multipart()[0])[1])
         while self._judge is not None:
             try:
                 request = self._judge.recv_multipart(flags=zmq.NOBLOCK)

@@ -1,7 +1,4 @@
-"""Poses of vehicle and camera, interpolation between samples, field of view and footprint; for daemon and products.
-
-`camera_pose` loads pyproj: import it where it is needed.
-"""
+"""Poses of vehicle and camera, interpolation between samples, field of view and footprint; for daemon and products."""
 
 from dappled.decode.geometry.pose import (
     FrameGeometry,

@@ -9,13 +9,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pyproj
 from numpy.typing import NDArray
 
 from dappled.decode.geometry.pose import Pose, Quaternion, Vector3
 from dappled.errors import DappledError
+
+if TYPE_CHECKING:
+    import pyproj
 
 Matrix = NDArray[np.float64]
 
@@ -147,6 +150,8 @@ def from_ecef(place: Matrix) -> tuple[float, float, float]:
 
 @cache
 def _earth() -> pyproj.Transformer:
+    import pyproj  # noqa: PLC0415  # a flight needs none, and it is a twentieth of a start
+
     return pyproj.Transformer.from_crs(_GEODETIC, _GEOCENTRIC, always_xy=True, allow_ballpark=False)
 
 
