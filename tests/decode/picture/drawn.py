@@ -1,8 +1,8 @@
 """Masked frames of any mask, stop, layout and distance, drawn by Latin hypercube; nothing of `dappled` makes them.
 
 Rays: for each of 15 × 15 points of the stop the scene is moved by its parallax and multiplied by the film's Fourier
-series at the place where the rays pass it (`ray_frames` has films, stops and what is lost on film, by diffraction and
-on pixels). The truth is the same camera without film.
+series at the place where the rays pass it, summed wave by wave of the film (`ray_frames` has films, stops and what is
+lost on film, by diffraction and on pixels). The truth is the same camera without film.
 """
 
 from __future__ import annotations
@@ -109,17 +109,22 @@ class Drawn:
         moved = self.disparity_px * (2 * self.film.p + 1)
         waves = [fft.rfft2(scene) for scene in self.scenes]
         colour = np.maximum(self.colour_at, 0)
-        masked, plain, shadow = np.zeros((3, *SHAPE))
         points, weights = Stop(self.stop, blades=6, n=15).points
-        for (v, u), weight in zip(points, weights, strict=True):
-            at = np.array([v, u]) * alpha * V_MM / self.f_number + (0.013, 0.021)
-            turned = down * (values * np.exp(2j * np.pi * per_mm @ at))
-            film = 1 + turned.real @ across.real - turned.imag @ across.imag
-            parallax = np.outer(np.exp(-2j * np.pi * moved * v * fy), np.exp(-2j * np.pi * moved * u * fx))
-            seen = np.choose(colour, [fft.irfft2(wave * parallax, s=SHAPE) for wave in waves])
-            masked += weight * seen * film
-            plain += weight * seen
-            shadow += weight * film
+        parallax = [np.exp(-2j * np.pi * moved * np.outer(f, at)) for f, at in zip((fy, fx), points.T, strict=True)]
+
+        def through(of_points: Grid) -> Grid:
+            """The scene as the points of the stop see it, by weight."""
+            together = (parallax[0] * of_points) @ parallax[1].T
+            return np.choose(colour, [fft.irfft2(wave * together, s=SHAPE) for wave in waves])
+
+        places = points * alpha * V_MM / self.f_number + (0.013, 0.021)
+        turned = values[:, None] * np.exp(2j * np.pi * per_mm @ places.T)  # orders, points
+        plain = through(weights)
+        masked, shadow = plain.copy(), np.ones(SHAPE)
+        for k, turns in enumerate(turned * weights):
+            wave = np.outer(down[:, k], across[k])
+            shadow += (turns.sum() * wave).real
+            masked += through(turns.real) * wave.real - through(turns.imag) * wave.imag
         return masked, plain, shadow
 
     def frame(self) -> NDArray[np.float32]:
