@@ -87,15 +87,12 @@ class Daemon:
         self._send, self._fired, self._packets = send, fired, 0
         self._packer = mavlink.MAVLink(None, *US)
         self.component = Component(
-            self,
-            OwnAutopilot(self, self.clock),
+            OwnAutopilot(self, self.clock, cam_idx=camera),
             self.shutter,
-            self.clock,
             Parameters(_Body()),
             model=self,
             earlier=_NothingEarlier(),
             series=_NoSeries(),
-            cam_idx=camera,
         )
 
     def receive(self, link: int, message: MavlinkMessage, raw: bytes) -> None:

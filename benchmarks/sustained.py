@@ -31,10 +31,10 @@ from tests.daemon.fakes import FlightSink, NoPoses
 from dappled.clock import SystemClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
+from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.daemon.pipeline.verdicts import Judge
@@ -133,19 +133,9 @@ def measure(root: Path, seconds: float, rate: float, size: int, *, decode_s: flo
     shots = PendingShots(camera)
     shutter = Shutter(FlightSink(flight, shots), clock, next_index=0, capacity=1000)
     ends = Ends(shutter)
-    pipeline = Pipeline(
-        camera,
-        shots,
-        LedgerWriter(flight, clock),
-        NoPoses(),
-        decoder=SlowDecoder(decode_s),
-        publisher=None,
-        latency=BodyLatency(60.0, 15.0),
-        names=Names("benchmark", "mask", "geometric"),
-        observer=ends,
-        decode_queue=QUEUE,
-        judge=Judge(PoseSettings().mount, on_gimbal=False),
-    )
+    judge, stages = Judge(PoseSettings().mount, on_gimbal=False), ShotEnds(shots, LedgerWriter(flight, clock), ends)
+    decoding = Decoding(stages, SlowDecoder(decode_s), None, capacity=QUEUE, judge=judge)
+    pipeline = Pipeline(decoding, NoPoses(), BodyLatency(60.0, 15.0), Names("benchmark", "mask", "geometric"))
 
     memory = Memory(flight.folder.ledger)
     pipeline.start()

@@ -14,10 +14,10 @@ from pathlib import Path
 from dappled.clock import RecordedClock, SystemClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import BodyLatency, ExposureTime
-from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots
+from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.daemon.pipeline.verdicts import Judge, PictureFacts
@@ -299,23 +299,14 @@ def rig(
         made[0].shutter.settled(index, ok)
 
     pending_shots = PendingShots(camera)
-    pipeline = Pipeline(
-        camera,
-        pending_shots,
-        writer,
-        NoPoses(),
-        decoder=decoder,
-        publisher=publisher,
-        latency=BodyLatency(60.0, 15.0),
-        names=Names("test", "mask", "geometric"),
-        observer=CallingObserver(
-            settled,
-            lambda pending: made[0].tagged.append(pending.shot.index),
-            lambda pending: made[0].shots.append(pending),  # noqa: PLW0108  # a test may take the list away
-        ),
-        decode_queue=queue_,
-        judge=Judge(PoseSettings().mount, on_gimbal=False),
+    observer = CallingObserver(
+        settled,
+        lambda pending: made[0].tagged.append(pending.shot.index),
+        lambda pending: made[0].shots.append(pending),  # noqa: PLW0108  # a test may take the list away
     )
+    ends, judge = ShotEnds(pending_shots, writer, observer), Judge(PoseSettings().mount, on_gimbal=False)
+    decoding = Decoding(ends, decoder, publisher, capacity=queue_, judge=judge)
+    pipeline = Pipeline(decoding, NoPoses(), BodyLatency(60.0, 15.0), Names("test", "mask", "geometric"))
     now_ns = clock.utc_ns()  # it stands still, so that a slow machine makes no new request of a retry
     steady = RecordedClock(now_ns, now_ns - clock.monotonic_ns())
     shutter = Shutter(FlightSink(flight, pending_shots), steady, next_index=flight.next_index, capacity=1000)

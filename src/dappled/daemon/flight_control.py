@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dappled import findings
-from dappled.clock import Clock
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, ReportedCamera
 from dappled.daemon.camera_protocol.parameters import Parameter
@@ -17,7 +16,7 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import PacketSender
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight import FlightError, Recording, Shot, layout
+from dappled.flight import FlightError, Shot, layout
 from dappled.flight.layout import DiskSpace
 from dappled.flight.records import LOST, REFUSED
 
@@ -33,19 +32,18 @@ class FlightControl:
     def __init__(
         self,
         settings: LiveSettings,
-        clock: Clock,
-        recording: Recording,
-        *,
         shots: PendingShots,
         writer: LedgerWriter,
         navigation: Navigation,
+        *,
         camera: ReportedCamera,
         sender: PacketSender,
         alarms: Alarms,
         handover: FlightHandover | None,
     ) -> None:
-        self._settings, self._clock, self._recording, self._shots = settings, clock, recording, shots
-        self._writer, self._navigation, self._camera = writer, navigation, camera
+        self._settings, self._clock, self._shots = settings, shots.clock, shots
+        self._writer, self._recording = writer, writer.recording
+        self._navigation, self._camera = navigation, camera
         self._sender, self._alarms, self._handover = sender, alarms, handover
         self.lost_triggers = 0
         self._looked: tuple[Finding | None, int] = (None, 0)

@@ -43,12 +43,12 @@ from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation import BodyLatency, Navigation
 from dappled.daemon.navigation.machine_clock import utc_known
 from dappled.daemon.pipeline import recipes
-from dappled.daemon.pipeline.capture import Observer, PendingShots
+from dappled.daemon.pipeline.capture import Observer, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.overlap import OverlapWatch
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger
@@ -236,11 +236,9 @@ class Service:
         reported, sender = ReportedCamera(settings), links.sender
         control = FlightControl(
             self._settings,
-            clock,
-            recording,
-            shots=shots,
-            writer=writer,
-            navigation=navigation,
+            shots,
+            writer,
+            navigation,
             camera=reported,
             sender=sender,
             alarms=self._alarms,
@@ -253,8 +251,8 @@ class Service:
             capacity=settings.camera.max_pending,
             fires=not settings.camera.fired_outside,
         )
-        cam_idx = settings.mavlink.cam_idx
-        autopilot = OwnAutopilot(sender, clock, on_gimbal=settings.pose.on_gimbal, cam_idx=cam_idx)
+        on_gimbal, cam_idx = settings.pose.on_gimbal, settings.mavlink.cam_idx
+        autopilot = OwnAutopilot(sender, clock, on_gimbal=on_gimbal, cam_idx=cam_idx)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
         survey = LiveSurvey(navigation, reported, shots)
@@ -264,15 +262,12 @@ class Service:
         body = BodyPlan(settings.body, settings.camera.capture_target, camera)
         parameters = self._settable(body, shots, writer, shutter, names, decodes=recipe is not None)
         component = Component(
-            sender,
             autopilot,
             shutter,
-            clock,
             parameters,
             model=control,
             earlier=IndexedOutcomes(recording.index),
             series=distance,
-            cam_idx=cam_idx,
         )
         decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
         depth: LiveDepth | None = None
@@ -291,27 +286,21 @@ class Service:
             recording,
             reported,
             navigation.utc,
-            shutter=shutter,
             component=component,
             logbook=self._logbook,
             depth=depth,
             recipe=recipe,
             outside=self._outside,
         )
-        pipeline = Pipeline(
-            camera,
-            shots,
-            writer,
-            navigation,
-            decoder=decoder,
-            publisher=publisher,
-            latency=BodyLatency.of(settings.camera),
-            names=names,
-            observer=events,
-            decode_queue=settings.decode.queue,
-            judge=Judge(settings.pose.mount, on_gimbal=settings.pose.on_gimbal, plan=body),
+        decoding = Decoding(
+            ShotEnds(shots, writer, events),
+            decoder,
+            publisher,
+            capacity=settings.decode.queue,
+            judge=Judge(settings.pose.mount, on_gimbal=on_gimbal, plan=body),
             preview_interval_s=settings.publish.preview_interval_s,
         )
+        pipeline = Pipeline(decoding, navigation, BodyLatency.of(settings.camera), names)
         answers = Answers(writer, decoder, shots, clock=clock)
         driver = tuple(part for part in (camera, gnss) if isinstance(part, HasThreads))
         return FlightParts(

@@ -12,7 +12,6 @@ from dappled.daemon.health.logbook import Logbook, of_shot
 from dappled.daemon.navigation.clocks import UtcLearner
 from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.pipeline.live_depth import LiveDepth
-from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw.recipe import Recipe
@@ -38,7 +37,6 @@ class ShotEvents(Observer):
         camera: ReportedCamera,
         utc: UtcLearner,
         *,
-        shutter: Shutter,
         component: Component,
         logbook: Logbook,
         depth: LiveDepth | None,
@@ -46,7 +44,7 @@ class ShotEvents(Observer):
         outside: Observer,
     ) -> None:
         self._recording, self._camera, self._utc = recording, camera, utc
-        self._shutter, self._component, self._logbook = shutter, component, logbook
+        self._shutter, self._component, self._logbook = component.shutter, component, logbook
         self._depth, self._recipe, self._outside = depth, recipe, outside
         self.misfit: Finding | None = None
         self.of_body: deque[BodyNews] = deque(maxlen=_OF_BODY)

@@ -80,10 +80,8 @@ class Camera:
         autopilot = OwnAutopilot(self.links.sender, self.clock)
         autopilot.identity.settled = settled
         self.component = Component(
-            self.links.sender,
             autopilot,
             self.shutter,
-            self.clock,
             settable(self),
             model=self,
             earlier=NothingEarlier(),

@@ -85,15 +85,12 @@ class Rig:
         parameters = Parameters(self.body, (self,))
         self.autopilot = OwnAutopilot(self, self.clock, on_gimbal=on_gimbal, cam_idx=cam_idx)
         self.component = Component(
-            self,
             self.autopilot,
             self.shutter,
-            self.clock,
             parameters,
             model=self,
             earlier=earlier or NothingEarlier(),
             series=self.series,
-            cam_idx=cam_idx,
         )
 
     @property

@@ -189,6 +189,6 @@ def test_the_daemon_tags_with_the_place_of_its_own_vehicle(settings: Settings) -
     assert [system for _, system in recorded.vehicles] == [OURS]
     exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)
     for vehicles, same in ((recorded.vehicles, True), ((), False)):
-        again = RecordedTelemetry(recorded.telemetry, recorded.horizons, wait_s=1.0, vehicles=vehicles)
+        again = RecordedTelemetry(settings, recorded.telemetry, recorded.horizons, vehicles)
         _, pose = again.pose(0, replace(exposure))
         assert (digest(pose) == recorded.expected[0].pose_sha256) is same

@@ -10,10 +10,10 @@ from PIL import Image
 
 from dappled import codec
 from dappled.cli import main
-from dappled.config.settings import PoseSettings
+from dappled.config.settings import PoseSettings, Settings
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.capture import PendingShot, PendingShots
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.capture import PendingShot, PendingShots, ShotEnds
+from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.replay import replay
@@ -53,19 +53,10 @@ def again(flight: Path, pace: replay.Pace | None = None) -> list[str]:
     progress = Progress()
     camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", ""))
     shots = PendingShots(camera)
-    pipeline = Pipeline(
-        camera,
-        shots,
-        verifier,
-        RecordedTelemetry(recording.telemetry, recording.horizons, wait_s=0.0),
-        decoder=FakeDecoder(),
-        publisher=None,
-        latency=BodyLatency(60.0, 15.0),
-        names=Names("test", "mask", "geometric"),
-        observer=progress,
-        decode_queue=100,
-        judge=Judge(PoseSettings().mount, on_gimbal=False),
-    )
+    judge = Judge(PoseSettings().mount, on_gimbal=False)
+    decoding = Decoding(ShotEnds(shots, verifier, progress), FakeDecoder(), None, capacity=100, judge=judge)
+    telemetry = RecordedTelemetry(Settings(pose=PoseSettings(0.0)), recording.telemetry, recording.horizons)
+    pipeline = Pipeline(decoding, telemetry, BodyLatency(60.0, 15.0), Names("test", "mask", "geometric"))
     pipeline.start()
     try:
         replay.play(recording, shots, progress, time=replay.clock(recording), pace=pace, timeout_s=60)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dappled.config.settings import PoseSettings, Settings
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import metres_per_radian, turn_rad
@@ -73,7 +74,7 @@ def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path
     data = log.read_bytes()
     log.write_bytes(data[: len(data) - cut])
     for at_s, level in ((SPAN_S, Level.CAUTION), (SPAN_S / 2, Level.NOTE)):
-        telemetry = RecordedTelemetry(log, {}, wait_s=9.0)
+        telemetry = RecordedTelemetry(Settings(pose=PoseSettings(9000.0)), log, {})
         telemetry.pose(0, ExposureTime((UTC_US + round(at_s * 1e6)) * 1000, 1_000_000, TimeSource.REQUEST))
         told = telemetry.findings()
         if at_s == SPAN_S or form != "tlog":  # a link's log is not read on after its frames

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+from dappled.config.settings import PoseSettings, Settings
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import Pose
@@ -256,7 +257,7 @@ def add_px4_triggers(log: Path, times_s: Mapping[int, float], *, contacts: bool 
 
 
 def poses(path: Path) -> list[Pose]:
-    telemetry = RecordedTelemetry(path, {}, wait_s=1.0)
+    telemetry = RecordedTelemetry(Settings(pose=PoseSettings(1000.0)), path, {})
     times = [UTC_US * 1000 + round(t_s * 1e9) for t_s in TIMES_S]
     return [telemetry.pose(n, ExposureTime(utc_ns, 1_000_000, TimeSource.REQUEST))[1] for n, utc_ns in enumerate(times)]
 

@@ -13,7 +13,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime
 
-from dappled.clock import Clock
 from dappled.daemon.camera_protocol.camera_status import CameraModel, CameraStatus, Captured
 from dappled.daemon.camera_protocol.commands import (
     ACCEPTED,
@@ -28,7 +27,7 @@ from dappled.daemon.camera_protocol.commands import (
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.feedback import CameraFeedback
 from dappled.daemon.camera_protocol.ftp_server import FtpServer
-from dappled.daemon.camera_protocol.own_autopilot import LISTEN_NS, Links, OwnAutopilot
+from dappled.daemon.camera_protocol.own_autopilot import LISTEN_NS, OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import ParameterReply, Parameters, ParameterServer
 from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.navigation.samples import CAPTURED, image_number, sent_us
@@ -139,28 +138,26 @@ class ReportRoutes:
 
 
 class Component:
-    """One camera on all links. `cam_idx` is its number at the autopilot.
+    """One camera on all links of its autopilot.
 
     Where the shutter doesn't fire the camera, each CAMERA_FEEDBACK about it is a shot.
     """
 
     def __init__(
         self,
-        links: Links,
         autopilot: OwnAutopilot,
         shutter: Shutter,
-        clock: Clock,
         parameters: Parameters,
         *,
         model: CameraModel,
         earlier: EarlierOutcomes,
         series: DistanceSeries,
-        cam_idx: int = 0,
     ) -> None:
+        links, clock = autopilot.links, shutter.clock
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity
-        self._shutter, self._clock = shutter, clock
+        self.shutter, self._clock = shutter, clock
         self._model, self._earlier = model, earlier
-        self._feedback = CameraFeedback(autopilot, clock, cam_idx=cam_idx, makes_shots=not shutter.fires)
+        self._feedback = CameraFeedback(autopilot, clock, makes_shots=not shutter.fires)
         self._status = CameraStatus(model, shutter, parameters, clock, component_id=links.component_id)
         self._intervals = MessageIntervals()
         self._commands = CameraCommands(
@@ -321,7 +318,7 @@ class Component:
         CAMERA_IMAGE_CAPTURED (263). None is acknowledged."""
         message = packet.message
         name, of_autopilot = message.get_type(), message.get_srcComponent() == AUTOPILOT
-        if name == CAPTURED and (self._shutter.fires or not of_autopilot):
+        if name == CAPTURED and (self.shutter.fires or not of_autopilot):
             return
         if message.get_srcSystem() != self._identity.system_id or self._is_duplicate(packet):
             return
@@ -332,9 +329,9 @@ class Component:
         numbers, now_ns = self._autopilot.numbers[name], self._clock.monotonic_ns()
         if name == "CAMERA_FEEDBACK":
             ours = self._feedback.is_trigger(message, self._here)
-            if ours and self._shutter.fires:
+            if ours and self.shutter.fires:
                 numbers.reported(sequence, now_ns, self._here)
-            if not ours or self._shutter.fires:
+            if not ours or self.shutter.fires:
                 return  # the hot shoe's time of a known shot: telemetry uses it
         if name == CAPTURED and not self._feedback.is_capture(message, self._here):
             return
@@ -350,11 +347,11 @@ class Component:
             acknowledged=False,
             time_us=time_us,
             autopilot=True,
-            happened=not self._shutter.fires,
+            happened=not self.shutter.fires,
         )
         known = False
         try:
-            decision = self._shutter.request(request)
+            decision = self.shutter.request(request)
             known = decision.outcome == "duplicate"
         finally:  # a shot that could not be fired is in the books as failed, and not lost
             triggers = self._autopilot.numbers["CAMERA_TRIGGER"]
@@ -464,7 +461,7 @@ class Component:
             self._rivals = rivals.facts
             self.say(str(told(rivals)), mavlink.MAV_SEVERITY_NOTICE)
         self._tell_lost_triggers()
-        if (counts := self._shutter.statistics()) != self._reported:
+        if (counts := self.shutter.statistics()) != self._reported:
             self._reported = counts
             self._status_wanted.set()
         if self._status_wanted.is_set() and now_ns >= self._status_due_ns:

@@ -16,12 +16,12 @@ _IMAGES = 2**16  # img_idx has 16 bits
 
 
 class CameraFeedback:
-    """The CAMERA_FEEDBACK of our autopilot. `cam_idx` is the camera's number there; `makes_shots`: each trigger that is
+    """The CAMERA_FEEDBACK of our autopilot. `makes_shots`: each trigger that is
     reported is a shot, as something else fires the camera."""
 
-    def __init__(self, autopilot: OwnAutopilot, clock: Clock, *, cam_idx: int, makes_shots: bool) -> None:
+    def __init__(self, autopilot: OwnAutopilot, clock: Clock, *, makes_shots: bool) -> None:
         self._autopilot, self._clock = autopilot, clock
-        self._cam_idx, self._makes_shots = cam_idx, makes_shots
+        self._makes_shots = makes_shots
         self._last: int | None = None
         self._last_ns = 0
         self._unclear: deque[tuple[int, int]] = deque(maxlen=64)  # no time, no newer number: of the next start, perhaps
@@ -63,7 +63,7 @@ class CameraFeedback:
         time, or have neither time nor number. Without a time, or before the autopilot's clock is known, a number that
         is newer than the last one shows a trigger; the first number of all may be a repeated one, and is told as lost.
         """
-        if feedback.cam_idx != self._cam_idx:
+        if feedback.cam_idx != self._autopilot.cam_idx:
             return False
         self._follow_restarts(where)
         now_ns = self._clock.monotonic_ns()

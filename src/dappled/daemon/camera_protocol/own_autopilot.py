@@ -475,11 +475,11 @@ class OwnAutopilot:
     """
 
     def __init__(self, links: Links, clock: Clock, *, on_gimbal: bool = False, cam_idx: int = 0) -> None:
-        self._links, self._clock = links, clock
+        self.links, self._clock = links, clock
         self.identity = SystemIdentity(links.system_id, clock.monotonic_ns())
         self._commands = AutopilotCommands()
         self._requests = AutopilotRequests((*STREAMS, GIMBAL_STREAM) if on_gimbal else STREAMS)
-        self._cam_idx, self._named = cam_idx, NamedComponent(cam_idx, links.component_id)
+        self.cam_idx, self._named = cam_idx, NamedComponent(cam_idx, links.component_id)
         self._now, self._battery = AutopilotNow(), BatteryReports()
         self.numbers = {kind: TriggerNumbers() for kind in ("CAMERA_FEEDBACK", "CAMERA_TRIGGER", CAPTURED)}
         self.restarts = self.restarted_ns = 0  # of the autopilot, so far: its numbers began again then (monotonic)
@@ -490,7 +490,7 @@ class OwnAutopilot:
         self.identity.fired_by(system_id)
         if self.identity.system_id != before:
             self._now, self._battery = AutopilotNow(), BatteryReports()
-            self._named = NamedComponent(self._cam_idx, self._links.component_id)
+            self._named = NamedComponent(self.cam_idx, self.links.component_id)
             self.numbers = {kind: TriggerNumbers() for kind in self.numbers}
 
     def heard(self, message: MavlinkMessage) -> None:
@@ -534,10 +534,10 @@ class OwnAutopilot:
         if autopilot is not None:
             system, link = autopilot
             for message in self._requests.due(system, self._clock.monotonic_ns(), self._clock.utc_ns()):
-                self._links.send(message, link)
+                self.links.send(message, link)
             if self.identity.is_ardupilot():
                 for message in self._named.due(system, self._clock.monotonic_ns()):
-                    self._links.send(message, link)
+                    self.links.send(message, link)
 
     def command(self, number: int, parameters: Sequence[float]) -> str | None:
         """Send it a command (MAV_CMD, parameters from the first); a sentence where it can't be sent."""
@@ -547,14 +547,14 @@ class OwnAutopilot:
         system, link = autopilot
         self._commands.sent(number, self._clock.monotonic_ns())
         seven = (*parameters, *(0.0,) * (7 - len(parameters)))
-        sent = self._links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
+        sent = self.links.send(mavlink.MAVLink_command_long_message(system, 1, number, 0, *seven), link)
         return None if sent else "its link takes no more messages"
 
     def refusal(self, message: MavlinkMessage) -> str | None:
         """A sentence where a COMMAND_ACK refuses a command of ours."""
         ours = message.get_srcSystem() == self.identity.system_id and message.target_component in (
             0,
-            self._links.component_id,
+            self.links.component_id,
         )
         if not ours or message.command not in self._commands.numbers:
             return None

@@ -113,7 +113,7 @@ class PendingShots:
         self.state: BodyState = "starting"
         self.reason = ""
         self.decoding = True
-        self._camera = camera
+        self.camera = camera
         self._unfired: deque[ShotFailed] = deque()
         self._changed = threading.Condition()
         self._in_hand: dict[int, PendingShot] = {}
@@ -125,7 +125,7 @@ class PendingShots:
         with self._changed:
             self._in_hand[shot.index] = PendingShot(shot)
         try:
-            self._camera.fire(shot.index)
+            self.camera.fire(shot.index)
         except Exception as error:  # noqa: BLE001  # any driver's; the shot is noted and must come to an end
             reason = f"the camera driver did not take the shot: {sentence(error)}"
             self._unfired.append(ShotFailed(shot.index, reason, self.clock.monotonic_ns()))
@@ -291,8 +291,8 @@ class Capture:
     `following` takes the shots that are ready to be tagged: their frame is safe, or its file stays at the camera.
     """
 
-    def __init__(self, camera: Camera, ends: ShotEnds, following: NextStage) -> None:
-        self._camera, self._ends, self._following = camera, ends, following
+    def __init__(self, ends: ShotEnds, following: NextStage) -> None:
+        self._camera, self._ends, self._following = ends.shots.camera, ends, following
         self._shots, self._writer, self._observer = ends.shots, ends.writer, ends.observer
         self._clock = ends.shots.clock
         self._give_up_ns = 0

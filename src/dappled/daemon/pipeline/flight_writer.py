@@ -66,35 +66,35 @@ class LedgerWriter:
     """Writes one flight. Until its first event only the journal holds a shot: firing never waits for the ledger."""
 
     def __init__(self, recording: Recording, clock: Clock) -> None:
-        self._recording, self._clock = recording, clock
+        self.recording, self._clock = recording, clock
         self._later: deque[tuple[str, str]] = deque(maxlen=_LATER)
         self._sizes: deque[int] = deque(maxlen=_RECENT)
 
     def requested(self, shot: Shot) -> None:
         """Enter a shot that stands in the journal."""
-        self._recording.ledger.add_shot(shot)
+        self.recording.ledger.add_shot(shot)
 
     def frame(self, index: int) -> Frame | None:
         """A frame that is safe."""
-        return self._recording.ledger.frame(index)
+        return self.recording.ledger.frame(index)
 
     def tag(self, index: int) -> Tag | None:
         """The tag of a frame, once known."""
-        return self._recording.ledger.tag(index)
+        return self.recording.ledger.tag(index)
 
     def fired(self, event: Fired) -> None:
         """The trigger call was made."""
-        self._recording.ledger.fired(event.shot, event.called_monotonic_ns, event.returned_monotonic_ns)
+        self.recording.ledger.fired(event.shot, event.called_monotonic_ns, event.returned_monotonic_ns)
 
     def failed(self, index: int, why: Finding) -> None:
         """A shot will bring no frame."""
-        self._recording.ledger.failed(index, why)
+        self.recording.ledger.failed(index, why)
         self._index(index)
 
     def record(self, index: int | None, name: str, blob: Blob) -> Frame:
         """Make a file safe. One that belongs to no shot is kept as a stray, and raises DappledError."""
         arrived_utc_ns = self._clock.utc_ns()
-        recorder = self._recording.recorder
+        recorder = self.recording.recorder
         if index is None:
             why = finding(Code.FILE_NO_SHOT, Subject("file", name))
             stray = recorder.record_stray(name, blob, why, arrived_utc_ns=arrived_utc_ns)
@@ -106,12 +106,12 @@ class LedgerWriter:
 
     def follows(self, index: int, why: Finding) -> None:
         """A shot was fired, and its file stays at the camera for now."""
-        self._recording.ledger.follows(index, why)
+        self.recording.ledger.follows(index, why)
         self._index(index)
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
         """Make a file safe that stands beside a frame."""
-        recorder = self._recording.recorder
+        recorder = self.recording.recorder
         recorder.record_companion(index, name, blob, arrived_utc_ns=self._clock.utc_ns())
         if self._sizes:
             self._sizes[-1] += blob.size
@@ -124,24 +124,24 @@ class LedgerWriter:
 
     def path(self, frame: Frame) -> str:
         """Where the frame's file stands."""
-        return str(self._recording.folder.path / frame.name)
+        return str(self.recording.folder.path / frame.name)
 
     def tagged(self, tag: Tag) -> None:
         """A frame's tag is known."""
-        self._recording.ledger.add_tag(tag)
+        self.recording.ledger.add_tag(tag)
 
     def law_decided(self, decision: LawDecision) -> None:
         """Write the law that a frame showed into flight.toml, so that replays and products decode as the flight did."""
-        self._recording.add_facts({DECISION: codec.plain(decision)})
+        self.recording.add_facts({DECISION: codec.plain(decision)})
         self.event("law", decision.sentence, decision.first)
 
     def decoded(self, result: Result) -> None:
         """A frame's slices are known."""
-        self._recording.ledger.add_result(result)
+        self.recording.ledger.add_result(result)
 
     def event(self, kind: str, text: str, index: int | None = None) -> None:
         """Something happened."""
-        self._recording.ledger.add_event(kind, text, index)
+        self.recording.ledger.add_event(kind, text, index)
 
     def later(self, kind: str, text: str) -> None:
         """Take an event from a thread that must not wait for the disk. `write_later` writes the last 1000."""
@@ -160,6 +160,6 @@ class LedgerWriter:
     def _index(self, index: int) -> None:
         """Update the index over flights. It can be rebuilt from the ledgers, so a failure is only logged."""
         try:
-            self._recording.note_image(index)
+            self.recording.note_image(index)
         except DappledError as error:
             report(log, "index", error)

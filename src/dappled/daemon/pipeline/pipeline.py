@@ -13,15 +13,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.capture import Capture, Observer, PendingShot, PendingShots, ShotEnds
+from dappled.daemon.pipeline.capture import Capture, PendingShot, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodedFrame, FrameDecoder
-from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.tagging import PoseSource, Tagging
 from dappled.daemon.pipeline.verdicts import Judge, Verdict, VerdictCounts, unjudged
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
-from dappled.drivers.camera import Camera
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import report, sentence
 from dappled.findings import FRAME, Code, Finding, Subject, finding
@@ -58,32 +56,15 @@ class DecodeFailures:
 
 
 class Pipeline:
-    """Runs the stages over the shots of `shots`. `decoder` None: frames are recorded and tagged, and decoded later."""
+    """Runs the stages over the shots of `decoding`, its last stage."""
 
-    def __init__(
-        self,
-        camera: Camera,
-        shots: PendingShots,
-        writer: FlightWriter,
-        poses: PoseSource,
-        *,
-        decoder: FrameDecoder | None,
-        publisher: Stream | None,
-        latency: BodyLatency,
-        names: Names,
-        observer: Observer,
-        decode_queue: int,
-        judge: Judge,
-        preview_interval_s: float = 0.0,
-    ) -> None:
-        shots.decoding = decoder is not None
-        self._clock = shots.clock
-        ends = ShotEnds(shots, writer, observer)
-        self._decoding = Decoding(
-            ends, decoder, publisher, capacity=decode_queue, judge=judge, preview_interval_s=preview_interval_s
+    def __init__(self, decoding: Decoding, poses: PoseSource, latency: BodyLatency, names: Names) -> None:
+        self._clock = decoding.ends.shots.clock
+        self._decoding = decoding
+        self._tagging = Tagging(
+            decoding.ends, poses, decoding.publisher, latency=latency, names=names, following=decoding
         )
-        self._tagging = Tagging(ends, poses, publisher, latency=latency, names=names, following=self._decoding)
-        self._capture = Capture(camera, ends, self._tagging)
+        self._capture = Capture(decoding.ends, self._tagging)
 
     def start(self) -> None:
         """Start the last stage first and the camera last, so that each event finds its stage running."""
@@ -123,7 +104,8 @@ class Pipeline:
 
 
 class Decoding:
-    """Decode one shot's frame after the other, in one thread, and publish its slices; without a `decoder`, none.
+    """Decode one shot's frame after the other, in one thread, and publish its slices. `decoder` None: frames are
+    recorded and tagged, and decoded later.
 
     At most one preview is published in `preview_interval_s`.
     """
@@ -136,9 +118,11 @@ class Decoding:
         *,
         capacity: int,
         judge: Judge,
-        preview_interval_s: float,
+        preview_interval_s: float = 0.0,
     ) -> None:
-        self._ends, self._decoder, self._publisher = ends, decoder, publisher
+        ends.shots.decoding = decoder is not None
+        self.ends, self.publisher = ends, publisher
+        self._decoder = decoder
         self._clock = ends.shots.clock
         self._preview_interval_s, self._last_preview_s = preview_interval_s, -1e9
         self.failures = DecodeFailures()
@@ -156,13 +140,13 @@ class Decoding:
     def take(self, pending: PendingShot) -> None:
         """Queue a shot. A frame that is not to be decoded comes to its end here."""
         if self._decoder is None:
-            self._ends.finish(pending)
-        elif self._ends.shots.decoding:
+            self.ends.finish(pending)
+        elif self.ends.shots.decoding:
             self.worker.put(pending)
         else:
             self._unjudged(pending, "it was not decoded: decoding was switched off")
-            self._ends.note("not decoded", "decoding was switched off", pending.shot.index)
-            self._ends.finish(pending)
+            self.ends.note("not decoded", "decoding was switched off", pending.shot.index)
+            self.ends.finish(pending)
 
     def _work(self, pending: PendingShot) -> None:
         """Decode a tagged frame, record the result, publish it, and end the shot. Raises DecodeProcessError."""
@@ -171,7 +155,7 @@ class Decoding:
         assert tag is not None
         assert self._decoder is not None
         began = self._clock.monotonic_ns()
-        writer = self._ends.writer
+        writer = self.ends.writer
         decoded = self._decoder.decode(
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
@@ -190,7 +174,7 @@ class Decoding:
         began = self._clock.monotonic_ns()
         self._publish(tag, decoded, judged)
         pending.ms["publish"] = (self._clock.monotonic_ns() - began) / 1e6
-        self._ends.finish(pending)
+        self.ends.finish(pending)
 
     def _judged(self, pending: PendingShot, tag: Tag, decoded: DecodedFrame) -> Verdict:
         try:
@@ -215,19 +199,19 @@ class Decoding:
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         self.failures = self.failures.after(sentence(error))
         self._unjudged(pending, "it could not be decoded")
-        self._ends.leave(pending, "not decoded", sentence(error))
+        self.ends.leave(pending, "not decoded", sentence(error))
 
     def _dropped(self, pending: PendingShot) -> None:
         self._unjudged(pending, "it was not decoded: decoding fell behind")
-        self._ends.drop(pending, "not decoded")
+        self.ends.drop(pending, "not decoded")
 
     def _publish(self, tag: Tag, decoded: DecodedFrame, judged: Mapping[str, Any]) -> None:
-        if self._publisher is None:
+        if self.publisher is None:
             return
-        self._publisher.publish("slices", {**wire.slices_header(tag, decoded), "verdict": judged}, decoded.body)
+        self.publisher.publish("slices", {**wire.slices_header(tag, decoded), "verdict": judged}, decoded.body)
         now_s = self._clock.monotonic_ns() / 1e9
         if decoded.preview and now_s - self._last_preview_s >= self._preview_interval_s:
             self._last_preview_s = now_s
             facts = wire.frame_facts(tag, decoded.law)
             size = {"width": decoded.preview_size[0], "height": decoded.preview_size[1]}
-            self._publisher.publish("preview", {**facts, "media_type": "image/jpeg", **size}, decoded.preview)
+            self.publisher.publish("preview", {**facts, "media_type": "image/jpeg", **size}, decoded.preview)

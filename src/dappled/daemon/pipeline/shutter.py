@@ -120,7 +120,7 @@ class Shutter:
     """
 
     def __init__(self, sink: ShotSink, clock: Clock, *, next_index: int, capacity: int = 8, fires: bool = True) -> None:
-        self._sink, self._clock, self.fires = sink, clock, fires
+        self._sink, self.clock, self.fires = sink, clock, fires
         self._next_index = next_index
         self._capacity = capacity
         self._lock = threading.Lock()
@@ -172,7 +172,7 @@ class Shutter:
                 return self._refuse(request, bounds)
         request = replace(request, series=(interval_s, float(count)))
         with self._lock:
-            now_ns = self._clock.monotonic_ns()
+            now_ns = self.clock.monotonic_ns()
             if (known := self._recent.same(request, now_ns)) is not None:
                 self._forwarded.add(request, now_ns, known)  # the autopilot begins again, with a trigger at once
                 return ShotDecision("duplicate", index=known)
@@ -181,7 +181,7 @@ class Shutter:
                 step_ns = round(max(interval_s, _SHORTEST_S if interval_s > 0 else 0.0) * 1e9)
                 left = None if count == 0 else count - 1
                 self._end_interval(request.source)
-                now_ns, driven = self._clock.monotonic_ns(), decision.outcome == "duplicate"
+                now_ns, driven = self.clock.monotonic_ns(), decision.outcome == "duplicate"
                 due_ns = now_ns + step_ns + (FORWARDED_NS if driven else 0)
                 self._interval = _Interval(request.source, step_ns, left, due_ns, request, now_ns, driven=driven)
                 self._wake.set()
@@ -221,7 +221,7 @@ class Shutter:
     def serve(self) -> float:
         """Take the interval's shot if one is due; seconds until there is something to do. The thread's work."""
         with self._lock:
-            now_ns = self._clock.monotonic_ns()
+            now_ns = self.clock.monotonic_ns()
             interval = self._interval
             if interval is None or (interval.interval_ns == 0 and self._pending):
                 return _IDLE_S
@@ -260,7 +260,7 @@ class Shutter:
                 0 if interval is None else interval.taken - interval.refused,
                 0 if interval is None else interval.refused,
                 None if interval is None or interval.left is None else interval.taken + interval.left,
-                None if interval is None else max(0, interval.due_ns - self._clock.monotonic_ns()) / 1e9,
+                None if interval is None else max(0, interval.due_ns - self.clock.monotonic_ns()) / 1e9,
                 0 if interval is None else interval.began_ns,
             )
 
@@ -271,7 +271,7 @@ class Shutter:
         self._interval = None
 
     def _judge(self, request: CaptureRequest) -> ShotDecision:
-        now_ns = self._clock.monotonic_ns()
+        now_ns = self.clock.monotonic_ns()
         if request.kind not in OWN_KINDS:
             known = self._recent.same(request, now_ns)
             if known is not None:
@@ -288,7 +288,7 @@ class Shutter:
         reason = self._why_not(happened=request.happened)
         if reason is None:
             shot = Shot(
-                self._next_index, Cause(request.source, request.kind, request.sequence), self._clock.utc_ns(), now_ns
+                self._next_index, Cause(request.source, request.kind, request.sequence), self.clock.utc_ns(), now_ns
             )
             try:
                 self._sink.note(shot)
@@ -376,4 +376,4 @@ class Shutter:
             except Exception as error:  # noqa: BLE001  # noting or firing failed: the interval goes on
                 report(log, "interval", error)
                 wait_s = _AGAIN_S
-            self._clock.wait(self._wake, min(wait_s, _SETTLE_S))
+            self.clock.wait(self._wake, min(wait_s, _SETTLE_S))

@@ -110,7 +110,7 @@ def by_vehicle(flight: Path, wanted: int | None) -> tuple[dict[int, Tag] | None,
         return None, []
     facts = layout.read_facts(folder)
     settings = configuration.of_tables(facts.get("settings", {}), str(folder.settings))
-    telemetry = RecordedTelemetry.flown(settings, folder.telemetry, {}, [(0, system)], doubt=doubt)
+    telemetry = RecordedTelemetry(settings, folder.telemetry, {}, [(0, system)], doubt=doubt)
     made = {}
     for tag in sorted(tags.values(), key=lambda one: one.utc_ns):
         exposure = ExposureTime(tag.utc_ns, tag.utc_sigma_ns, tag.time_source)

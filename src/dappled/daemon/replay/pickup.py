@@ -165,7 +165,7 @@ def bring(
     with LedgerReader.open(folder.ledger) as reader:
         turns, before = recorded_vehicles(reader), recorded_doubt(reader)
     log = folder.telemetry if folder.telemetry.is_file() else None
-    telemetry = RecordedTelemetry.flown(settings, log, {}, turns, doubt=before)
+    telemetry = RecordedTelemetry(settings, log, {}, turns, doubt=before)
     frames: list[Frame] = []
     zooms: list[Finding] = []
     companions = 0

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from dappled.config.settings import PublishSettings, Settings
 from dappled.daemon.body_plan import exposure_of, plan_of
 from dappled.daemon.navigation import BodyLatency
-from dappled.daemon.pipeline.capture import PendingShots
+from dappled.daemon.pipeline.capture import PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodeProcess
-from dappled.daemon.pipeline.pipeline import Pipeline
+from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.verdicts import FixedPlan, Judge
 from dappled.daemon.replay import replay
@@ -63,7 +63,7 @@ def run(
             decoder = DecodeProcess(recipe)
             stack.callback(decoder.close)
             decoder.warm_up()
-        telemetry = RecordedTelemetry.flown(
+        telemetry = RecordedTelemetry(
             flown.settings,
             recording.telemetry,
             recording.horizons,
@@ -79,23 +79,11 @@ def run(
             publisher.publish("start", header)
         camera = ReplayCamera(recording.files, Identity("dappled", "recording", "", str(recording.root)), time)
         shots = PendingShots(camera)
-        pipeline = Pipeline(
-            camera,
-            shots,
-            writer,
-            telemetry,
-            decoder=decoder,
-            publisher=publisher,
-            latency=flown.latency,
-            names=flown.names,
-            observer=progress,
-            decode_queue=_DECODE_QUEUE,
-            judge=Judge(
-                flown.settings.pose.mount,
-                on_gimbal=flown.settings.pose.on_gimbal,
-                plan=plan,
-            ),
-        )
+        pose = flown.settings.pose
+        judge = Judge(pose.mount, on_gimbal=pose.on_gimbal, plan=plan)
+        ends = ShotEnds(shots, writer, progress)
+        decoding = Decoding(ends, decoder, publisher, capacity=_DECODE_QUEUE, judge=judge)
+        pipeline = Pipeline(decoding, telemetry, flown.latency, flown.names)
         pipeline.start()
         stack.callback(pipeline.stop, _STOP_S)
         replay.play(recording, shots, progress, time=time, pace=pace)

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from time import sleep
-from typing import Self
 
 from dappled import __version__, codec, confined, durable, picture_order
 from dappled.clock import RecordedClock, TimeOfDayClock
@@ -258,26 +257,23 @@ class RecordedTelemetry:
 
     def __init__(
         self,
+        settings: Settings,
         path: Path | None,
         horizons: dict[int, int],
-        *,
-        wait_s: float,
         vehicles: Sequence[tuple[int, int]] = (),
-        component_id: int = 100,
-        cam_idx: int = 0,
-        attitude_sigma_rad: float = 0.0,
+        *,
         report: Callable[[Finding], object] = lambda _: None,
         bounds: UtcBounds | None = None,
         doubt: PositionDoubt | None = None,
     ) -> None:
-        """`vehicles`, `component_id`, `cam_idx`, `attitude_sigma_rad` and `doubt` are those that the recording
-        daemon had. `report` gets what is to be said of the log."""
-        self._horizons, self._wait_ns = horizons, round(wait_s * 1e9)
+        """`settings`, `vehicles` and `doubt` are those that the recording daemon had. `report` gets what is to be said
+        of the log."""
+        self._horizons, self._wait_ns = horizons, round(settings.pose.wait_ms * 1e6)
         self._telemetry = Telemetry(
             vehicles=vehicles,
-            component_id=component_id,
-            cam_idx=cam_idx,
-            attitude_sigma_rad=attitude_sigma_rad,
+            component_id=settings.mavlink.component_id,
+            cam_idx=settings.mavlink.cam_idx,
+            attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
             doubt=doubt,
         )
         self._path, self._report = path, report
@@ -286,32 +282,6 @@ class RecordedTelemetry:
         self._gaps: list[_Gap] = []
         self._of_folder = bounds is not None
         self._unplaced, self._jump_m = 0, 0.0
-
-    @classmethod
-    def flown(
-        cls,
-        settings: Settings,
-        path: Path | None,
-        horizons: dict[int, int],
-        vehicles: Sequence[tuple[int, int]],
-        *,
-        report: Callable[[Finding], object] = lambda _: None,
-        bounds: UtcBounds | None = None,
-        doubt: PositionDoubt | None = None,
-    ) -> Self:
-        """As the daemon of these settings had it."""
-        return cls(
-            path,
-            horizons,
-            wait_s=settings.pose.wait_ms / 1e3,
-            vehicles=vehicles,
-            component_id=settings.mavlink.component_id,
-            cam_idx=settings.mavlink.cam_idx,
-            attitude_sigma_rad=math.radians(settings.pose.attitude_sigma_deg),
-            report=report,
-            bounds=bounds,
-            doubt=doubt,
-        )
 
     def pose(self, index: int, exposure: ExposureTime) -> tuple[ExposureTime, Pose]:
         """When and where a frame was exposed (see `Pipeline`); frames come in the order of their exposure."""
