@@ -6,7 +6,7 @@ from __future__ import annotations
 from itertools import groupby
 from pathlib import Path
 
-from dappled.findings import WORDS
+from dappled.findings import words
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "findings.md"
@@ -14,9 +14,8 @@ STUB = ROOT / "src" / "dappled" / "finding_codes.pyi"
 STUB_HEAD = '''"""The codes of `findings.toml`, written by `python tools/findings_page.py`."""
 
 from enum import StrEnum
-from typing import Any
 
-TABLE: dict[str, dict[str, Any]]
+LIST: str
 
 class Code(StrEnum):
     """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""
@@ -38,18 +37,18 @@ TITLES = "| code | level | what was found | what to do |\n| --- | --- | --- | --
 def page() -> str:
     """The page as it should be."""
     parts = [HEAD]
-    for about, each in groupby(WORDS.items(), lambda one: one[0].value.partition(".")[0]):
+    for about, each in groupby(words().items(), lambda one: one[0].value.partition(".")[0]):
         rows = [f"## {about}\n\n{TITLES}"]
-        for code, words in each:
-            more = f"{' ' if words.remedy else ''}([more]({words.page}))" if words.page else ""
-            rows.append(f"| `{code.value}` | {words.level.word} | {words.sentence} | {words.remedy}{more} |")
+        for code, told in each:
+            more = f"{' ' if told.remedy else ''}([more]({told.page}))" if told.page else ""
+            rows.append(f"| `{code.value}` | {told.level.word} | {told.sentence} | {told.remedy}{more} |")
         parts.append("\n".join(rows) + "\n")
     return "\n".join(parts)
 
 
 def stub() -> str:
     """The list of codes as it should be."""
-    return STUB_HEAD + "".join(f'    {code.name} = "{code.value}"\n' for code in WORDS)
+    return STUB_HEAD + "".join(f'    {code.name} = "{code.value}"\n' for code in words())
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
 """The codes of `findings.toml`, written by `python tools/findings_page.py`."""
 
 from enum import StrEnum
-from typing import Any
 
-TABLE: dict[str, dict[str, Any]]
+LIST: str
 
 class Code(StrEnum):
     """What can be found. The part before the dot names what it is about; `findings.toml` has the words."""

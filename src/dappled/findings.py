@@ -9,14 +9,16 @@ from __future__ import annotations
 import json
 import math
 import string
+import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from functools import cache
 from types import MappingProxyType
 from typing import Any, Self, TypeAlias
 
 from dappled import codec
-from dappled.finding_codes import TABLE
+from dappled.finding_codes import LIST
 from dappled.finding_codes import Code as Code  # noqa: PLC0414  they are imported from here
 
 Value: TypeAlias = str | int | float | bool | None
@@ -85,6 +87,13 @@ class Wording:
     settles_s: float = 0.0
 
 
+@cache
+def words() -> Mapping[Code, Wording]:
+    """How each code is told, in the order of the alphabet."""
+    rows = tomllib.loads(LIST).items()
+    return MappingProxyType({Code(code): Wording(Level[row.pop("level").upper()], **row) for code, row in rows})
+
+
 @dataclass(frozen=True, slots=True)
 class Finding:
     """One thing found. `facts` have their unit in the key (`sigma_ms`) and stand as JSON."""
@@ -127,7 +136,7 @@ def of_json_text(words: str) -> Finding | None:
 
 def finding(code: Code, subject: Subject, level: Level | None = None, **facts: Value) -> Finding:
     """A finding with its code's own level, unless another is given. A number that isn't finite is unknown: None."""
-    return Finding(code, subject, _known(facts), WORDS[code].level if level is None else level)
+    return Finding(code, subject, _known(facts), words()[code].level if level is None else level)
 
 
 def _known(facts: Mapping[str, Value]) -> dict[str, Value]:
@@ -183,12 +192,12 @@ def _filled(sentence: str, facts: Mapping[str, Value]) -> str:
 
 def text(one: Finding) -> Text:
     """What was found, as a clause without its subject and without a full stop."""
-    return Text(_filled(WORDS[one.code].sentence, one.facts))
+    return Text(_filled(words()[one.code].sentence, one.facts))
 
 
 def remedy(one: Finding) -> Text:
     """What to do; "" where nothing is to be done."""
-    return Text(_filled(WORDS[one.code].remedy, one.facts))
+    return Text(_filled(words()[one.code].remedy, one.facts))
 
 
 def named(one: Finding, under: Subject | None = None) -> Text:
@@ -223,8 +232,3 @@ def first_by_name(frames: Iterable[tuple[str, Iterable[Finding]]]) -> list[Findi
         for one in of_subject(found, Subject("frame", name)):
             first.setdefault((one.code, one.subject.kind), one)
     return list(first.values())
-
-
-WORDS: Mapping[Code, Wording] = MappingProxyType(
-    {Code(code): Wording(Level[row.pop("level").upper()], **row) for code, row in TABLE.items()}
-)

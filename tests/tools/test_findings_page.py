@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dappled.findings import WORDS
+from dappled.findings import words
 from tests.made_pages import ROOT, assert_made
 
 
@@ -11,4 +11,4 @@ def test_the_page_of_all_findings_is_that_of_the_table() -> None:
 
 
 def test_each_finding_leads_to_a_page_that_is_there() -> None:
-    assert all((ROOT / "docs" / words.page.partition("#")[0]).exists() for words in WORDS.values() if words.page)
+    assert all((ROOT / "docs" / one.page.partition("#")[0]).exists() for one in words().values() if one.page)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dappled import codec
-from dappled.findings import WORDS, Code, Finding, Level, Subject, above_note, in_order
+from dappled.findings import Code, Finding, Level, Subject, above_note, in_order, words
 from dappled.flight.records import BEGAN, ENDED
 
 ALL_IS_WELL = "all is well"
@@ -56,7 +56,7 @@ def in_record(health: Mapping[str, Any]) -> list[Finding]:
 def unasked(health: Mapping[str, Any]) -> list[Finding]:
     """Those of a health record that a person is told without asking: what usually ends by itself may settle first."""
     rows = zip(in_record(health), health["findings"], strict=True)
-    return [one for one, row in rows if row[_AGE] >= WORDS[one.code].settles_s]
+    return [one for one, row in rows if row[_AGE] >= words()[one.code].settles_s]
 
 
 class NewFindings:
