@@ -57,13 +57,17 @@ def judged(shot: Drawn) -> Judged:
     [
         # masks 1 to 5 and the reference; noise, ghosts of 1 to 3 px a view, and frames in focus
         *[(2, -1.5), (5, -3), (20, -6), (23, 0.3), (46, -0.8), (52, -2)],
-        *[(61, -5), (72, -1), (74, -2), (90, -5), (133, 2.2), (155, 1.3)],
+        *[(61, -5), (72, -1), (74, -2), (90, -5), (133, -1)],
     ],
 )
 def test_a_drawn_picture_is_about_as_good_as_the_better_of_true_shadow_and_band(
     number: int, most_short_db: float
 ) -> None:
     assert judged(draw()[number]).short_db > -most_short_db
+
+
+def test_orders_that_fold_into_local_means_on_samples_that_stand_far_apart_are_found() -> None:
+    assert judged(draw()[155]).short_db > -0.3
 
 
 @pytest.mark.slow

@@ -66,14 +66,14 @@ class PatternPlace:
         return rows, columns
 
 
-def kept_by_mean(frequencies: Floats, reach_px: float, step: tuple[int, int]) -> Floats:
+def kept_by_mean(frequencies: Floats, reach_px: float, step: tuple[int, int]) -> NDArray[np.complex128]:
     """(K,) what `local_mean` keeps of waves of these frequencies (K, 2), in cycles a pixel: next to nothing, but of
-    those that fold to low ones on samples that stand far apart."""
-    kept = np.ones(len(frequencies))
+    those that fold to low ones on samples that stand far apart. Its middle lies half a sample on where it has none."""
+    kept = np.ones(len(frequencies), dtype=np.complex128)
     for f, one in zip(frequencies.T, step, strict=True):
         size, around = _width(reach_px, one), _PASSES * (_width(reach_px, one) - 1)
         shares = np.exp(-2j * np.pi * np.outer(f * one, np.arange(size) - (size - 1) / 2)).mean(axis=1).real
-        kept *= shares**_PASSES * np.cos(np.pi * f * one * (around % 2))
+        kept *= shares**_PASSES * np.exp(1j * np.pi * f * one * (around % 2))
     return kept
 
 

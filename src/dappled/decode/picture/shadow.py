@@ -125,7 +125,9 @@ def shadow_of(
     kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
     lost = bool(np.any(np.abs(kept) > _KEPT))
     if lost:
-        first = replace(first, coefficients=first.coefficients / np.maximum(1 - kept, 0.1)[:, None])
+        first = replace(
+            first, coefficients=first.coefficients / np.where(np.abs(1 - kept) > 0.1, 1 - kept, 0.1)[:, None]
+        )
     if known := first.depth > _DEEP or mosaic.valid is not None or lost:
         means = _Means.of(mosaic, means.period, first)  # where the light was is known better behind a known shadow
     if known or equations.at != found:
