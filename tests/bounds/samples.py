@@ -30,7 +30,7 @@ from dappled.decode.calibration import Calibration, LatticeFit
 from dappled.decode.optics import Lattice
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
-from dappled.findings import Code, Subject, finding, json_text
+from dappled.findings import Code, Subject, finding
 from dappled.flight import Ledger, recording, seals
 from dappled.products.exports import light_files
 from tests.drivers.raw.test_reading import dng
@@ -425,7 +425,7 @@ def _flight(flights: Path) -> Path:
     with seals.reopened(flight.folder, clock, "a test"), Ledger(flight.folder.ledger, clock) as ledger:
         sha256 = hashlib.sha256(line).hexdigest()
         removed = finding(Code.FLIGHT_FILES_REMOVED, Subject("flight"), files=1, which="", there="", sha256=sha256)
-        ledger.add_event("offloaded", json_text(removed))
+        ledger.add_event("offloaded", removed)
     return path
 
 

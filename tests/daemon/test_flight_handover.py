@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 
+from dappled import findings
 from dappled.clock import RecordedClock
 from dappled.config import profiles
 from dappled.config.settings import CameraSettings, DecodeSettings, MaskSettings, Settings
@@ -19,6 +20,7 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.camera import CameraError, Setting, SettingName
 from dappled.errors import DappledError
+from dappled.findings import Finding
 from tests.daemon.fakes import FakeSink
 
 CONFIGURED = Settings(
@@ -46,8 +48,8 @@ class Flown:
         recipe = RecipeParameters(names or recipes.called(settings), after, LiveSettings(settings), self.shutter, self)
         self.parameters = Parameters(NoBody(), (recipe,))
 
-    def later(self, kind: str, text: str) -> None:
-        self.events.append(f"{kind}: {text}")
+    def later(self, kind: str, found: Finding) -> None:
+        self.events.append(f"{kind}: {findings.text(found)}")
 
 
 def test_each_shipped_mask_each_law_and_no_mask_can_be_chosen() -> None:

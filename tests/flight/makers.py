@@ -10,8 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.decode.geometry import Pose
-from dappled.findings import Finding, text
+from dappled.findings import Code, Finding, Subject, finding, text
 from dappled.flight import Cause, Frame, Recording, Shot, Tag, TimeSource
+
+CARD_FULL = finding(Code.BODY_CARD_FULL, Subject("card"))  # some event of a ledger
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 
 import pytest
 
@@ -36,8 +37,9 @@ def test_refused_requests_are_counted_at_their_source(flight: Recording) -> None
     request(flight, 0)
     for source, times in (("mavlink:7/1", 1), ("console", 1), ("mavlink:7/1", 511), ("other peers", 9)):
         one = finding(Code.CAMERA_ABSENT, Subject("source", source), reason="", times=times)
-        flight.ledger.add_event("refused", findings.json_text(one))
-    flight.ledger.add_event("refused", '{"code": "gibberish"}')
+        flight.ledger.add_event("refused", one)
+    with sqlite3.connect(flight.folder.ledger) as damaged:
+        damaged.execute("INSERT INTO events (utc_ns, kind, text) VALUES (0, 'refused', '{\"code\": \"gibberish\"}')")
     counts = {one.source: one for one in by_source(flight.folder.path)}
     assert (counts["mavlink:7/1"].wishes, counts["mavlink:7/1"].refused) == (512, 512)
     assert counts["other peers"].refused == 9
@@ -59,10 +61,10 @@ def test_the_report_names_frames_in_doubt_and_what_the_card_holds(
 ) -> None:
     """By what a driver's findings left in the ledger; a frame that may be another shot's makes it exit with 1."""
     card = finding(Code.PICTURE_ON_CARD, Subject("picture", "/DCIM/IMG_0004.CR2"))
-    doubt = findings.json_text(finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 0), rival=1))
+    doubt = finding(Code.FRAME_RIVAL_SHOTS, Subject("frame", 0), rival=1)
     request(flight, 0)
     deliver(flight, 0, bytes(1000))
-    flight.ledger.add_event("noticed", findings.json_text(card))
+    flight.ledger.add_event("noticed", card)
     flight.ledger.add_event("doubt", doubt, 0)
     flight.close()
     assert main(["flight", "report", str(flight.folder.path)]) == 1
@@ -76,7 +78,7 @@ def test_the_report_says_what_stood_and_when(flight: Recording, capsys: pytest.C
     filling = finding(Code.DISK_FILLING, Subject("disk"), left_mb=409, least_mb=200)
     full = finding(Code.DISK_FULL, Subject("disk"), left_kb=1)
     for kind, one in (("began", down), ("began", filling), ("ended", down), ("began", full), ("began", down)):
-        flight.ledger.add_event(kind, findings.json_text(one))
+        flight.ledger.add_event(kind, one)
     flight.close()
     stood = flight_report.balance(flight.folder.path).stood
     assert [one.finding for one in stood] == [down, filling, full, down]

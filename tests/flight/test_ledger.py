@@ -20,7 +20,7 @@ from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Result, Sho
 from dappled.flight.ledger import advance
 from dappled.flight.stored_rows import ledger_damage
 from dappled.flight.tables import TRANSITIONS
-from tests.flight.makers import shot, tag
+from tests.flight.makers import CARD_FULL, shot, tag
 from tests.standing import STRAY, failure
 
 
@@ -46,7 +46,7 @@ def test_everything_comes_back_as_it_was_noted(tmp_path: Path) -> None:
         ledger.add_result(result)
         ledger.add_result(replace(result, run="again"))
         ledger.add_stray(stray)
-        ledger.add_event("camera", "it is ready")
+        ledger.add_event("camera", CARD_FULL)
         ledger.set_fact("telemetry_packets", 1)
         ledger.set_fact("telemetry_packets", 2)
     with LedgerReader.open(path) as reader:
@@ -223,7 +223,7 @@ def test_a_full_disk_is_told(tmp_path: Path) -> None:
     with ledger_at(tmp_path / "flight.sqlite") as ledger:
         ledger._rows("PRAGMA max_page_count = 1")
         with pytest.raises(FlightError, match="the disk is full"):
-            ledger.add_event("fill", "x" * 1_000_000)
+            ledger.add_event("fill", CARD_FULL.with_facts(fill="x" * 1_000_000))
         ledger._rows("PRAGMA max_page_count = 1000000")
         ledger.add_shot(shot(1))
         assert len(ledger.shots()) == 1

@@ -41,7 +41,7 @@ from dappled.flight.checks import flight_check as checks
 from dappled.flight.checks.flight_check import check
 from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, flip, held, mavlink_2, request, words_of
+from tests.flight.makers import CARD_FULL, deliver, flip, held, mavlink_2, request, words_of
 from tests.standing import STRAY
 
 pytestmark = pytest.mark.usefixtures("on_ext4")
@@ -490,21 +490,21 @@ def test_a_copy_whose_ledger_has_grown_stays(closed: Path, tmp_path: Path) -> No
     """Frames are tagged in the copy; a later offload does not take that back."""
     done = go(closed, tmp_path / "disk")
     with Ledger(done.destination / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
-        ledger.add_event("tagged late", "in the copy")
+        ledger.add_event("tagged late", CARD_FULL)
     assert go(closed, tmp_path / "disk").copied == 0
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
-        ledger.add_event("picked up", "in the source")
+        ledger.add_event("picked up", CARD_FULL)
     with pytest.raises(FlightError, match="each holds what the other lacks"):
         go(closed, tmp_path / "disk")
 
 
 def test_the_ledger_is_copied_with_what_stands_in_its_log(closed: Path, tmp_path: Path) -> None:
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as reader:  # keeps the log from being folded in
-        reader.add_event("note", "in the log")
+        reader.add_event("note", CARD_FULL)
         assert (closed / "flight.sqlite-wal").stat().st_size > 0
         done = go(closed, tmp_path / "disk")
     with LedgerReader.open(done.destination / "flight.sqlite") as ledger:
-        assert ledger.events()[-1].text == "in the log"
+        assert ledger.events()[-1].finding == CARD_FULL
     assert not list(done.destination.glob("flight.sqlite-*"))
 
 

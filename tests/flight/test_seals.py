@@ -31,7 +31,7 @@ from dappled.flight import (
 from dappled.flight.checks.flight_check import check
 from tests.flight.checks.test_chain_check import attacked, fly
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import flip, words_of
+from tests.flight.makers import CARD_FULL, flip, words_of
 
 SEED = 20261122
 LATER = RecordedClock(START_UTC_NS + 10**12)
@@ -244,7 +244,7 @@ def test_a_file_of_ones_own_is_named_and_no_fault(sealed: FlightFolder) -> None:
 
 def test_work_that_was_killed_leaves_rows_that_the_chain_vouches_for(sealed: FlightFolder) -> None:
     with Ledger(sealed.ledger, LATER) as writer:
-        writer.add_event("opened again", "late tags")
+        writer.add_event("opened again", CARD_FULL)
     (sealed.frames / "000001.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
     report = check(sealed.path)
     assert words_of(report.problems) == ()
@@ -371,7 +371,7 @@ def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, mon
     """A seal of a file that SQLite has still to change would be wrong later."""
     monkeypatch.setattr("dappled.flight.ledger.BUSY_S", 0.05)
     with attacked(sealed) as reader, Ledger(sealed.ledger, LATER) as writer:
-        writer.add_event("camera", "another row, in the WAL")
+        writer.add_event("camera", CARD_FULL)
         reader.execute("BEGIN")
         reader.execute("SELECT count(*) FROM events").fetchone()
         with pytest.raises(FlightError, match="another program holds it"):

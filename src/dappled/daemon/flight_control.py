@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dappled import findings
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured, ReportedCamera
 from dappled.daemon.camera_protocol.parameters import Parameter
@@ -82,7 +81,7 @@ class FlightControl:
 
     def refused(self, why: Finding) -> None:
         """Requests became no shots: the first of a source for a reason, later how many more."""
-        self._writer.later(REFUSED, findings.json_text(why))
+        self._writer.later(REFUSED, why)
 
     # CameraModel
 
@@ -124,7 +123,7 @@ class FlightControl:
     def lost(self, triggers: Finding) -> None:
         """Write down triggers of the autopilot that became no shot."""
         self.lost_triggers += triggers.number("triggers")
-        self._writer.later(LOST, findings.json_text(triggers))
+        self._writer.later(LOST, triggers)
 
     # DistanceReceiver
 
@@ -150,4 +149,4 @@ class DecodingParameter:
     def set(self, name: str, value: str) -> None:
         """Take one of the choices of one of them; it has it at once."""
         self._shots.decoding = value == "on"
-        self._writer.later("decoding", f"{value} from now on, by the ground station")
+        self._writer.later("decoding", finding(Code.DECODE_SWITCHED, Subject("decoding"), value=value))

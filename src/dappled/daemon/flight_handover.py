@@ -21,6 +21,7 @@ from dappled.daemon.pipeline.shutter import Shutter
 from dappled.decode.optics import LAWS
 from dappled.drivers.camera import CameraError
 from dappled.errors import DappledError, counted, sentence
+from dappled.findings import Code, Finding, Subject, finding
 
 log = logging.getLogger(__name__)
 NONE = "none"  # no mask: frames are kept, not decoded
@@ -78,7 +79,7 @@ def words(names: Names) -> tuple[str, str]:
 class EventWriter(Protocol):
     """What takes the events of a flight: `pipeline.flight_writer.LedgerWriter`."""
 
-    def later(self, kind: str, text: str) -> None:
+    def later(self, kind: str, found: Finding) -> None:
         """Take an event from a thread that must not wait for the disk."""
 
 
@@ -124,7 +125,7 @@ class RecipeParameters:
         if now.pending:
             raise CameraError(f"{text} would begin another flight: {counted(now.pending, 'shot')} under way, ask again")
         after.next = following
-        self._events.later("next flight", f"{text} from there on, by the ground station")
+        self._events.later("next flight", finding(Code.FLIGHT_NEXT_SET, Subject("flight"), what=text))
 
 
 def flights(settings: Settings, fly: Callable[[Settings, FlightHandover], bool]) -> None:

@@ -453,7 +453,7 @@ class Service:
         record = self.health()
         self.parts.publisher.publish("health", record)
         for kind, one in self._told.of(record):
-            self.parts.writer.later(kind, findings.json_text(one))
+            self.parts.writer.later(kind, one)
         for text, severity in self._alarms.lines(record, again=self.parts.component.audience_has_grown()):
             self.parts.component.say(text, severity, news=True)  # it began or ended again
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from dappled import durable
 from dappled.clock import Clock
-from dappled.errors import counted
+from dappled.findings import Code, Subject, finding
 from dappled.flight import layout
 from dappled.flight.chain import Column
 from dappled.flight.layout import FlightFolder
@@ -67,5 +67,5 @@ class Added:
             copy_verified(there, source, folder.seals.name)
         source.sync()
         with Ledger(folder.ledger, clock) as ledger:
-            text = f"{counted(self.count, 'row')} that later work added to the copy {there.path} were brought home"
-            ledger.adopt(self.rows, printable(text))
+            copy = printable(str(there.path))
+            ledger.adopt(self.rows, finding(Code.FLIGHT_BROUGHT_HOME, Subject("flight"), rows=self.count, copy=copy))

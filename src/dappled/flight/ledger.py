@@ -19,7 +19,7 @@ from dappled import codec, findings
 from dappled.clock import Clock
 from dappled.codec import CodecError, canonical
 from dappled.decode.geometry import Pose
-from dappled.findings import Finding
+from dappled.findings import FRAME, Code, Finding, finding
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column, digest
 from dappled.flight.errors import FlightError, ledger_error
@@ -341,7 +341,8 @@ class Ledger(LedgerReader):
             values = (one.index, one.name, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
             self._insert("frames", (frame.index,), *values)
             if before == "failed":
-                self._event("late", f"the file {frame.camera_name} came after the shot had been given up", frame.index)
+                late = finding(Code.FRAME_LATE, FRAME, file=frame.camera_name)
+                self._event("late", late, frame.index)
 
     def follows(self, index: int, why: Finding) -> None:
         """Note that the shot was fired and its file is still on the camera: it counts as failed until picked up."""
@@ -361,7 +362,8 @@ class Ledger(LedgerReader):
             why = "" if stray.reason is None else findings.json_text(stray.reason)
             values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, why)
             self._insert("strays", (stray.name,), *values)
-            self._event("stray", why, None)
+            if stray.reason is not None:
+                self._event("stray", stray.reason, None)
 
     def add_tag(self, tag: Tag) -> None:
         """Add a frame's tag and, with a digest of its own, the pose in it."""
@@ -375,23 +377,23 @@ class Ledger(LedgerReader):
             values = (result.index, result.run, result.slices_sha256, canonical(result).decode())
             self._insert("results", (result.index, result.run), *values)
 
-    def add_event(self, kind: str, text: str, index: int | None = None) -> None:
+    def add_event(self, kind: str, found: Finding, index: int | None = None) -> None:
         with self._transaction():
-            self._event(kind, text, index)
+            self._event(kind, found, index)
 
     def set_fact(self, key: str, value: object) -> None:
         """Store a value that holds for the whole flight; replaces an earlier one."""
         with self._transaction():
             self._fact(key, value)
 
-    def adopt(self, rows: Mapping[str, Iterable[Sequence[Column]]], text: str) -> None:
-        """Add rows of a later state of this ledger, by table, with the links that they have there; `text` says so."""
+    def adopt(self, rows: Mapping[str, Iterable[Sequence[Column]]], found: Finding) -> None:
+        """Add rows of a later state of this ledger, by table, with the links that they have there; `found` says so."""
         with self._transaction():
             for table, some in rows.items():
                 for row in some:
                     marks = ", ".join("?" * len(row))
                     self._db.execute(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", row)  # noqa: S608  our own names
-            self._event("brought home", text, None)
+            self._event("brought home", found, None)
 
     def fold(self) -> None:
         """Fold the WAL into the file, which then stays as it is until the next row. Raises FlightError where another
@@ -405,8 +407,8 @@ class Ledger(LedgerReader):
     def _fact(self, key: str, value: object) -> None:
         self._insert("facts", (key,), key, canonical(value).decode())
 
-    def _event(self, kind: str, text: str, index: int | None) -> None:
-        values = (self._clock.utc_ns(), kind, index, text)
+    def _event(self, kind: str, found: Finding, index: int | None) -> None:
+        values = (self._clock.utc_ns(), kind, index, findings.json_text(found))
         row = self._db.execute("INSERT INTO events (utc_ns, kind, idx, text) VALUES (?, ?, ?, ?)", values)
         self._written["events", (row.lastrowid,)] = None
 
@@ -418,9 +420,8 @@ class Ledger(LedgerReader):
         self._written[table, key] = None
 
     def _end(self, index: int, kind: str, why: Finding) -> None:
-        text = findings.json_text(why)
-        self._advance(index, "failed", text)
-        self._event(kind, text, index)
+        self._advance(index, "failed", findings.json_text(why))
+        self._event(kind, why, index)
 
     def _advance(self, index: int, new: ShotState, reason: str | None = None) -> ShotState:
         row = self.shot(index)

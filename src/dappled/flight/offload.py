@@ -284,7 +284,11 @@ def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
     what was done in between. Raises FlightError."""
     with LedgerReader.open(folder.ledger) as ledger:
         count, missing = seals.announced(ledger.facts())
-        reasons = [event.text for event in ledger.events() if event.kind == "opened again"]
+        reasons = [
+            found.facts.get("why")
+            for event in ledger.events()
+            if event.kind == seals.OPENED and (found := event.finding)
+        ]
     last = seals.read(folder).last
     written = 0 if last is None else last.seal
     if reasons[-1:] == [PRUNES] and count > written and count not in missing:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dappled.clock import Clock
-from dappled.findings import json_text, text
+from dappled.findings import text
 from dappled.flight import layout, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import CheckReport
@@ -43,5 +43,5 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
             known = [event.finding for event in ledger.events() if event.kind == seals.CHANGED]
             for one in found.notes:
                 if one not in known:
-                    ledger.add_event(seals.CHANGED, json_text(one))
+                    ledger.add_event(seals.CHANGED, one)
     return flight_check.check(folder.path, key)

@@ -16,7 +16,7 @@ from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.codec import canonical
-from dappled.findings import Code, Subject, finding, json_text
+from dappled.findings import Code, Subject, finding
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
@@ -104,7 +104,7 @@ def note(
         noted = finding(
             Code.FLIGHT_FILES_REMOVED, Subject("flight"), files=len(sure), which=which, there=to, sha256=sha256
         )
-        ledger.add_event(EVENT, json_text(noted))
+        ledger.add_event(EVENT, noted)
     try:
         durable.write_file(folder.path / RECORD, data)
     except OSError as error:

@@ -19,7 +19,7 @@ from typing import Any, Protocol, TypeVar
 
 from dappled import durable, findings
 from dappled.clock import Clock
-from dappled.findings import Code, Finding, Subject, finding
+from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import layout, provenance, recovery, seals
 from dappled.flight.errors import FlightError, disk_error
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
@@ -120,7 +120,7 @@ class Recorder:
 
     def _again(self, first: Frame, camera_name: str, blob: FileBytes, arrived_utc_ns: int) -> Frame:
         if blob.size == first.size and durable.hash_descriptor(blob.fd, blob.size) == first.sha256:
-            self._ledger.add_event("double", f"{camera_name} came again with the same bytes", first.index)
+            self._ledger.add_event("double", finding(Code.FILE_CAME_AGAIN, FRAME, file=camera_name), first.index)
             return first
         why = finding(Code.FILE_SECOND, Subject("file", camera_name), shot=first.index, frame=first.name)
         raise StrayFileError(self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns))
@@ -227,7 +227,8 @@ class Recording:
         names stay as they are; ledger and index hold the correction. Raises FlightError."""
         fact = {"correction_ns": correction_ns, "sigma_ns": sigma_ns, "source": source}
         self.ledger.set_fact("utc_correction", fact)
-        self.ledger.add_event("utc", f"UTC is {correction_ns / 1e9:+.3f} s from this machine's, by {source}")
+        learned = finding(Code.CLOCK_UTC_LEARNED, Subject("clock"), correction_s=correction_ns / 1e9, source=source)
+        self.ledger.add_event("utc", learned)
         began_utc_ns = self.ledger.facts()["began_utc_ns"]
         self.index.add_flight(self.folder.name, began_utc_ns + correction_ns, correction_ns)
 
@@ -291,7 +292,7 @@ def begin(
         stack.callback(journal.close)
         _sync_names(folder)
         for one in recovered:
-            ledger.add_event("recovery", findings.json_text(one))
+            ledger.add_event("recovery", one)
         recorder = Recorder(folder, ledger)
         opened = Recording(
             folder,

@@ -174,7 +174,8 @@ class Stray:
 
 @dataclass(frozen=True, slots=True)
 class LedgerEvent:
-    """Something that happened, as a sentence or a finding's JSON. `index` is the shot's, where there is one."""
+    """Something that happened, as the ledger holds it: the JSON of a finding. `index` is the shot's, where there is
+    one."""
 
     number: int
     utc_ns: int
@@ -184,7 +185,7 @@ class LedgerEvent:
 
     @property
     def finding(self) -> Finding | None:
-        """What was found; None for a sentence."""
+        """What was found; None where that can't be read."""
         return findings.of_json_text(self.text)
 
     @property

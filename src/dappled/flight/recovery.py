@@ -15,7 +15,7 @@ from pathlib import Path
 from dappled import durable, refusals
 from dappled.clock import Clock
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Subject, finding, json_text
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_error
 from dappled.flight.index import ImageIndex
@@ -88,7 +88,7 @@ def recover_flight(folder: FlightFolder, clock: Clock) -> list[Finding]:
             close_ledger(folder, ledger, clock.utc_ns(), None, report)
             report.append(finding(Code.FLIGHT_PUT_RIGHT, FLIGHT))
         for one in report:
-            ledger.add_event("recovery", json_text(one))
+            ledger.add_event("recovery", one)
     return report
 
 

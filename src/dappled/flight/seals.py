@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled import codec, durable, file_lock, findings
+from dappled import codec, durable, file_lock
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
@@ -30,6 +30,7 @@ from dappled.shown import printable
 SEAL = Subject("seal")
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
 BY_OWNER = "signed by its owner"  # why a seal was made that `flight seal` adds
+OPENED = "opened again"  # an event: for what later work
 CHANGED = "changed in between"  # an event: what later work found that was not as the seal before it covers it
 _NAMED = 5
 _BESIDE_LEDGER = ("-wal", "-shm")
@@ -147,11 +148,11 @@ def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | No
     layout.remove_parts(folder)
     last, changed = read(folder).last, changed_since(folder)
     with Ledger(folder.ledger, clock) as ledger:
-        ledger.add_event("opened again", why)
+        ledger.add_event(OPENED, finding(Code.FLIGHT_OPENED_AGAIN, Subject("flight"), why=why))
         if last is not None and changed:
             names, more = printable(", ".join(changed[:_NAMED])), max(0, len(changed) - _NAMED)
             found = finding(Code.SEAL_CHANGED, SEAL, seal=last.seal, names=names, more=f"{more} more" if more else "")
-            ledger.add_event(CHANGED, findings.json_text(found))
+            ledger.add_event(CHANGED, found)
     try:
         yield
     finally:

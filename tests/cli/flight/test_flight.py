@@ -15,7 +15,7 @@ from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.flight import Recording, Result, layout, recording, seal_key, seals
 from dappled.flight.ledger import Ledger
-from tests.flight.makers import deliver, flip, request, tag
+from tests.flight.makers import CARD_FULL, deliver, flip, request, tag
 from tests.standing import failure
 
 START_UTC_NS = 1_795_256_103_000_000_000  # 2026-11-21T10:15:03Z
@@ -239,7 +239,7 @@ def test_what_a_check_notes_before_the_owner_signs_is_noted_ever_after(
     seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), "geotag")
     lines(["seal", *words], capsys)
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
-        ledger.add_event("opened again", "by a stranger")
+        ledger.add_event("opened again", CARD_FULL)
     (closed / "frames" / "000000.xmp").write_bytes(b"<x:forged/>")
     assert any("frames/000000.xmp was changed" in line for line in lines(["check", *words], capsys, 1))
     for verb in ("seal", "check"):

@@ -62,7 +62,7 @@ def test_the_law_of_a_flight_is_written_down_and_read_with_its_recipe(tmp_path: 
     decision = LawDecision("geometric", (1.01, 0.02, -0.02, 1.01), 3, "decoded by the law geometric")
     LedgerWriter(flight, SystemClock()).law_decided(decision)
     (event,) = [event for event in flight.ledger.events() if event.kind == "law"]
-    assert (event.index, event.text) == (3, "decoded by the law geometric")
+    assert (event.index, event.words) == (3, "decoded by the law geometric")
     facts = layout.read_facts(flight.folder)
     made = of_flight(flight.folder.path, facts, {})
     assert made is not None

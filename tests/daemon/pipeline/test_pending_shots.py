@@ -11,6 +11,7 @@ import pytest
 from dappled.daemon.pipeline import capture as module
 from dappled.daemon.pipeline.capture import GIVEN_UP, Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.flight_writer import FlightWriter
+from dappled.findings import Finding
 from dappled.flight import Cause, FlightError, Frame, Shot, Tag
 from tests.daemon.fakes import CallingObserver, FakeCamera, arrival, fired, rig
 from tests.standing import failure
@@ -23,7 +24,7 @@ class Events:
     def __init__(self) -> None:
         self.told: list[str] = []
 
-    def event(self, kind: str, text: str, index: int | None = None) -> None:
+    def event(self, kind: str, found: Finding, index: int | None = None) -> None:
         self.told.append(f"{index} {kind}")
 
 

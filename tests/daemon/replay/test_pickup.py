@@ -17,7 +17,7 @@ from dappled.daemon.replay.pickup import Choice
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.errors import DappledError
-from dappled.findings import Code, of_json_text
+from dappled.findings import Code, Finding
 from dappled.flight import Cause, LedgerReader, Shot, recording
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import request, shot
@@ -78,9 +78,9 @@ class Landed:
         with LedgerReader.open(self.path / "flight.sqlite") as ledger:
             return {frame.index: (self.path / frame.name).read_bytes() for frame in ledger.frames()}
 
-    def events(self, kind: str) -> list[tuple[int | None, str]]:
+    def events(self, kind: str) -> list[tuple[int | None, Finding | None]]:
         with LedgerReader.open(self.path / "flight.sqlite") as ledger:
-            return [(event.index, event.text) for event in ledger.events() if event.kind == kind]
+            return [(event.index, event.finding) for event in ledger.events() if event.kind == kind]
 
 
 def test_a_second_card_that_numbers_from_1_again_is_brought_too(
@@ -102,7 +102,7 @@ def test_a_second_card_that_numbers_from_1_again_is_brought_too(
     assert "note: the camera's memory card was changed" in told.err
     expected = [(card / name).read_bytes() for card in (first, second) for name in names]
     assert flight.frames() == dict(enumerate(expected))
-    (noticed,) = [of_json_text(text) for _, text in flight.events("noticed")]
+    (noticed,) = [found for _, found in flight.events("noticed")]
     assert noticed is not None
     assert noticed.code is Code.CARD_CHANGED
     for card in (first, second):

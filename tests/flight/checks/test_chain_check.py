@@ -15,7 +15,7 @@ from dappled.flight import FlightFolder, Frame, Ledger, Recording, Result, Stray
 from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
 from dappled.flight.tables import KEYS
-from tests.flight.makers import deliver, held, mavlink_2, request, tag, words_of
+from tests.flight.makers import CARD_FULL, deliver, held, mavlink_2, request, tag, words_of
 from tests.standing import STRAY, failure
 
 SEED = 20261122
@@ -166,7 +166,7 @@ def test_a_link_that_does_not_follow_is_named_once(recorded: FlightFolder) -> No
 
 def test_rows_of_a_transaction_that_failed_leave_no_link(tmp_path: Path) -> None:
     with Ledger(tmp_path / "flight.sqlite", RecordedClock(77)) as ledger:
-        ledger.add_event("camera", "it is ready")
+        ledger.add_event("camera", CARD_FULL)
         before = ledger.last_link()
         with pytest.raises(Exception, match="never requested"):
             ledger.safe(Frame(9, "frames/000009.cr2", "A.CR2", 1, "ab", 5))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled import durable, findings
+from dappled import durable
 from dappled.cli.flight import lines as flight_lines
 from dappled.clock import SystemClock
 from dappled.findings import Code, Subject, finding
@@ -161,7 +161,7 @@ def test_counts_with_lost_triggers_do_not_balance(recorded: FlightFolder) -> Non
     where = "noticed at 2026-11-21T10:15:03.2Z near 47.397700, 8.545600"
     lost = finding(Code.TRIGGER_LOST, Subject("trigger", "13 to 15"), first=13, triggers=3, where=where)
     with Ledger(recorded.ledger, SystemClock()) as ledger:
-        ledger.add_event(LOST, findings.json_text(lost))
+        ledger.add_event(LOST, lost)
     counts = flight_report.balance(recorded.path)
     assert (counts.lost, counts.lost_triggers) == (3, (lost,))
     assert not counts.balanced

@@ -11,7 +11,7 @@ from dappled.flight import FlightFolder, LedgerReader, Recording
 from dappled.flight.checks.flight_check import check
 from dappled.flight.logs import BLOCK_BYTES
 from tests.flight.checks.test_chain_check import attacked
-from tests.flight.makers import flip, mavlink_2, words_of
+from tests.flight.makers import CARD_FULL, flip, mavlink_2, words_of
 
 
 @pytest.fixture
@@ -22,8 +22,8 @@ def folder(flight: Recording) -> FlightFolder:
     deadline = time.monotonic() + 60
     while len(flight.telemetry.blocks(0)) < 2 and time.monotonic() < deadline:
         time.sleep(0.01)
-    flight.ledger.add_event("camera", "a row takes the blocks with it")
-    flight.ledger.add_event("camera", "and the next one doesn't again")
+    flight.ledger.add_event("camera", CARD_FULL)  # a row takes the blocks with it
+    flight.ledger.add_event("camera", CARD_FULL)  # and the next one doesn't again
     return flight.folder
 
 

@@ -24,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled import codec, findings
+from dappled import codec
 from dappled.cli import main
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Gnss, Pose, camera_pose, from_euler
@@ -178,7 +178,7 @@ def flown_by_two(root: Path, extra: Extra = nothing_more, doubt: Finding | None 
     made = replace(tag(deliver(begun, 0, b"raw")), utc_ns=START_NS + 5 * 10**9)
     begun.ledger.add_tag(replace(made, pose=replace(pose(), latitude_rad=math.radians(10.0))))
     if doubt:
-        begun.ledger.add_event(kind, findings.json_text(doubt), 0)
+        begun.ledger.add_event(kind, doubt, 0)
     begun.close()
     return begun.folder.path
 

@@ -30,7 +30,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.errors import report, sentence
-from dappled.findings import Code, Finding, Subject, finding
+from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Frame, Shot, Tag
 from dappled.flight.records import DOUBT, LATER_DOUBT, NOTICED
 from dappled.workers import Loop
@@ -236,10 +236,8 @@ class ShotEnds:
         pending.frame = frame
         followed, failed = self.shots.file_came(frame.index)
         if followed:
-            self.note("followed", f"its file has arrived: {name}", frame.index)
+            self.note("followed", finding(Code.FRAME_FOLLOWED, FRAME, file=name), frame.index)
         elif failed:
-            why = "" if pending.problem is None else f": {findings.text(pending.problem)}"
-            self.note("late", f"its file arrived after the shot had failed{why}", frame.index)
             pending.problem = None
             self.shots.add(pending)
         return pending
@@ -254,7 +252,7 @@ class ShotEnds:
 
     def _leave(self, pending: PendingShot, what: str, why: Finding) -> None:
         pending.problem = why
-        self.note(what, findings.json_text(why), pending.shot.index)
+        self.note(what, why, pending.shot.index)
         self.finish(pending)
 
     def finish(self, pending: PendingShot) -> None:
@@ -262,9 +260,9 @@ class ShotEnds:
         if self.shots.remove(pending):
             self.tell(self.observer.finished, pending)
 
-    def note(self, kind: str, text: str, index: int) -> None:
+    def note(self, kind: str, found: Finding, index: int) -> None:
         """Write an event into the record. The pipeline goes on where that fails."""
-        self.tell(self.writer.event, kind, text, index)
+        self.tell(self.writer.event, kind, found, index)
 
     def tell(self, receiver: Callable[..., Any], *facts: object) -> None:
         """Call `receiver`; log its exception instead of raising it."""
@@ -375,9 +373,9 @@ class Capture:
         log.warning("%s", findings.told(found))
         about = found.subject
         if about.kind == "frame" and isinstance(about.which, int):
-            self._writer.event(LATER_DOUBT, findings.json_text(found), about.which)
+            self._writer.event(LATER_DOUBT, found, about.which)
         else:
-            self._writer.event(NOTICED, findings.json_text(found))
+            self._writer.event(NOTICED, found)
 
     def _enter(self, index: int | None) -> None:
         """Write a shot's row before its first event. Raises FlightError; the next event tries again."""
@@ -397,7 +395,7 @@ class Capture:
     def _shot_failed(self, index: int, why: Finding) -> None:
         pending = self._shots.in_hand(index)
         if pending is not None and pending.frame is not None:
-            self._ends.note("contradiction", findings.json_text(why), index)
+            self._ends.note("contradiction", why, index)
             return
         try:
             self._enter(index)
@@ -426,7 +424,7 @@ class Capture:
         pending = self._ends.safe(pending, frame, arrival.name)
         if doubt := arrival.facts.get("doubt"):
             pending.doubt = codec.read(Finding, doubt)
-            self._ends.note(DOUBT, findings.json_text(pending.doubt), frame.index)
+            self._ends.note(DOUBT, pending.doubt, frame.index)
         if pending.fired:
             pending.ms["trigger to file"] = (arrival.monotonic_ns - pending.fired.returned_monotonic_ns) / 1e6
         pending.ms["record"] = (self._clock.monotonic_ns() - began) / 1e6

@@ -11,7 +11,7 @@ from dappled.clock import Clock
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import DECISION, LawDecision
 from dappled.errors import DappledError, report
-from dappled.findings import Code, Finding, Subject, finding, named
+from dappled.findings import FRAME, Code, Finding, Subject, finding, named
 from dappled.flight import Frame, Recording, Result, Shot, Tag
 
 log = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ class FlightWriter(Protocol):
     def decoded(self, result: Result) -> None:
         """A frame's slices are known."""
 
-    def event(self, kind: str, text: str, index: int | None = None) -> None:
+    def event(self, kind: str, found: Finding, index: int | None = None) -> None:
         """Something happened."""
 
 
@@ -67,7 +67,7 @@ class LedgerWriter:
 
     def __init__(self, recording: Recording, clock: Clock) -> None:
         self.recording, self._clock = recording, clock
-        self._later: deque[tuple[str, str]] = deque(maxlen=_LATER)
+        self._later: deque[tuple[str, Finding]] = deque(maxlen=_LATER)
         self._sizes: deque[int] = deque(maxlen=_RECENT)
 
     def requested(self, shot: Shot) -> None:
@@ -133,28 +133,28 @@ class LedgerWriter:
     def law_decided(self, decision: LawDecision) -> None:
         """Write the law that a frame showed into flight.toml, so that replays and products decode as the flight did."""
         self.recording.add_facts({DECISION: codec.plain(decision)})
-        self.event("law", decision.sentence, decision.first)
+        self.event("law", finding(Code.DECODE_LAW_DECIDED, FRAME, why=decision.sentence), decision.first)
 
     def decoded(self, result: Result) -> None:
         """A frame's slices are known."""
         self.recording.ledger.add_result(result)
 
-    def event(self, kind: str, text: str, index: int | None = None) -> None:
+    def event(self, kind: str, found: Finding, index: int | None = None) -> None:
         """Something happened."""
-        self.recording.ledger.add_event(kind, text, index)
+        self.recording.ledger.add_event(kind, found, index)
 
-    def later(self, kind: str, text: str) -> None:
+    def later(self, kind: str, found: Finding) -> None:
         """Take an event from a thread that must not wait for the disk. `write_later` writes the last 1000."""
-        self._later.append((kind, text))
+        self._later.append((kind, found))
 
     def write_later(self) -> None:
         """Write the events taken. Raises FlightError; the next call goes on from there."""
         while self._later:
-            kind, text = self._later.popleft()
+            kind, found = self._later.popleft()
             try:
-                self.event(kind, text)
+                self.event(kind, found)
             except DappledError:
-                self._later.appendleft((kind, text))
+                self._later.appendleft((kind, found))
                 raise
 
     def _index(self, index: int) -> None:

@@ -22,7 +22,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import report, sentence
-from dappled.findings import FRAME, Code, Finding, Subject, finding
+from dappled.findings import FRAME, Code, Finding, Level, Subject, finding
 from dappled.flight import Tag
 from dappled.workers import Statistics, Worker
 
@@ -145,7 +145,8 @@ class Decoding:
             self.worker.put(pending)
         else:
             self._unjudged(pending, "it was not decoded: decoding was switched off")
-            self.ends.note("not decoded", "decoding was switched off", pending.shot.index)
+            off = finding(Code.FRAME_LEFT, FRAME, Level.NOTE, what="not decoded", why="decoding was switched off")
+            self.ends.note("not decoded", off, pending.shot.index)
             self.ends.finish(pending)
 
     def _work(self, pending: PendingShot) -> None:

@@ -16,7 +16,7 @@ from dappled.drivers.raw import reading
 from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.drivers.raw.recipe import camera_name
 from dappled.errors import DappledError, report, sentence
-from dappled.findings import Code, Finding, Subject, finding, json_text, told
+from dappled.findings import FRAME, Code, Finding, Subject, finding, told
 from dappled.flight import Frame, Tag
 from dappled.workers import Worker
 
@@ -159,7 +159,7 @@ class Tagging:
         settings = self._settings(frame)
         if zoomed := self._zoom.look(frame.index, settings.focal_length_mm):
             log.warning("zoom: %s", told(zoomed))
-            self._ends.note("zoom", json_text(zoomed), frame.index)
+            self._ends.note("zoom", zoomed, frame.index)
         exposure, pose = self._poses.pose(frame.index, self._expected(pending, settings))
         # The time of a file that may belong to another shot says nothing about the camera's clock.
         if pending.fired and not pending.doubt and (shown := clocks.camera_time(settings.taken)):
@@ -186,7 +186,8 @@ class Tagging:
         try:
             return FrameSettings.of(reading.read_metadata(self._ends.writer.path(frame)))
         except DappledError as error:
-            self._ends.note("unreadable", str(error), frame.index)
+            found = finding(Code.FILE_UNREADABLE, Subject("file", frame.name), why=str(error))
+            self._ends.note("unreadable", found, frame.index)
             return FrameSettings()
 
     def _expected(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
@@ -209,10 +210,8 @@ class Tagging:
         shown = clocks.camera_time(settings.taken)
         by_camera = shown and clocks.exposure_from_camera(self._camera_clock, *shown, settings.exposure_s)
         if by_camera:
-            self._ends.note(
-                "untimed", "the driver did not report when it fired: the camera's clock is used", shot.index
-            )
+            self._ends.note("untimed", finding(Code.FRAME_UNTIMED, FRAME, by="the camera's clock"), shot.index)
             return by_camera
-        self._ends.note("untimed", "the driver did not report when it fired: the request's time is used", shot.index)
+        self._ends.note("untimed", finding(Code.FRAME_UNTIMED, FRAME, by="the request's time"), shot.index)
         arrived_utc_ns = pending.frame.arrived_utc_ns if pending.frame else None
         return clocks.mid_exposure_by_request(shot.wished_utc_ns, arrived_utc_ns, self._latency, settings.exposure_s)

@@ -20,7 +20,7 @@ from dappled.daemon.replay.vehicle_choice import VehicleError, vehicle_of
 from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
-from dappled.findings import Finding
+from dappled.findings import FRAME, Code, Finding, finding
 from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Tag, layout, seals
 from dappled.flight.seal_key import SealKey
 
@@ -47,10 +47,10 @@ class MissingTagWriter(ReplayVerifier):
             self._ledger.add_tag(tag)
             self.added.append(tag.index)
 
-    def event(self, kind: str, text: str, index: int | None = None) -> None:
+    def event(self, kind: str, found: Finding, index: int | None = None) -> None:
         """Something happened."""
         if index is not None and self._lacks(index) and kind not in self._expected[index].events:
-            self._ledger.add_event(kind, text, index)
+            self._ledger.add_event(kind, found, index)
 
     def _lacks(self, index: int) -> bool:
         one = self._expected[index]
@@ -89,7 +89,7 @@ def add_missing(flight: Path, clock: Clock, key: SealKey | None, vehicle: int | 
         writer = MissingTagWriter(recording, ledger)
         playback.run(recording, writer, ReplayProgress(), flown)
         for index in writer.added:
-            ledger.add_event("tagged late", "the recording ended before it was tagged; it is tagged now", index)
+            ledger.add_event("tagged late", finding(Code.FRAME_TAGGED_LATE, FRAME), index)
     return writer.added
 
 

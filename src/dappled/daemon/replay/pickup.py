@@ -30,7 +30,7 @@ from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding, json_text, text
+from dappled.findings import FRAME, Code, Finding, Level, Subject, finding, text
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
 from dappled.flight.records import DOUBT, NOTICED
@@ -180,13 +180,14 @@ def bring(
         stack.callback(recorder.close)
         for one in proposal.findings:
             if one.code is Code.CARD_CHANGED:
-                ledger.add_event(NOTICED, json_text(one))
+                ledger.add_event(NOTICED, one)
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
-            ledger.add_event("picked up", f"{group.main.name}: {text(proposal.reasons[number])}", number)
+            why = str(text(proposal.reasons[number]))
+            ledger.add_event("picked up", finding(Code.FRAME_PICKED_UP, FRAME, file=group.main.name, why=why), number)
             doubt = next((one for one in proposal.doubts if one.subject == Subject("frame", number)), None)
             if doubt is not None:
-                ledger.add_event(DOUBT, json_text(doubt), number)
+                ledger.add_event(DOUBT, doubt, number)
             for other in group.companions:
                 _accompany(recorder, source, number, other, clock.utc_ns())
                 companions += 1
@@ -202,7 +203,7 @@ def bring(
             index.put(IndexEntry(number, folder.name, frame.name, "safe"))
             if zoomed := zoom.look(number, facts_of.focal_length_mm):
                 zooms.append(zoomed)
-                ledger.add_event("zoom", json_text(zoomed), number)
+                ledger.add_event("zoom", zoomed, number)
             frames.append(frame)
             progress(frame.size)
     return Picked(tuple(frames), companions, tuple(zooms))

@@ -81,9 +81,9 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
         turns, doubt = recorded_vehicles(ledger), recorded_doubt(ledger)
         tags = ledger.tags()
         made_by = ledger.facts().get(f"run:{run}", {}) if run != LIVE else layout.read_facts(flight)
-    texts: dict[int | None, dict[str, str]] = defaultdict(dict)
+    kinds: dict[int | None, set[str]] = defaultdict(set)
     for event in events:
-        texts[event.index][event.kind] = event.text
+        kinds[event.index].add(event.kind)
     doubts = {event.index: event.finding for event in events if event.kind == DOUBT}
     expected, files = [], []
     for row in rows:
@@ -99,7 +99,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 None if result is None else result.slices_sha256,
                 tags.get(index),
                 None if result is None else result.details.get("fingerprint"),
-                frozenset(texts[index]),
+                frozenset(kinds[index]),
             )
         )
         files.append(_file(flight, row, frame, doubts.get(index)))

@@ -13,7 +13,7 @@ from dappled.decode.lightfield.light_field import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Subject, Value, finding
+from dappled.findings import Code, Finding, Subject, Value, finding, text
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
 MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platform does to slices, with room
@@ -139,11 +139,11 @@ class ReplayVerifier:
             hashes = one.slices_sha256, result.slices_sha256
             self._compare(result.index, "slices", hashes, share=self._share(one, result))
 
-    def event(self, kind: str, text: str, index: int | None = None) -> None:
+    def event(self, kind: str, found: Finding, index: int | None = None) -> None:
         """Something happened. An event of a kind that the flight has for this shot too is no difference."""
         if index is not None and kind in self._expected[index].events:
             return
-        self._differ(Code.REPLAY_OTHER_EVENT, "" if index is None else index, kind=kind, text=text)
+        self._differ(Code.REPLAY_OTHER_EVENT, "" if index is None else index, kind=kind, text=str(text(found)))
 
     def verdict(self, *, decoded: bool = True) -> list[Finding]:
         """All differences, and what the replay did not come to compare. `decoded`: whether the flight was decoded as it
