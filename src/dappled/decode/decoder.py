@@ -489,7 +489,7 @@ class MaskDecoder:
             facts,
             made.findings if strange is None else (strange, *made.findings),
             () if place is None else moved(place.periods, place.turn_rad, self.optics.mask.frequency_per_mm),
-            () if place is None or not place.unseen else (finding(Code.MASK_UNSEEN, FRAME, nats=place.nats),),
+            () if place is None or place.seen else (finding(Code.MASK_UNSEEN, FRAME, nats=place.nats),),
         )
 
     def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:

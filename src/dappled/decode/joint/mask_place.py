@@ -10,8 +10,9 @@ a polynomial of few terms, m the differences of orders. Parallax tells δ even w
 
 Without a mask a slice is detail of the scene alone, whose phases are as random as the places of its edges: each patch
 places the mask somewhere, with L(δ) over its mean over all δ as sharply as with a mask. So the odds of one place for
-all patches, against a place for each, say whether there is a mask, whatever the likelihood's scale. A scene without
-parallax, behind an even square stop at the ideal aperture, holds no trace of a mask, and tells none from its absence.
+all patches but an unknown share, against a place for each, say whether there is a mask, whatever the likelihood's
+scale: without a mask they are 1 on average. A scene without parallax, behind an even square stop at the ideal aperture,
+holds no trace of a mask, and tells none from its absence.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.array_types import Complexes, Floats
+from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patch_model import (
     AT_REST,
     KINDS,
@@ -53,10 +54,10 @@ _SURE = 3.0  # standard deviations: patches that are more probable with the move
 _LEAST_NATS = 3.0  # that the median patch must gain
 _LIKELY, _MANY_NATS = 2.0, 30.0  # or both of these: clean frames gain 14 nats at most, moved ones 33 and more
 _AT_EDGE = 0.95  # of the farthest turn: beyond it the best is elsewhere
-_ASTRAY = 0.5  # of the patches may lie in anything that places no mask: edges between depths, no parallax
-_SEEN = 0.0  # nats
+# Of the patches may lie in anything that places no mask, edges between depths or no parallax: any share is as probable.
+_ASTRAY = (np.arange(32) + 0.5) / 32
+_SEEN = 4.6  # nats: without a mask the odds are 1 on average, whatever the scene, and 100 in at most 1 % of frames
 _SEEN_ELSEWHERE = 1.5  # nats of each patch: turned and moved masks have 3 to 5, one 0.3 % off in scale 0.7
-_UNSEEN = 0.25  # of the nats of patches that are all astray: frames without a mask have 0.35 to 1, others up to 0.22
 _OVERLAP = 2.0  # patches that count as one measurement: they overlap by half
 
 
@@ -85,17 +86,12 @@ class MaskPlace:
 
     @property
     def seen(self) -> bool:
-        """Whether a mask there is more probable than none."""
+        """Whether the patches agree on this place: else there is no mask, or nothing has parallax or texture."""
         return self.nats > _SEEN
 
     def nowhere(self, nats: float) -> MaskPlace:
         """It without any move, and with these odds: a turn at the search's edge that led nowhere."""
         return replace(self, periods=(0.0, 0.0), turn_rad=0.0, nats=nats)
-
-    @property
-    def unseen(self) -> bool:
-        """Whether the patches, sharp as they are, agree on no place: there is no mask, or nothing has parallax."""
-        return self.nats < _UNSEEN * _astray(self.patches)
 
     def undone(
         self, slices: Complexes, orders: Sequence[Order], turned: Floats, steps_px: tuple[float, float]
@@ -109,11 +105,6 @@ class MaskPlace:
             for along, side, px in zip(cycles.T, slices.shape[1:], steps_px, strict=True)
         )
         return np.asarray(slices * down[:, :, None] * across[:, None, :])
-
-
-def _astray(patches: int) -> float:
-    """The log odds of so many patches that all lie in what places no mask."""
-    return patches / _OVERLAP * float(np.log(_ASTRAY))
 
 
 def cycles_per_radian(lattice: Lattice, sensor: Sensor) -> Floats:
@@ -143,12 +134,34 @@ def mask_place(
     inner = np.flatnonzero(~patches.at_edges)
     if len(inner) < _FEWEST:
         return None
-    for ranges in ((USUAL,), (USUAL, AT_REST)):  # at rest only where it matters: it costs half as much again
-        differences, terms, used = _terms(
-            slices, model, patches, inner, ranges, samples_px=samples_px, noise=noise, reach=reach, workers=workers
-        )
-        corners = np.array(patches.corners)[used] - SIDE
-        middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
+    cut, means = patches.less_means(patches.cut(slices, inner), model.common()[: len(slices)])
+    contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, patches.window**2)
+    best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
+    spectra = patches.spectra(cut[:, best])
+    both = np.concatenate([noise, noise[1:]])
+    frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=(USUAL,), workers=workers)
+    radius = frame.radius(frame.frequencies)
+    power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
+    spectrum = TexturePower.of(power, radius)
+    own = spectrum.at(radius)
+    strength = (np.abs(spectra[1:, 0]) ** 2 / (own[1:, None] + frame.noise[0])).mean(axis=0)
+    spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
+    corners = np.array(patches.corners)[inner[best]] - SIDE
+    middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
+    place: MaskPlace | None = None
+    likely = -np.inf
+    for some in (USUAL, AT_REST):  # at rest only where it matters: it costs half as much again
+        if some not in frame.ranges:
+            more = FrameModel.of(patches, model, samples_px, both, reach, ranges=(some,), workers=workers)
+            frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
+        kinds = [kind for kind in KINDS if kind.range == some]
+        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), kinds)
+        wholes = wholes_of(frame, rests)
+        found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
+        if found.max() <= likely:
+            break
+        likely = float(found.max())
+        differences, terms = _terms(model.orders, wholes[int(found.argmax())], frame.weights, spectra, workers)
         place = _Likelihood(differences, terms, (middles * np.array(steps_px)) @ turned.T).place()
         if place.seen:
             break
@@ -156,35 +169,12 @@ def mask_place(
 
 
 def _terms(
-    slices: Complexes,
-    model: SliceModel,
-    patches: Patches,
-    inner: NDArray[np.intp],
-    ranges: tuple[int, ...],
-    *,
-    samples_px: tuple[float, float],
-    noise: Floats,
-    reach: float,
-    workers: int,
-) -> tuple[NDArray[np.int64], NDArray[np.complex128], NDArray[np.intp]]:
-    """The differences m (M, 2) of orders, the terms c (N, M) of each patch, and which patches these are."""
-    cut, means = patches.less_means(patches.cut(slices, inner), model.common()[: len(slices)])
-    contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, patches.window**2)
-    best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
-    spectra = patches.spectra(cut[:, best])
-    both = np.concatenate([noise, noise[1:]])
-    frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=ranges, workers=workers)
-    kinds = [kind for kind in KINDS if kind.range in ranges]
-    power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
-    spectrum = TexturePower.of(power, frame.radius(frame.frequencies))
-    own = spectrum.at(frame.radius(frame.frequencies))
-    strength = (np.abs(spectra[1:, 0]) ** 2 / (own[1:, None] + frame.noise[0])).mean(axis=0)
-    spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
-    rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), kinds)
-    wholes = wholes_of(frame, rests)
-    whole = wholes[int(likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1).argmax())]
-    inverse = np.linalg.inv(whole.astype(np.complex128)) * frame.weights[:, None, None]
-    apart = model.orders[:, None] - model.orders[None, :]
+    orders: NDArray[np.int64], whole: Complexes, weights: Singles, spectra: Complexes, workers: int
+) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
+    """The differences m (M, 2) of `orders` (A, 2), and the terms c (N, M) of each patch (F, A, N) whose covariance is
+    the `whole` (F, A, A), by frequencies' `weights` (F,)."""
+    inverse = np.linalg.inv(whole.astype(np.complex128)) * weights[:, None, None]
+    apart = orders[:, None] - orders[None, :]
     differences, place = np.unique(apart.reshape(-1, 2), axis=0, return_inverse=True)
     place = place.reshape(apart.shape[:2])
     terms = np.zeros((spectra.shape[2], len(differences)), dtype=np.complex128)
@@ -192,13 +182,13 @@ def _terms(
     def add(some: slice) -> None:
         here = spectra[:, :, some]
         conjugate = here.conj()
-        for b in range(len(model.orders)):
+        for b in range(len(orders)):
             column = inverse[:, :, b].astype(np.complex64)[:, :, None] * conjugate
             products = np.einsum("fan,fn->na", column, here[:, b])
             terms[some, place[:, b]] -= products  # for one b every a has a difference of its own
 
     each(add, spans(len(terms), _AT_A_TIME), workers)
-    return differences, terms, inner[best]
+    return differences, terms
 
 
 def _tried() -> Floats:
@@ -254,7 +244,9 @@ class _Likelihood:
         mean = most + np.log(np.exp(anywhere - most[:, None]).mean(axis=1))
         at = move[:2] + move[2] * self.turned
         here = (terms * np.exp(2j * np.pi * at @ differences.T)).real.sum(axis=1)
-        return float(np.logaddexp(np.log1p(-_ASTRAY) + here - mean, np.log(_ASTRAY)).sum() / _OVERLAP)
+        placed, astray = np.log1p(-_ASTRAY)[:, None], np.log(_ASTRAY)[:, None]
+        shares = np.logaddexp(placed + here - mean, astray).sum(axis=1) / _OVERLAP
+        return float(np.logaddexp.reduce(shares) - np.log(len(shares)))
 
     def patches(self, move: Floats) -> Floats:
         """(N,) log likelihoods at (ky, kx, radians)."""
