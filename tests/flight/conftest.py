@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from dappled import durable
 from dappled.clock import RecordedClock
 from dappled.flight import Recording, places, recording
 
@@ -24,6 +26,20 @@ def flight(flights: Path) -> Iterator[Recording]:
     yield begun
     if not begun.closed:
         begun.close()
+
+
+@pytest.fixture
+def synced(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, frozenset[str]]]:
+    """Each folder that is made sure of from here on, with the names that stood in it then."""
+    sync = durable.sync_folder
+    done: list[tuple[Path, frozenset[str]]] = []
+
+    def watched(path: Path) -> None:
+        sync(path)
+        done.append((path, frozenset(os.listdir(path))))
+
+    monkeypatch.setattr(durable, "sync_folder", watched)
+    return done
 
 
 @pytest.fixture

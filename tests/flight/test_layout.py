@@ -12,10 +12,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled import durable
 from dappled.confined import OutsideError
 from dappled.findings import Code
 from dappled.flight import FlightError, FlightsLock, layout
 from tests.flight.conftest import START_UTC_NS
+
+
+def test_half_written_files_are_removed_for_good(flights: Path, synced: list[tuple[Path, frozenset[str]]]) -> None:
+    """A name that came back after a power cut would stand in a flight that is closed."""
+    folder = layout.create(flights, START_UTC_NS)
+    part = durable.temporary(folder.frames / "000000.cr2")
+    part.write_bytes(b"half")
+    synced.clear()
+    assert layout.remove_parts(folder) == [part.name]
+    assert synced == [(folder.frames, frozenset())]
 
 
 @pytest.mark.parametrize("link", [os.symlink, os.link])

@@ -178,7 +178,19 @@ def test_a_flight_that_died_while_it_was_made(flights: Path) -> None:
     second.close()
 
 
-def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flight: Recording) -> None:
+def test_the_names_in_a_new_flight_are_sure_when_it_begins(
+    flights: Path, synced: list[tuple[Path, frozenset[str]]]
+) -> None:
+    """The ledger, the telemetry and the journal: a power cut may keep bytes and lose the name that leads to them."""
+    flight = begin_later(flights)
+    begun = {flight.folder.ledger.name, flight.folder.telemetry.name, flight.folder.journal.name}
+    assert any(path == flight.folder.path and begun <= names for path, names in synced)
+    flight.close()
+
+
+def test_a_damaged_ledger_does_not_keep_the_next_flight_down(
+    flights: Path, flight: Recording, synced: list[tuple[Path, frozenset[str]]]
+) -> None:
     request(flight, 4)
     deliver(flight, 4, b"raw")
     flight.close()
@@ -187,6 +199,9 @@ def test_a_damaged_ledger_does_not_keep_the_next_flight_down(flights: Path, flig
     second = begin_later(flights)
     assert second.next_index == 5  # the journal and the frame's name say so
     assert second.recovered[0].code is Code.LEDGER_REBUILT
+    ledger = flight.folder.ledger.name
+    aside = [names for path, names in synced if path == flight.folder.path and ledger not in names]
+    assert any(f"{ledger}.damaged" in names for names in aside)  # sure before another one is made
     assert (flight.folder.path / "frames/000004.cr2").read_bytes() == b"raw"
     second.close()
 

@@ -339,6 +339,17 @@ def test_a_key_is_derived_for_seals_alone(tmp_path: Path) -> None:
     assert secret.hex() not in repr(key)
 
 
+def test_a_signature_counts_whole(tmp_path: Path) -> None:
+    key = seal_key.load(key_file(tmp_path))
+    right = key.sign(b"seal")
+    assert key.signed(b"seal", right)
+    for at in range(len(right)):
+        other = "0" if right[at] != "0" else "1"
+        assert not key.signed(b"seal", right[:at] + other + right[at + 1 :])
+    assert not key.signed(b"seal", right[:-1])
+    assert not key.signed(b"seal", right + "0")
+
+
 def test_a_key_that_others_can_read_is_refused(tmp_path: Path) -> None:
     path = key_file(tmp_path)
     assert path.stat().st_mode & 0o777 == 0o600

@@ -174,6 +174,23 @@ def test_the_autopilots_own_attitude_accuracy_counts() -> None:
     assert math.sqrt(found[0] + found[3] + found[5]) == pytest.approx(0.02)
 
 
+def test_an_unknown_time_is_along_the_turn_in_the_covariance_of_an_attitude() -> None:
+    """It rolls: yaw and pitch are as well known as ever."""
+    link = Link(attitude_sigma_rad=0.02)
+    for step in range(STEPS):
+        link.send(
+            step / 10, mavlink.MAVLink_global_position_int_message(step * 100, 401070457, 1, 0, 0, 500, 0, 200, 0)
+        )
+        rolled = (step * 100, 0.01 * step, 0.0, 0.0, 0.1, 0.0, 0.0)  # ms, rad, rad/s
+        link.send(step / 10, mavlink.MAVLink_attitude_message(*rolled))
+    pose = link.pose(2.04, sigma_ms=500)
+    assert pose.attitude_covariance_rad2 is not None
+    roll, _, _, pitch, _, yaw = pose.attitude_covariance_rad2
+    assert roll - pitch == pytest.approx((0.1 * 0.5) ** 2, rel=0.05)
+    assert pitch == yaw
+    assert math.sqrt(roll + pitch + yaw) == pytest.approx(pose.attitude_sigma_rad)
+
+
 @pytest.mark.parametrize(
     ("roll", "pitch", "yaw", "sigma_rad"),
     [(1e-6, 1e-6, 7e-6, 0.02), (4e-4, 4e-4, 8e-4, 0.04), (0, 0, 9e-4, 0.02), (-1e-6, 9e-4, 9e-4, 0.02)],

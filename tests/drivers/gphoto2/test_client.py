@@ -516,7 +516,7 @@ def _ended(events: list[Any]) -> list[Any]:
     return events
 
 
-@pytest.mark.parametrize("target", ["card", "ram"])
+@pytest.mark.parametrize("target", ["card", pytest.param("ram", marks=pytest.mark.slow)])
 def test_raw_and_jpeg_are_one_frame_and_its_companion(target: str) -> None:
     with (
         SimulatedBody.start(BodyOptions(picture=f"pattern:{SIZE}:cr2", pairs=True)) as body,
@@ -555,7 +555,7 @@ def test_a_slow_transfer_is_waited_for(ready: Make, body: SimulatedBody) -> None
     assert content(arrival) == pattern(1, SIZE)
 
 
-@pytest.mark.parametrize("wanted", ["0000000001", "0000000002"])
+@pytest.mark.parametrize("wanted", [pytest.param("0000000001", marks=pytest.mark.slow), "0000000002"])
 def test_of_two_bodies_of_one_model_the_one_with_the_serial_number_is_taken(wanted: str) -> None:
     numbers = ("0000000001", "0000000002")
     with (
