@@ -24,6 +24,7 @@ from dappled.daemon.pipeline.verdicts import VerdictCounts
 from dappled.decode.geometry import Gnss
 from dappled.drivers.mavlink import mavlink
 from dappled.findings import FRAME, Code, Level, Subject, finding, remedy, told
+from dappled.flight.layout import DiskSpace
 from tests.daemon.health.test_record import HERE, LINK, WELL, S, record
 
 BODY = BodyReport(True, True, (), (), None, 250, "100%", 100, battery_low=False, temperature_c=24.0)
@@ -51,7 +52,10 @@ FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
     "hot battery": (Code.BODY_HOT, {"body": replace(BODY, temperature_c=55.0)}),
     "low disk": (
         Code.DISK_FILLING,
-        {"settings": replace(WELL, record=RecordSettings(warn_free_mb=10**7, min_free_mb=0))},
+        {
+            "settings": replace(WELL, record=RecordSettings()),
+            "space": DiskSpace(64 * 10**9, 62_577 * 10**6, 1_423 * 10**6),
+        },
     ),
     "lost link": (Code.LINK_SILENT, {"link": replace(LINK, last_heard_monotonic_ns=90 * S)}),
     "no camera": (Code.CAMERA_ABSENT, {"state": "absent", "reason": "none is on the bus"}),

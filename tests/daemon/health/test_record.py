@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import reduce
 from pathlib import Path
 from typing import Any, cast
+from unittest import mock
 
 import jsonschema
 import pytest
@@ -26,6 +28,7 @@ from dappled.decode.geometry import Gnss, Pose
 from dappled.drivers.camera import BodyState
 from dappled.drivers.mavlink import LinkStatistics, SigningStatistics
 from dappled.findings import Code, Subject, finding
+from dappled.flight import layout
 from dappled.workers import Worker
 from tests.daemon.fakes import FakeCamera
 from tests.schemas import schema
@@ -63,17 +66,22 @@ def record(
     of_shots = {name: more.pop(name) for name in ("series", "body", "parameters", "overlap") if name in more}
     telemetry = replace(Telemetry().statistics(), positions=more.pop("positions", 0))
     stream = PublisherStatistics({}, {}, 0, 0, 0)
+    disk = mock.patch.object(layout, "disk_space", return_value=more.pop("space")) if "space" in more else nullcontext()
     links = [link, *more.pop("links", ())]
-    return health.record(
-        settings,
-        ServiceTime(1_800_000_000 * S, 101 * S, more.pop("began", 90 * S), more.pop("utc_known", True)),
-        ShootingState(shots, ShutterStatistics(2, 0, 0, 2, 0, 2, None), **of_shots),
-        VehicleState(links, telemetry, more.pop("clock", CLOCK), more.pop("vehicle", HERE), more.pop("battery", None)),
-        KeepingState(folder, [stage.statistics()], stream, more.pop("frame_bytes", None)),
-        decoding=more.pop("decoding", DecodingState(True)),
-        dead_threads=more.pop("dead", ()),
-        **more,
-    )
+    times = ServiceTime(1_800_000_000 * S, 101 * S, more.pop("began", 90 * S), more.pop("utc_known", True))
+    with disk:
+        return health.record(
+            settings,
+            times,
+            ShootingState(shots, ShutterStatistics(2, 0, 0, 2, 0, 2, None), **of_shots),
+            VehicleState(
+                links, telemetry, more.pop("clock", CLOCK), more.pop("vehicle", HERE), more.pop("battery", None)
+            ),
+            KeepingState(folder, [stage.statistics()], stream, more.pop("frame_bytes", None)),
+            decoding=more.pop("decoding", DecodingState(True)),
+            dead_threads=more.pop("dead", ()),
+            **more,
+        )
 
 
 def test_well(tmp_path: Path) -> None:
