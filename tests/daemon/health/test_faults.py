@@ -54,7 +54,7 @@ FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
         Code.DISK_FILLING,
         {
             "settings": replace(WELL, record=RecordSettings()),
-            "space": DiskSpace(64 * 10**9, 62_577 * 10**6, 1_423 * 10**6),
+            "space": DiskSpace(64 * 10**9, 62_577 * 10**6, 1_873 * 10**6),
         },
     ),
     "lost link": (Code.LINK_SILENT, {"link": replace(LINK, last_heard_monotonic_ns=90 * S)}),
