@@ -54,7 +54,8 @@ FAULTS: dict[str, tuple[Code, dict[str, Any]]] = {
         Code.DISK_FILLING,
         {
             "settings": replace(WELL, record=RecordSettings()),
-            "space": DiskSpace(64 * 10**9, 62_577 * 10**6, 1_873 * 10**6),
+            "space": DiskSpace(64 * 10**9, 62 * 10**9, 1_873 * 10**6),
+            "frame_bytes": 11e6,  # an S5200's: of larger ones few fit, which is another finding
         },
     ),
     "lost link": (Code.LINK_SILENT, {"link": replace(LINK, last_heard_monotonic_ns=90 * S)}),
