@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pwd
+import re
 import socket
 import struct
 import time
@@ -28,13 +29,22 @@ if not words_only:
 SERVICE_FOLDER = Path("/run/dappled")  # RuntimeDirectory= of systemd/dappled.service
 
 
+def to_endpoint(text: str) -> str:
+    """One that a stream may have. Raises ValueError."""
+    if not re.fullmatch(r"ipc://.+|tcp://.+:\d+", text):
+        raise ValueError(f"{text!r} is not a ZeroMQ endpoint such as ipc:///run/dappled/slices or tcp://HOST:PORT")
+    return text
+
+
 @dataclass(frozen=True, kw_only=True)
 class ShowStatus(Verb):
     """Show the state of the daemon."""
 
     examples = ("dappled status --config /etc/dappled/dappled.toml",)
 
-    endpoint: str | None = argument("ENDPOINT", "ZeroMQ endpoint of the stream (default: from --config)", default=None)
+    endpoint: str | None = argument(
+        "ENDPOINT", "ZeroMQ endpoint of the stream (default: from --config)", default=None, parse=to_endpoint
+    )
     config: Path | None = option("--config", "the daemon's settings file", None, otherwise="the built-in settings")
     timeout: float = option("--timeout", "how long to wait for a record", 3.0, unit="s", low=0)
     json: bool = flag("--json", "print the health record as it is published")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli.table import words_only
-from dappled.cli.verb import Output, Report, Verb, flag, option
+from dappled.cli.verb import CallError, Output, Report, Verb, flag, option
 from dappled.config import settings
 
 if not words_only:
@@ -70,6 +70,13 @@ class AskForPhotographs(Verb):
     )  # fmt: skip
     key: Path | None = option("--key", "the link's signing key (dappled mavlink key)", None)
     json: bool = flag("--json", "print one JSON object per photograph")
+
+    def check(self) -> None:
+        """Refuse a call that is wrong by itself."""
+        try:
+            parse(self.url or DEFAULT_URL)
+        except LinkError as error:
+            raise CallError(str(error)) from None
 
     def run(self, output: Output) -> Report:
         """Ask for photographs."""

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled.cli.status import stream_endpoint
+from dappled.cli.status import stream_endpoint, to_endpoint
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option
 from dappled.clock import SystemClock
@@ -28,8 +28,11 @@ class WatchStream(Verb):
     notes = "exits 1 if slices were lost, or fewer than --count arrived"
 
     endpoint: str | None = argument(
-        "ENDPOINT", "ZeroMQ endpoint of the stream (default: the daemon's on this machine)", default=None
-    )
+        "ENDPOINT",
+        "ZeroMQ endpoint of the stream (default: the daemon's on this machine)",
+        default=None,
+        parse=to_endpoint,
+    )  # fmt: skip
     config: Path | None = option("--config", "the daemon's settings file, which names the endpoint", None)
     ask: str | None = option(
         "--ask", "endpoint that answers requests", None, metavar="ENDPOINT", otherwise="the one beside an ipc stream",

@@ -158,7 +158,6 @@ def test_design_knows_cover_glass_and_stops(capsys: pytest.CaptureFixture[str]) 
         (["make", "mask-2", "-o", "x.jpg"], "must end in .png or .tif"),
         (["table", "--mask", "mask-2", "--camera", "fujifilm-s5200", "--focal-length", "0.013"], "millimetres"),
         (["design", "--altitude", "40", "--camera", "fujifilm-s5200"], "with --focal-length"),
-        (["plan", "--altitude", "40", "--camera", "reference-36mm", "--speed", "-3"], "ground speed = -3"),
         (["diffraction", "--mask", "mask-2", "--measured", "nowhere.csv"], "nowhere.csv: no such file"),
     ],
 )

@@ -172,19 +172,3 @@ def test_a_plan_by_hand() -> None:
     assert lenses.plan_survey(REFERENCE, focal_length_mm=50, altitude_m=50.05, speed_m_s=5, sideways=True).footprint_m[
         0
     ] == pytest.approx(36.88, rel=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("changed", "said"),
-    [
-        ({"overlap": 80}, "overlap = 80  must lie between 0 and 0.99 ; a share, not percent"),
-        ({"speed_m_s": 0}, "ground speed = 0"),
-        ({"exposure_s": math.inf}, "exposure = inf"),
-        ({"altitude_m": 0}, "distance = 0 m"),
-    ],
-)
-def test_a_wrong_plan_is_answered(changed: dict[str, Any], said: str) -> None:
-    values: dict[str, Any] = {"focal_length_mm": 50.0, "altitude_m": 50.0, "speed_m_s": 5.0}
-    with pytest.raises(DecodeError) as caught:
-        lenses.plan_survey(REFERENCE, **{**values, **changed})
-    assert " ".join(said.split()).replace(" ;", ";") in " ".join(str(caught.value).split()).replace(" ;", ";")

@@ -52,7 +52,7 @@ class InstallationArguments(SensorArguments):
 class AltitudeArguments(SensorArguments):
     """--altitude, and the camera that is flown there."""
 
-    altitude: float = option("--altitude", "height above ground", unit="m")
+    altitude: float = option("--altitude", "height above ground", unit="m", low=1e-3, high=1e6)
     focal_length: float | None = option(
         "--focal-length", "focal length of the lens", None, metavar="MM", otherwise="the camera's, if it has only one",
     )  # fmt: skip

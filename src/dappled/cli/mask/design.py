@@ -9,7 +9,7 @@ from typing import Any
 from dappled import codec
 from dappled.cli.mask.arguments import FILM_NAMES, AltitudeArguments, InstallationArguments, out_of_reach
 from dappled.cli.table import words_only
-from dappled.cli.verb import Output, Overwriting, Report, Verb, option
+from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
 from dappled.findings import told
 
 if not words_only:
@@ -17,6 +17,7 @@ if not words_only:
     from PIL import Image
 
     from dappled.config import profiles
+    from dappled.decode import DecodeError
     from dappled.decode.optics import MaskedOptics, carrier_tables
     from dappled.decode.optics.film import FILMS
     from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
@@ -50,14 +51,15 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.picture)
         profiles.camera(self.camera)
+        if self.mask is None:
+            try:
+                self._wanted()
+            except DecodeError as error:
+                raise CallError(str(error)) from None
 
-    def run(self, output: Output) -> Report:
-        """Design mask, distance and film."""
-        if self.mask:
-            return self._best(self.mask)
+    def _wanted(self) -> DesignRequirements:
         camera, sensor, length = self.camera_set()
-        law = self.law or camera.law
-        wanted = DesignRequirements(
+        return DesignRequirements(
             sensor=sensor,
             focal_length_mm=length,
             f_number=self.f_number,
@@ -71,6 +73,12 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
             least_distance_mm=camera.least_mask_distance_mm or 0.0,
             f_numbers=camera.f_numbers,
         )
+
+    def run(self, output: Output) -> Report:
+        """Design mask, distance and film."""
+        if self.mask:
+            return self._best(self.mask)
+        law, wanted = self.law or profiles.camera(self.camera).law, self._wanted()
         made = DESIGNS[law](wanted)
         instead = None if made.works else buildable(wanted, law)
         if self.picture:

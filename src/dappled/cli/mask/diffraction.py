@@ -28,10 +28,10 @@ class PredictDiffraction(Overwriting, Verb):
     examples = ("dappled mask diffraction --mask mask-1 --measured bench.csv",)
 
     mask: str = option("--mask", "mask profile or TOML file")
-    wavelength: float = option("--wavelength", "wavelength of the laser", 532.0, unit="nm")
-    distance: float = option("--distance", "distance from mask to wall", 0.5842, unit="m")
+    wavelength: float = option("--wavelength", "wavelength of the laser", 532.0, unit="nm", low=200, high=2000)
+    distance: float = option("--distance", "distance from mask to wall", 0.5842, unit="m", low=1e-4, high=100)
     measured: Path | None = option("--measured", "x_mm,y_mm of the measured spots", None, metavar="CSV", there=True)
-    tolerance: float = option("--tolerance", "tolerance of the measurement", 0.5, unit="mm")
+    tolerance: float = option("--tolerance", "tolerance of the measurement", 0.5, unit="mm", low=1e-3, high=100)
     picture: Path | None = option("--picture", "draw what the wall should show", None, metavar="FILE.png")
     image: Path | None = option(
         "--image", "draw it for this mask image (a positive) instead of the design", None, there=True,

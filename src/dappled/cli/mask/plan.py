@@ -30,11 +30,11 @@ class PlanFlight(AltitudeArguments, Verb):
         "dappled mask plan --altitude 40 --speed 8 --camera fujifilm-s5200 --focal-length 13   (the same)",
     )
 
-    speed: float = option("--speed", "speed over ground", unit="m/s")
-    overlap: float = option("--overlap", "overlap along the line", 0.8, metavar="SHARE")
-    sidelap: float = option("--sidelap", "overlap between lines", 0.6, metavar="SHARE")
-    exposure: float = option("--exposure", "exposure time", 0.001, unit="s")
-    hours: float = option("--hours", "flight time", 1.0, unit="h")
+    speed: float = option("--speed", "speed over ground", unit="m/s", low=0.01, high=200)
+    overlap: float = option("--overlap", "overlap along the line, a share", 0.8, metavar="SHARE", low=0, high=0.99)
+    sidelap: float = option("--sidelap", "overlap between lines, a share", 0.6, metavar="SHARE", low=0, high=0.99)
+    exposure: float = option("--exposure", "exposure time", 0.001, unit="s", low=1e-6, high=60)
+    hours: float = option("--hours", "flight time", 1.0, unit="h", above=0.0, high=1000)
     frame_mb: float = option("--frame-mb", "size of a raw file", 18.0, unit="MB", low=1e-3, high=10_000)
     mask: str | None = option("--mask", "mask profile, for what its views and one frame's depth are worth", None)
     f_number: float | None = option(
