@@ -14,13 +14,23 @@ frequency tells which hypotheses a patch may be of; only those are looked at by 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
-from dappled.decode.joint.patch_model import LEAST_NOISE, SIDE, WITHIN, DisparityRange, FrameModel, whitener_of
+from dappled.decode.joint.patch_model import (
+    AT_A_TIME,
+    LEAST_NOISE,
+    SIDE,
+    WITHIN,
+    DisparityRange,
+    FrameModel,
+    whitener_of,
+)
+from dappled.workers import spans
 
 Doubles = NDArray[np.complex128]
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
@@ -96,14 +106,9 @@ class _Hypothesis:
         power = (projected.real**2 + projected.imag**2).reshape(shrunk.shape[1], -1)
         return np.asarray(shrunk @ power - volume[:, None], dtype=np.float64)
 
-    def at(self, few: slice) -> _Hypothesis:
-        """The same at a few frequencies."""
-        return _Hypothesis(self.strength[few], self.rows[few], self.viewed[few])
 
-
-def _each_of(directions: _Directions, beside: Complexes) -> list[_Hypothesis]:
-    """One of each disparity, from `beside` (F, D, R, V·U)."""
-    rows = directions.rows
+def _each_of(rows: Doubles, beside: Complexes) -> list[_Hypothesis]:
+    """One of each disparity, from `rows` (F, D, R, r) and `beside` (F, D, R, V·U)."""
     strength, turn = np.linalg.eigh(rows.conj() @ rows.swapaxes(2, 3))
     strength = np.maximum(strength, 0)
     turned = turn.swapaxes(2, 3)
@@ -135,41 +140,47 @@ def _together(directions: _Directions, beside: Complexes, share: Floats) -> _Hyp
 
 def views_at_any(
     frame: FrameModel, some: DisparityRange, own: Floats, background: PatchBackground, spectra: Complexes
-) -> tuple[Complexes, Floats]:
-    """The views' spectra (F, V·U, N), and their variance (V·U, N) a pixel but for what each has alone, of patches in a
-    range and before a background."""
+) -> Iterator[tuple[slice, Complexes, Floats]]:
+    """The views' spectra (F, V·U, n), and their variance (V·U, n) a pixel but for what each has alone, of patches
+    (F, A, N) in a range and before a background, a few patches at a time."""
     size = np.sqrt(own / len(WITHIN)).astype(np.float32)[:, None, None, None]
     seen = some.seen * size
     alone = seen.reshape(len(seen), -1, seen.shape[3]) @ background.unmixed.swapaxes(1, 2)
     beside = np.asarray(some.viewed * size - alone.reshape(some.viewed.shape), dtype=np.complex64)
     directions = _Directions.of(some, own, background.whitener)
-    single = _each_of(directions, beside)
     low = directions.projector @ spectra
-    gains = _likely_gains(single, low, frame.weights)
+    likely = _likely(directions, low, frame.weights)
+    looked = np.flatnonzero(likely.any(axis=1))
+    single = _each_of(directions.rows[:, looked], beside[:, looked])
+    gains = _gains(single, likely[looked], low, frame.weights)
     _, prior = _weighed(gains, np.full(len(gains), 1 / len(gains)))
-    histogram = prior.reshape(len(single), -1).sum(axis=1)
+    histogram = np.zeros(len(likely))
+    histogram[looked] = prior.reshape(len(single), -1).sum(axis=1)
     together = _together(directions, beside, 0.98 * histogram + 0.02 / len(histogram))
     gains = np.concatenate([gains, together.gains(low, frame.weights)])
     count = len(STRENGTHS)
     odds, _ = _weighed(gains, np.concatenate([0.8 * prior, np.full(count, 0.2 / count)]))
-    moved, variance = _expected(frame, [*single, together], odds, low)
-    moved += background.unmixed @ spectra
-    return moved, variance
+    for few in spans(spectra.shape[2], AT_A_TIME):
+        moved, variance = _expected(frame, [*single, together], odds[:, few], low[:, :, few])
+        moved += background.unmixed @ spectra[:, :, few]
+        yield few, moved, variance
 
 
-def _likely_gains(hypotheses: list[_Hypothesis], low: Complexes, weights: Singles) -> Floats:
-    """(C, N) `gains` of projected patches, −inf where a few frequencies show that a hypothesis is not likely."""
+def _likely(directions: _Directions, low: Complexes, weights: Singles) -> NDArray[np.bool_]:
+    """(D, N) which disparities projected patches (F, r, N) may have, by a few frequencies."""
     few = slice(None, None, _TRIED)
-    shape = len(hypotheses), len(STRENGTHS), low.shape[2]
-    tried = np.concatenate([one.at(few).gains(low[few], weights[few]) for one in hypotheses])
-    tried = tried.reshape(shape)
-    best = tried.max(axis=1)
-    likely = best >= best.max(axis=0) - _LIKELY_NATS
-    gains = np.full(shape, -np.inf)
+    rows = directions.rows[few]
+    no_views = np.zeros((*rows.shape[:3], 0), dtype=np.complex64)
+    best = np.stack([one.gains(low[few], weights[few]).max(axis=0) for one in _each_of(rows, no_views)])
+    return np.asarray(best >= best.max(axis=0) - _LIKELY_NATS)
+
+
+def _gains(hypotheses: list[_Hypothesis], likely: NDArray[np.bool_], low: Complexes, weights: Singles) -> Floats:
+    """(C, N) `gains` of projected patches (F, r, N), −inf where a hypothesis is not `likely` (D, N)."""
+    gains = np.full((len(hypotheses), len(STRENGTHS), low.shape[2]), -np.inf)
     for one, members, found in zip(hypotheses, likely, gains, strict=True):
-        if members.any():
-            found[:, members] = one.gains(low[:, :, members], weights)
-    return gains.reshape(-1, shape[2])
+        found[:, members] = one.gains(low[:, :, members], weights)
+    return gains.reshape(-1, low.shape[2])
 
 
 def _weighed(gains: Floats, prior: Floats) -> tuple[Floats, Floats]:

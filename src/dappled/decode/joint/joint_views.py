@@ -14,6 +14,7 @@ tells which patches have hardly any parallax, and the disparities of the others,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,6 +25,7 @@ from dappled.decode.depth.estimate import estimate
 from dappled.decode.depth.evidence import of_views
 from dappled.decode.joint.any_disparity import PatchBackground, views_at_any
 from dappled.decode.joint.patch_model import (
+    AT_A_TIME,
     BEYOND,
     KINDS,
     MOTIONLESS_RANGE,
@@ -33,10 +35,11 @@ from dappled.decode.joint.patch_model import (
     USUAL,
     USUAL_KINDS,
     FrameModel,
-    LikelyKinds,
     Rests,
     TexturePower,
     is_motionless,
+    likely_kinds,
+    moved_nats,
     rests_of,
     usual_nats,
 )
@@ -46,7 +49,7 @@ from dappled.decode.joint.told_disparity import MOST_STILL, at_rest, shares_of, 
 from dappled.decode.joint.told_patches import ToldPatches, likely_told, write_variance
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.aperture import Aperture
-from dappled.workers import each
+from dappled.workers import each, spans
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
@@ -132,8 +135,10 @@ def joint_views(
         ringing = rings * mean if group[members[0]] == _TEXTURES else np.zeros(len(rings))
         here = replace(frame, noise=frame.noise + ringing**2, astray=float(stray[members[0]]))
         power = (np.abs(patches.spectra(first[:, alike])[:, 0]) ** 2).mean(axis=1)
-        cut, _ = patches.less_means(patches.cut(slices, members), common)
-        found[part] = _Looked.of(here, power, mean, members, patches.spectra(cut))
+        spectra = np.empty((len(frame.frequencies), len(frame.noise), len(members)), dtype=np.complex64)
+        for some in spans(len(members), AT_A_TIME):
+            spectra[:, :, some] = patches.spectra(patches.less_means(patches.cut(slices, members[some]), common)[0])
+        found[part] = _Looked.of(here, power, mean, members, spectra)
 
     each(look, range(len(parts)), workers)
     looked = [found[part] for part in range(len(parts))]
@@ -144,9 +149,7 @@ def joint_views(
     if model.aperture.views >= _FEWEST_VIEWS:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
-        moved = np.concatenate([one.likely.moved for one in looked])
-        motionless = bool(still.mean() > MOST_STILL) and is_motionless(moved)
-        each(lambda one: made.solve_at_rest(one, still, motionless), looked, workers)
+        made.solve_at_rest(looked, still, workers)
         shares = shares_of(depths, frame.ranges[USUAL].disparities, patches)
         shares[still] = 0
         each(lambda one: told.extend(made.told(one, shares)), looked, workers)
@@ -192,14 +195,29 @@ class _PatchViews:
 
     def solve(self, one: _Looked) -> None:
         """With any disparity."""
-        self._solve(one, np.arange(len(one.members)), one.likely.with_parallax, np.ones(len(one.members), dtype=bool))
+        self._solve(one, np.arange(len(one.members)), one.kinds, np.ones(len(one.members), dtype=bool))
 
-    def solve_at_rest(self, one: _Looked, still: NDArray[np.bool_], motionless: bool) -> None:
+    def solve_at_rest(self, looked: Sequence[_Looked], still: NDArray[np.bool_], workers: int) -> None:
         """With hardly any parallax where patches are `still` (N,), and with none that a patch could tell where the
-        frame is `motionless`."""
-        here = np.flatnonzero(still[one.members])
-        moved = (one.likely.moved >= MOVES_NATS) | (not motionless)
-        self._solve(one, here, one.likely.at_rest[here], moved[here])
+        frame is motionless."""
+        resting = [one for one in looked if still[one.members].any()]
+        moved = np.full(len(still), np.inf)
+        if still.mean() > MOST_STILL:
+
+            def ask(one: _Looked) -> None:
+                here = still[one.members]
+                moved[one.members[here]] = moved_nats(one.frame, one.rests, one.spectra[:, :, here])
+
+            each(ask, resting, workers)
+        if not (still.any() and is_motionless(moved[still])):
+            moved[:] = np.inf
+
+        def rest(one: _Looked) -> None:
+            here = np.flatnonzero(still[one.members])
+            kinds = likely_kinds(one.frame, one.rests, one.spectra[:, :, here], with_parallax=False)
+            self._solve(one, here, kinds, moved[one.members[here]] >= MOVES_NATS)
+
+        each(rest, resting, workers)
 
     def _solve(self, one: _Looked, which: NDArray[np.intp], kinds: NDArray[np.intp], moved: NDArray[np.bool_]) -> None:
         """Solve `which` (N,) patches of a part, of these `kinds` (N,); those at rest that have not `moved` (N,) have no
@@ -215,19 +233,19 @@ class _PatchViews:
                     continue
                 some = frame.ranges[MOTIONLESS_RANGE if still else kind.range]
                 members = one.members[chosen]
-                made, found = views_at_any(frame, some, own, background, one.spectra[:, :, chosen])
-                self.windowed[members] = self.patches.images(made) + self.lit[members]
                 self.of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
-                self.variance[:, members] = of_alone * left + of_rest * found
                 self.beyond[members] = kind.range == BEYOND
+                for few, made, found in views_at_any(frame, some, own, background, one.spectra[:, :, chosen]):
+                    self.windowed[members[few]] = self.patches.images(made) + self.lit[members[few]]
+                    self.variance[:, members[few]] = of_alone * left + of_rest * found
 
     def told(self, one: _Looked, shares: Floats) -> list[ToldPatches]:
         """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
-        here = np.isin(one.likely.with_parallax, USUAL_KINDS) & shares[one.members].any(axis=1)
+        here = np.isin(one.kinds, USUAL_KINDS) & shares[one.members].any(axis=1)
         if not here.any():
             return []
         members = one.members[here]
-        spectra, kinds = one.spectra[:, :, here], one.likely.with_parallax[here]
+        spectra, kinds = one.spectra[:, :, here], one.kinds[here]
         found = views_told(one.frame, one.rests, spectra, shares[members])
         gained = found.nats - usual_nats(one.frame, one.rests, kinds, spectra)
         change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
@@ -269,13 +287,13 @@ def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, which kinds they
-    are likely to be, and their `spectra` (F, A, M)."""
+    """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, which `kinds`
+    (M,) with parallax they are likely to be, and their `spectra` (F, A, M)."""
 
     members: NDArray[np.intp]
     frame: FrameModel
     rests: Rests
-    likely: LikelyKinds
+    kinds: NDArray[np.intp]
     spectra: Complexes
 
     @classmethod
@@ -286,4 +304,4 @@ class _Looked:
         radius = frame.radius(frame.frequencies)
         spectrum = TexturePower.of(np.maximum(power - frame.noise[0], 0), radius)
         rests = rests_of(frame, spectrum, spectrum.at(radius), mean)
-        return cls(members, frame, rests, LikelyKinds.of(frame, rests, spectra), spectra)
+        return cls(members, frame, rests, likely_kinds(frame, rests, spectra, with_parallax=True), spectra)

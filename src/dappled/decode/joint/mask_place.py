@@ -156,7 +156,7 @@ def mask_place(
             frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
         kinds = [kind for kind in KINDS if kind.range == some]
         rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), kinds)
-        wholes = wholes_of(frame, rests)
+        wholes = list(wholes_of(frame, rests, range(len(kinds))))
         found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
         if found.max() <= likely:
             break

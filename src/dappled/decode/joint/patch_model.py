@@ -6,7 +6,7 @@ All are covariances of the slices at one spatial frequency, and the patches of a
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import Fold, SliceModel, folded
-from dappled.workers import each
+from dappled.workers import each, spans
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
@@ -64,10 +64,10 @@ KINDS: Sequence[PatchKind] = (
     PatchKind(USUAL, 1.0, 1.0, _ALONE_NATS),
     *(PatchKind(far, beyond, 0.01, (far - USUAL) * _FAR_NATS) for far in (FAR, BEYOND) for beyond in (0.1, 1.0, 4.0)),
 )
-_MOVES = np.array([kind.range != AT_REST for kind in KINDS])
 USUAL_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.nats) == (USUAL, 0)]
 LEAST_NOISE = 1e-12  # variance: what a slice without noise counts as, so that its inverse is finite in double precision
 WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
+AT_A_TIME = 256  # patches: what is worked on stays small
 _TRIED = 3  # of so many frequencies one is looked at to choose the kind
 _UNSURE_NATS = 300.0  # by those: less is no choice
 _HYPOTHESES = 17  # disparities over a range, an eighth of the reach apart
@@ -264,11 +264,16 @@ def detail_of(seen: Complexes, own: Floats) -> Complexes:
     return np.asarray(waves @ waves.conj().transpose(0, 2, 1))
 
 
-def wholes_of(frame: FrameModel, rests: Rests, some: slice = slice(None)) -> list[Complexes]:
-    """Covariances (F, A, A) of slices at some frequencies, one of each kind of patch."""
-    ranges = {kind.range for kind in rests.kinds}
-    details = {number: detail_of(frame.ranges[number].seen[some], rests.own[some]) for number in ranges}
-    return [rests.whole(number, details[kind.range], some) for number, kind in enumerate(rests.kinds)]
+def wholes_of(
+    frame: FrameModel, rests: Rests, numbers: Iterable[int], some: slice = slice(None)
+) -> Iterator[Complexes]:
+    """Covariances (F, A, A) of slices at some frequencies, one of each of these kinds of patch."""
+    details: dict[int, Complexes] = {}
+    for number in numbers:
+        place = rests.kinds[number].range
+        if place not in details:
+            details[place] = detail_of(frame.ranges[place].seen[some], rests.own[some])
+        yield rests.whole(number, details[place], some)
 
 
 def usual_nats(frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra: Complexes) -> Floats:
@@ -296,73 +301,73 @@ def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
 def nats_of(whitener: NDArray[np.complex128], white: Complexes | NDArray[np.complex128]) -> Floats:
     """(F, N) log likelihoods, but for a constant, of patches that the `whitener` (F, A, A) made `white` (F, A, N)."""
     volume = 2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1)
-    return np.asarray(volume[:, None] - (white.real**2 + white.imag**2).sum(axis=1))
+    parts = white.view(white.real.dtype)
+    power = np.einsum("fan,fan->fn", parts, parts).reshape(len(white), -1, 2).sum(axis=2)
+    return np.asarray(volume[:, None] - power)
 
 
-def likelihoods(wholes: list[Complexes], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
+def likelihoods(wholes: Iterable[Complexes], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
     """(B, N) log likelihoods of patches (F, A, N) whose slices have these covariances (F, A, A), by frequencies'
     `weights` (F,)."""
-    found = np.empty((len(wholes), spectra.shape[2]))
+    listed = list(wholes)
+    found = np.empty((len(listed), spectra.shape[2]))
 
     def one(number: int) -> None:
-        whitener = whitener_of(wholes[number])
-        found[number] = weights @ nats_of(whitener, whitener.astype(np.complex64) @ spectra)
+        exact = whitener_of(listed[number])
+        whitener = exact.astype(np.complex64)
+        for some in spans(spectra.shape[2], AT_A_TIME):
+            found[number, some] = weights @ nats_of(exact, whitener @ spectra[:, :, some])
 
-    each(one, range(len(wholes)), workers)
+    each(one, range(len(listed)), workers)
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LikelyKinds:
-    """The most probable kind (N,) of each patch `with_parallax` and `at_rest`, and by how many nats hardly any parallax
-    is more probable than none: `moved` (N,). Which of the two kinds a patch is of, likelihoods tell badly: small
-    parallax, too, is explained better by folded detail in free amounts."""
-
-    with_parallax: NDArray[np.intp]
-    at_rest: NDArray[np.intp]
-    moved: Floats
-
-    @classmethod
-    def of(cls, frame: FrameModel, rests: Rests, spectra: Complexes) -> LikelyKinds:
-        """Of patches (F, A, N) with these `rests_of` their group."""
-        few = slice(None, None, _TRIED)
-        weights = frame.weights[few] * (frame.weights.sum() / frame.weights[few].sum())
-        tried = likelihoods(wholes_of(frame, rests, few), spectra[few], weights)
-        tried -= np.array([[kind.nats] for kind in KINDS])
-        with_parallax, at_rest = (
-            _most_likely(frame, rests, spectra, np.where(chosen[:, None], tried, -np.inf))
-            for chosen in (_MOVES, ~_MOVES)
-        )
-        hardly, not_at_all = (
-            at_rest_nats(frame, some, rests, spectra)
-            for some in (frame.ranges[AT_REST], frame.ranges[MOTIONLESS_RANGE])
-        )
-        return cls(with_parallax, at_rest, hardly - not_at_all)
+def likely_kinds(frame: FrameModel, rests: Rests, spectra: Complexes, *, with_parallax: bool) -> NDArray[np.intp]:
+    """(N,) the most probable kinds of patches (F, A, N) with these `rests_of` their group, of those `with_parallax` or
+    those at rest. Which of the two a patch is of, likelihoods tell badly: small parallax, too, is explained better by
+    folded detail in free amounts."""
+    few = slice(None, None, _TRIED)
+    weights = frame.weights[few] * (frame.weights.sum() / frame.weights[few].sum())
+    numbers = [number for number, kind in enumerate(KINDS) if (kind.range != AT_REST) == with_parallax]
+    tried = likelihoods(wholes_of(frame, rests, numbers, few), spectra[few], weights)
+    tried -= np.array([[KINDS[number].nats] for number in numbers])
+    return np.array(numbers)[_most_likely(frame, rests, numbers, spectra, tried)]
 
 
-def _most_likely(frame: FrameModel, rests: Rests, spectra: Complexes, tried: Floats) -> NDArray[np.intp]:
-    """(N,) the most probable kinds of patches (F, A, N), by the log likelihoods (B, N) of a few frequencies where these
-    are sure of it, else of all."""
+def _most_likely(
+    frame: FrameModel, rests: Rests, numbers: Sequence[int], spectra: Complexes, tried: Floats
+) -> NDArray[np.intp]:
+    """(N,) places in `numbers` (B,) of the most probable kinds of patches (F, A, N), by the log likelihoods (B, N) of a
+    few frequencies where these are sure of it, else of all."""
     likely = tried >= tried.max(axis=0) - _UNSURE_NATS
     likely &= np.count_nonzero(likely, axis=0) > 1
     nats = tried.copy()
     details: dict[int, Complexes] = {}
-    for number in map(int, np.flatnonzero(likely.any(axis=1))):
-        kind, here = rests.kinds[number], likely[number]
+    for place in map(int, np.flatnonzero(likely.any(axis=1))):
+        number, here = numbers[place], likely[place]
+        kind = rests.kinds[number]
         if kind.range not in details:
             details[kind.range] = detail_of(frame.ranges[kind.range].seen, rests.own)
         whole = rests.whole(number, details[kind.range])
-        nats[number, here] = likelihoods([whole], spectra[:, :, here], frame.weights)[0] - kind.nats
+        nats[place, here] = likelihoods([whole], spectra[:, :, here], frame.weights)[0] - kind.nats
     unsure = likely.any(axis=0)
     return np.asarray(np.where(unsure, np.where(likely, nats, -np.inf).argmax(axis=0), tried.argmax(axis=0)))
 
 
+def moved_nats(frame: FrameModel, rests: Rests, spectra: Complexes) -> Floats:
+    """(N,) by how many nats hardly any parallax is more probable than none in patches (F, A, N)."""
+    hardly, not_at_all = (
+        _at_rest_nats(frame, frame.ranges[number], rests, spectra) for number in (AT_REST, MOTIONLESS_RANGE)
+    )
+    return hardly - not_at_all
+
+
 def is_motionless(moved: Floats) -> bool:
-    """Whether a frame without parallax has none that any patch could tell: by `LikelyKinds.moved` of all patches."""
+    """Whether a frame without parallax has none that any patch could tell: by `moved_nats` of its patches."""
     return float(np.median(moved)) < _MOVED_NATS
 
 
-def at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra: Complexes) -> Floats:
+def _at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra: Complexes) -> Floats:
     """(N,) log likelihoods of patches (F, A, N) whose disparities are in a range next to 0.
 
     Each slice then holds what is common to all views, and detail that folds in, in an amount of its own at each
@@ -377,19 +382,23 @@ def at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra:
     varied = once - base + moved
     found = np.zeros((len(_USUAL_AMOUNTS), spectra.shape[2]))
     for number, turn in enumerate(common):
-        left = spectra[:, number] - (np.complex64(turn) * spectra[:, 0] if number else 0)
-        power = left.real**2 + left.imag**2
         sizes = [(base + amount * varied)[:, number, None].astype(np.float32) for amount in (*_USUAL_AMOUNTS, *_MORE)]
-        nats = [-np.log(size) - power / size for size in sizes]
-        for usual in range(len(found)):
-            amounts = np.stack([nats[usual], *nats[len(found) :]])
-            found[usual] += frame.weights @ _mean_of_odds(amounts, 1 - _SELDOM)
+        volumes = [-np.log(size) for size in sizes]
+        for some_patches in spans(spectra.shape[2], AT_A_TIME):
+            left = spectra[:, number, some_patches]
+            if number:
+                left = left - np.complex64(turn) * spectra[:, 0, some_patches]
+            power = left.real**2 + left.imag**2
+            nats = np.stack([volume - power / size for volume, size in zip(volumes, sizes, strict=True)])
+            found[:, some_patches] += np.tensordot(_means_of_odds(nats), frame.weights, axes=(1, 0))
     return np.asarray(found.max(axis=0))
 
 
-def _mean_of_odds(nats: Singles, first: float) -> Singles:
-    """(F, N) log likelihoods where each frequency may be of any of some kinds (B, F, N): mostly of the `first`."""
-    rest = len(nats) - 1
-    odds = np.array([first] + [(1 - first) / rest] * rest)
+def _means_of_odds(nats: Singles) -> Singles:
+    """(usual, F, N) log likelihoods where each frequency has any of these amounts (B, F, N): mostly one of the usual
+    ones, which come first."""
+    usual = len(_USUAL_AMOUNTS)
     top = nats.max(axis=0)
-    return np.asarray(top + np.log(np.tensordot(odds.astype(np.float32), np.exp(nats - top), axes=1)))
+    odds = np.exp(nats - top)
+    seldom = np.float32(_SELDOM / len(_MORE)) * odds[usual:].sum(axis=0)
+    return np.asarray(top + np.log(np.float32(1 - _SELDOM) * odds[:usual] + seldom))
