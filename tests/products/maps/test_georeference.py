@@ -347,7 +347,7 @@ def tagged(sha256: str, index: int) -> Tag:
         (["--as", "difference"], "--against FLIGHT go together"),
         (["--terrain", __file__, "--terrain-heights", "ellipsoid", "--geoid", "no.gtx"], "no geoid grid no.gtx"),
         (["--refine", "a.tif", "b.tif", "--frames", "0"], "one base map"),
-        (["--view", "9,9", "--frames", "0"], "there is no view 9,9"),
+        pytest.param(["--view", "9,9", "--frames", "0"], "there is no view 9,9", marks=pytest.mark.slow),
         (["--mount", *"110010001"], "is not a rotation"),
         (["--between", "9", "3"], "the lower height comes first"),
     ],
@@ -435,6 +435,7 @@ def test_views_need_an_f_number(decoded: tuple[Station, LightField, CameraProfil
     photographs.photograph(unknown, silent, profile, PROJECTION)
 
 
+@pytest.mark.slow
 def test_one_view_is_seen_from_aside(short_flight: Flown, tmp_path: Path) -> None:
     more = ["--view", "0,4", "--as", "kmz", "--frames", "0", "--each", "--quad"]
     assert main(words(short_flight, tmp_path / "v", *more)) == 0
