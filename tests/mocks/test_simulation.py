@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -14,8 +15,9 @@ from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.decode.optics import LAWS
 from dappled.errors import DappledError
-from dappled.mocks.scene.masked_camera import eos450d_camera, eos450d_f_number
-from dappled.mocks.simulation import SimulatedCamera, World
+from dappled.mocks.autopilot.path import FlightPath
+from dappled.mocks.scene.masked_camera import eos450d_camera, eos450d_f_number, reference_camera
+from dappled.mocks.simulation import SimulatedCamera, World, overlapping_m_s
 
 
 def settings(camera: str, mask: str) -> Settings:
@@ -52,6 +54,16 @@ def test_a_mask_that_cannot_be_simulated_is_one_sentence(tmp_path: Path) -> None
     (tmp_path / "coarse.toml").write_text("frequency_per_mm = 0.5\n")
     with pytest.raises(DappledError, match=r"^mask\.profile '.*coarse\.toml' can't be simulated: carriers 0\.00"):
         SimulatedCamera("canon-eos-450d", str(tmp_path / "coarse.toml")).on_a_bench(World())
+
+
+@pytest.mark.parametrize("bench_s", [0.3, 1.0, 10.0])
+def test_frames_overlap_on_a_slow_computer_too(bench_s: float) -> None:
+    path = FlightPath(1, speed_m_s=overlapping_m_s(bench_s))
+    between_s = 4 * bench_s  # twice as long as usual
+    camera = reference_camera(1, scale=World().scale, scene="white")
+    seen_m = camera.sensor.shape[0] * camera.sensor.pitch_mm / camera.optics.focal_length_mm * path.height_m
+    apart_m = math.dist(*(path.pose(at_s).position_ned_m[:2] for at_s in (0.0, between_s)))
+    assert apart_m < 0.6 * seen_m
 
 
 @pytest.mark.long

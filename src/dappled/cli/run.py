@@ -99,7 +99,7 @@ class RunDaemon(SettingsArgument, Verb):
                 settings, record=replace(settings.record, directory=str(configuration.SIMULATED_FLIGHTS.absolute()))
             )
         with tempfile.TemporaryDirectory(prefix="dappled-") as folder:
-            world = World(seed=self.seed, autopilot=self.simulate == _ALL, real=True)
+            world = World(seed=self.seed, autopilot=self.simulate == _ALL, real=True, overlapping=True)
             simulation = Simulation(world, settings, Path(folder))
             remark(f"simulating {simulation.rig}{', an autopilot' if world.autopilot else ''} and a ground station")
             with simulation as simulated:

@@ -29,6 +29,7 @@ from dappled.drivers.raw import reading
 from dappled.errors import DappledError
 from dappled.mocks.autopilot.autopilot import Autopilot, BootTime
 from dappled.mocks.autopilot.ground_station import GroundStation
+from dappled.mocks.autopilot.path import SPEED_M_S
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.scene.masked_camera import MaskedCamera, eos450d_camera, eos450d_f_number, reference_camera
 
@@ -40,7 +41,9 @@ class World:
     """What is simulated. `scale` is the sensor's side as a share of the reference camera's 2776 × 3688 px; `f_number`
     0 opens the lens, None stops it down until carriers show; `truth`, for tests, is a folder for the true values.
     `real`: with a round stop, a film printed 0.3 % too fine, and ground whose detail does not end with a slice's band.
-    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in software in the loop."""
+    `overlapping`: the vehicle flies so slowly that frames overlap, however long this computer takes for each.
+    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in
+    software in the loop."""
 
     seed: int = 1
     scale: float = 0.5
@@ -48,8 +51,11 @@ class World:
     truth: Path | None = None
     autopilot: bool = True
     real: bool = False
+    overlapping: bool = False
 
 
+_APART_M = 1.6  # of frames that see 5.6 m along the way
+_FRAME_BENCHES = 2.0  # a frame of the ground takes so many times as long as the bench's with its calibration
 _ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
 
 
@@ -97,12 +103,16 @@ class Simulation:
         self._autopilot_port, self._ground_port = free_port(), free_port()
         self._settings, self._folder = settings, folder
         self.rig = SimulatedCamera.of(settings)
+        self._speed_m_s = SPEED_M_S
 
     def __enter__(self) -> Settings:
         """Start camera body and autopilot; returns the settings that make a daemon use them."""
         world, rig = self.world, self.rig
         camera = rig.on_a_bench(world)
+        began_ns = time.monotonic_ns()
         calibration = write_calibration(camera, self._folder, rig.profile, rig.mask)
+        if world.overlapping:
+            self._speed_m_s = overlapping_m_s((time.monotonic_ns() - began_ns) / 1e9)
         stop = rig.f_number(camera) if world.f_number is None else world.f_number or None
         with ExitStack() as stack:
             self.body = body = SimulatedBody.start(
@@ -115,6 +125,7 @@ class Simulation:
                     start_monotonic_ns=self.start_monotonic_ns,
                     truth=world.truth,
                     real=world.real,
+                    speed_m_s=self._speed_m_s,
                 )
             )
             stack.callback(body.stop)
@@ -171,6 +182,7 @@ class Simulation:
             seed=self.world.seed,
             start_monotonic_ns=self.start_monotonic_ns,
             booted_s=booted_s,
+            more=[f"--speed={self._speed_m_s}"],
         )
 
     def _stop_autopilot(self) -> None:
@@ -181,6 +193,12 @@ class Simulation:
         station = GroundStation.start(self.ground_url, frames, interval_s)
         self._stack.callback(station.stop)
         return station
+
+
+def overlapping_m_s(bench_s: float) -> float:
+    """The speed at which frames of the ground overlap, on a computer that took so long for the bench's frame and its
+    calibration."""
+    return min(SPEED_M_S, _APART_M / (_FRAME_BENCHES * bench_s))
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_DGRAM) -> int:

@@ -10,6 +10,7 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
+from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.body.body import BodyError, BodyOptions, SimulatedBody, pattern, pictures
 
 
@@ -97,7 +98,7 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     renderer = ModuleType("dappled.mocks.scene.masked_camera")
     renderer.__dict__["reference_camera"] = Camera
     monkeypatch.setitem(sys.modules, "dappled.mocks.scene.masked_camera", renderer)
-    options = BodyOptions(seed=9, scale=0.5, start_monotonic_ns=1_000_000_000, truth=tmp_path)
+    options = BodyOptions(seed=9, scale=0.5, start_monotonic_ns=1_000_000_000, truth=tmp_path, speed_m_s=0.8)
     assert pictures(replace(options, f_number=14.8)).exposure_s == 0.02
     asked.clear()
     source = pictures(options)
@@ -108,7 +109,8 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     assert isinstance(wanted, dict)
     now_t_s = time.time() - wanted.pop("epoch_utc_s")  # the epoch is the wall clock's time at the simulation's start
     assert abs(now_t_s - (time.monotonic_ns() - 1_000_000_000) / 1e9) < 5.0
-    assert wanted == {"scale": 0.5, "scene": "terrain", "law": "geometric", "real": False}
+    path = FlightPath(9, speed_m_s=0.8)
+    assert wanted == {"scale": 0.5, "scene": "terrain", "law": "geometric", "path": path, "real": False}
     assert asked[1] == (2.5, 4)
     assert (tmp_path / "000004.npz").read_bytes() == b"truth"
     times = json.loads((tmp_path / "000004.json").read_text())

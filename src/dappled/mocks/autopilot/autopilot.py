@@ -25,7 +25,7 @@ from dappled.clock import Clock, SystemClock, TimeOfDayClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.drivers.python_command import python_module
 from dappled.mocks.autopilot.on_request import OnRequest
-from dappled.mocks.autopilot.path import FlightPath, TruePose
+from dappled.mocks.autopilot.path import SPEED_M_S, FlightPath, TruePose
 from dappled.mocks.autopilot.personality import PERSONALITIES, CameraPort, CameraTriggers
 from dappled.workers import Loop
 
@@ -362,6 +362,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--battery", type=float, default=96.0, help="percent left at the flight's beginning")
     parser.add_argument("--gimbal", action="store_true", help="it has a gimbal, and sends its attitude on request")
     parser.add_argument("--ground", type=float, help="ground above the take-off place, m, for a rangefinder")
+    parser.add_argument("--speed", type=float, default=SPEED_M_S, help="m/s over ground")
     parser.add_argument("--forward", action="store_true", help="forward between its ports, as ArduPilot does")
     parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
     wanted = parser.parse_args(arguments)
@@ -369,7 +370,8 @@ def main(arguments: list[str] | None = None) -> int:
     links = MavlinkLinks(wanted.url, system_id=wanted.system_id, component_id=1, clock=SystemClock())
     boot = BootTime(wanted.booted, wanted.drift, tuple(wanted.jump))
     cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
-    flyer = Flyer(FlightPath(wanted.seed), start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
+    path = FlightPath(wanted.seed, speed_m_s=wanted.speed)
+    flyer = Flyer(path, start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
     flyer.has, flyer.arms_s = OnRequest(wanted.gimbal, wanted.battery, wanted.ground), wanted.arms
     if wanted.forward:
         flyer.relay = PortRelay(len(wanted.url), links.sender.send)

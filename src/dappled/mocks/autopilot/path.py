@@ -15,6 +15,7 @@ import numpy as np
 
 from dappled.decode.geometry import Quaternion, Vector3
 
+SPEED_M_S = 4.0
 _EQUATOR_M, _FLATTENING = 6378137.0, 1 / 298.257223563  # WGS 84
 
 
@@ -45,7 +46,7 @@ class FlightPath:
     home_longitude_deg: float = -91.5417
     home_altitude_msl_m: float = 203.0
     height_m: float = 20.0
-    speed_m_s: float = 4.0
+    speed_m_s: float = SPEED_M_S
     radius_m: float = 25.0
 
     def pose(self, t_s: float) -> TruePose:

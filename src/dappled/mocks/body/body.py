@@ -52,7 +52,8 @@ class BodyOptions:
     000001.json). `delay_s`: how long a pattern or
     file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
     body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has. `real`: as
-    `reference_camera` has it. `bind`: where on this machine it answers; `usbip`: over USB/IP, not PTP/IP.
+    `reference_camera` has it. `speed_m_s`: of the vehicle (None: the path's own). `bind`: where on this
+    machine it answers; `usbip`: over USB/IP, not PTP/IP.
     """
 
     picture: str = "simulated"
@@ -71,6 +72,7 @@ class BodyOptions:
     pairs: bool = False
     addresses: int = 1
     real: bool = False
+    speed_m_s: float | None = None
     bind: str = "127.0.0.1"
     usbip: bool = False
     faults: tuple[str, ...] = ()
@@ -92,6 +94,7 @@ class BodyOptions:
             "--card-bytes": self.card_bytes,
             "--clock-offset": self.clock_offset_s,
             "--addresses": self.addresses,
+            "--speed": self.speed_m_s,
             "--bind": self.bind,
         }
         given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
@@ -247,6 +250,9 @@ def _simulated(options: BodyOptions) -> Pictures:
     # Imported here: they load NumPy and the whole renderer, which a body that shows patterns doesn't need.
     start_ns = time.monotonic_ns() if options.start_monotonic_ns is None else options.start_monotonic_ns
     epoch_utc_s = time.time() + options.clock_offset_s - (time.monotonic_ns() - start_ns) / 1e9
+    from dappled.mocks.autopilot.path import SPEED_M_S, FlightPath  # noqa: PLC0415  # reason above
+
+    path = FlightPath(options.seed, speed_m_s=options.speed_m_s or SPEED_M_S)
     if options.mask:
         from dappled.config import profiles  # noqa: PLC0415  # reason above
         from dappled.mocks.scene.masked_camera import eos450d_camera  # noqa: PLC0415  # reason above
@@ -255,6 +261,7 @@ def _simulated(options: BodyOptions) -> Pictures:
             options.seed,
             profiles.mask(options.mask).mask,
             scene=options.scene,
+            path=path,
             epoch_utc_s=epoch_utc_s,
             real=options.real,
         )
@@ -266,6 +273,7 @@ def _simulated(options: BodyOptions) -> Pictures:
             scale=options.scale,
             scene=options.scene,
             law=options.law,
+            path=path,
             epoch_utc_s=epoch_utc_s,
             real=options.real,
         )
@@ -331,6 +339,7 @@ def _options(arguments: Sequence[str] | None) -> BodyOptions:
     parser.add_argument("--bind", default="127.0.0.1", help="address of this machine at which it answers")
     parser.add_argument("--usbip", action="store_true", help="answer over USB/IP, not PTP/IP")
     parser.add_argument("--real", action="store_true", help="a round stop, a print error, detail beyond a slice's band")
+    parser.add_argument("--speed", dest="speed_m_s", type=float, help="m/s over ground")
     parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
     found = vars(parser.parse_args(arguments))
     return BodyOptions(**{**found, "faults": tuple(found["faults"])})
