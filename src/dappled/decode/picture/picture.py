@@ -42,7 +42,7 @@ def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPi
     plane, sigma = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     trusted = np.zeros(shape, dtype=bool)
     dark = samples = 0
-    sharp = []
+    sharp, shadows = [], []
     for place in mosaic.places():
         known, values = shadow.at(place), mosaic.plane[place.cut]
         made = values / known
@@ -54,13 +54,14 @@ def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPi
             made = np.asarray(np.where(good, made, np.maximum(made, around)), dtype=np.float32)
             sound &= good
         base, slope = (np.float32(one) for one in noise_of(made, known))
-        light = np.maximum(base + slope * values, base) / (known * known)
-        variance = light + (made * np.float32(shadow.sigma[place.colour]) / known) ** 2
         trusted[place.cut] = sound
-        sharp.append(Sharp(place, made, made * known, variance))
+        # The shadow's error is far below the detail that a block holds at its carriers: no noise to be filtered.
+        sharp.append(Sharp(place, made, made * known, np.maximum(base + slope * values, base) / (known * known)))
+        shadows.append(known)
     shown = mixed(sharp, mosaic.pattern != EMPTY, shadow)
-    for one, image, variance in zip(sharp, shown.pictures, shown.variances, strict=True):
-        plane[one.place.cut], sigma[one.place.cut] = image, np.sqrt(variance)
+    for one, known, image, variance in zip(sharp, shadows, shown.pictures, shown.variances, strict=True):
+        off = image * np.float32(shadow.sigma[one.place.colour]) / known
+        plane[one.place.cut], sigma[one.place.cut] = image, np.sqrt(variance + off * off)
     return UnmaskedPicture(plane, mosaic.pattern, sigma, trusted, shadow, dark / max(samples, 1), shown.soft_share)
 
 

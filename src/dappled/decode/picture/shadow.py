@@ -405,33 +405,53 @@ class _Equations:
             trust = np.clip(1 - variance / np.maximum(np.abs(c) ** 2, 1e-30), 0, 1)
             coefficients.append((c * trust)[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
             sigmas.append(math.sqrt(2 * float(((trust * variance)[half] @ (terms**2).mean(axis=0)).sum())))
-        return Shadow(
+        made = Shadow(
             self.shape, self.at, self.orders, np.array(coefficients), degree, ShadowFrom.FRAME, np.array(sigmas)
         )
+        return replace(made, sigma=np.sqrt(made.sigma**2 + self.displaced(made)))
 
     def lattice(self) -> Lattice | None:
         """The lattice that the phases of the blocks agree on best, by one Gauss–Newton step; None where it is so near
         that nothing changes."""
-        half, count = np.array(self.orders, dtype=np.float64), len(self.orders)
-        normal, right = np.zeros((4 + count, 4 + count)), np.zeros(4 + count)
-        bins = np.repeat(1 / np.array(self.shape), 2)  # δ as rows (ky, kx) of columns (y, x), in columns y y x x
-        for colour, weights in enumerate(self.weights):
-            c = self._solved(colour, weights, 0)[0][1 : count + 1, 0]
-            own = self.gram[colour][:, 0, 0].real
-            for k, order in enumerate(half):
-                turned = weights * (np.conj(c[k]) * self.right[colour][:, k + 1]).imag
-                sure = weights * own * abs(c[k]) ** 2
-                lever = 2 * np.pi * np.column_stack([self.centres[:, [0]] * order, self.centres[:, [1]] * order]) * bins
-                normal[:4, :4] += (lever * sure[:, None]).T @ lever
-                normal[:4, 4 + k] += lever.T @ sure
-                normal[4 + k, 4 + k] += sure.sum()
-                right[:4] += lever.T @ turned
-                right[4 + k] += turned.sum()
-        normal[4:, :4] = normal[:4, 4:].T
-        normal += np.diag([*[1 / _FOUND_BINS**2] * 4, *[1e-9] * count])
-        step = np.linalg.solve(normal, right)[:4]
+        step, _ = self._lattice_step
         if float(np.abs(step).max()) < _STILL_BINS:
             return None
-        delta = (step * bins).reshape(2, 2).T  # rows ky, kx
+        delta = (step.reshape(2, 2) / np.array(self.shape)[:, None]).T  # rows ky, kx
         (a, b), (c2, d) = self.at.matrix() + delta
         return Lattice((float(a), float(b)), (float(c2), float(d)))
+
+    @cached_property
+    def _lattice_step(self) -> tuple[Floats, Floats]:
+        """(4,) how far the lattice lies off, in bins of rows of ky and kx, of columns of ky and kx; and (4, 4) the
+        covariance of its error, by the scatter between blocks."""
+        half, count = np.array(self.orders, dtype=np.float64), len(self.orders)
+        normal, scores = np.zeros((4 + count, 4 + count)), np.zeros((len(self.centres), 4 + count))
+        levers = 2 * np.pi * np.einsum("bd,kj,d->bkdj", self.centres, half, 1 / np.array(self.shape))
+        levers = levers.reshape(len(self.centres), count, 4)
+        parts = []
+        for colour, weights in enumerate(self.weights):
+            c = self._solved(colour, weights, 0)[0][1 : count + 1, 0]
+            turned = weights[:, None] * (c.conj() * self.right[colour][:, 1 : count + 1]).imag
+            sure = (weights * self.gram[colour][:, 0, 0].real)[:, None] * np.abs(c) ** 2
+            parts.append(sure)
+            normal[:4, :4] += np.einsum("bki,bk,bkj->ij", levers, sure, levers)
+            normal[:4, 4:] += np.einsum("bki,bk->ik", levers, sure)
+            normal[4:, 4:] += np.diag(sure.sum(axis=0))
+            scores[:, :4] += np.einsum("bki,bk->bi", levers, turned)
+            scores[:, 4:] += turned
+        normal[4:, :4] = normal[:4, 4:].T
+        normal += np.diag([*[1 / _FOUND_BINS**2] * 4, *[1e-9] * count])
+        inverse = np.linalg.inv(normal)
+        step = inverse @ scores.sum(axis=0)
+        sure = np.sum(parts, axis=0)
+        left = scores.copy()
+        left[:, :4] -= np.einsum("bki,bk->bi", levers, sure * (levers @ step[:4] + step[4:]))
+        left[:, 4:] -= sure * (levers @ step[:4] + step[4:])
+        errors = left @ inverse[:, :4]
+        return step[:4], np.asarray(errors.T @ errors)
+
+    def displaced(self, shadow: Shadow) -> Floats:
+        """(colours,) the variance over the frame that the lattice's error makes of a shadow's W."""
+        half, error = np.array(shadow.orders, dtype=np.float64), self._lattice_step[1]
+        turns = np.einsum("ki,ij,kj->k", half, error[:2, :2] + error[2:, 2:], half) * (2 * np.pi) ** 2 / 12
+        return np.asarray(2 * (np.abs(shadow.coefficients[:, :, 0]) ** 2 @ np.minimum(turns, 1)))
