@@ -173,6 +173,19 @@ def _terms(places: Floats, shape: tuple[int, int], degree: int) -> Floats:
     return np.stack([y**a * x**b for a, b in _powers(degree)], axis=1)
 
 
+def _alike(found: Coefficients, variance: Floats) -> tuple[Coefficients, Floats]:
+    """Coefficients (colours, K, terms), drawn towards the mean of the colours as far as they differ by no more than
+    their errors; and their variances. What the colours have in common of the scene errs in all of them alike."""
+    sure = 1 / np.maximum(variance, 1e-30)
+    whole = sure.sum(axis=0)
+    mean = (sure * found).sum(axis=0) / whole
+    apart = (sure * np.abs(found - mean) ** 2).sum(axis=0) - (len(found) - 1)
+    differing = np.maximum(apart, 0) / np.maximum(whole - (sure**2).sum(axis=0) / whole, 1e-30)
+    own = differing / (differing + np.maximum(variance, 1e-30))
+    together = (np.sqrt(sure).sum(axis=0) / whole) ** 2
+    return mean + own * (found - mean), np.minimum(together + own * variance, variance)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Means:
     """A mosaic with the local means of each place's samples."""
@@ -394,20 +407,21 @@ class _Equations:
     def fitted(self, degree: int) -> Shadow:
         """The frame's own shadow; each term is trusted as far as it stands above its error between blocks."""
         half = slice(1, len(self.orders) + 1)
-        coefficients, sigmas = [], []
+        found, spread = [], []
+        terms = self._terms(degree)
         for colour, weights in enumerate(self.weights):
             c, inverse = self._solved(colour, weights, degree)
-            local, terms = self._local(c, degree), self._terms(degree)
+            local = self._local(c, degree)
             image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
             scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
             errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
-            variance = (np.abs(errors) ** 2).sum(axis=0)
-            trust = np.clip(1 - variance / np.maximum(np.abs(c) ** 2, 1e-30), 0, 1)
-            coefficients.append((c * trust)[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
-            sigmas.append(math.sqrt(2 * float(((trust * variance)[half] @ (terms**2).mean(axis=0)).sum())))
-        made = Shadow(
-            self.shape, self.at, self.orders, np.array(coefficients), degree, ShadowFrom.FRAME, np.array(sigmas)
-        )
+            spread.append((np.abs(errors) ** 2).sum(axis=0)[half])
+            found.append(c[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
+        own, variance = _alike(np.array(found), np.array(spread))
+        trust = np.clip(1 - variance / np.maximum(np.abs(own) ** 2, 1e-30), 0, 1)
+        # What is not trusted may be there all the same.
+        sigmas = np.sqrt(2 * ((np.maximum(trust, 0.5) * variance) @ (terms**2).mean(axis=0)).sum(axis=1))
+        made = Shadow(self.shape, self.at, self.orders, own * trust, degree, ShadowFrom.FRAME, sigmas)
         return replace(made, sigma=np.sqrt(made.sigma**2 + self.displaced(made)))
 
     def lattice(self) -> Lattice | None:
