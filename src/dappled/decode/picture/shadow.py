@@ -38,6 +38,7 @@ _DEEP = 0.2  # standard deviation of W from which on local means are taken again
 _KEPT = 0.02  # of a carrier in local means: from which on it counts that it is missing beside them
 _STEPS = 3  # of Gauss and Newton, at most
 _ENOUGH = 0.1  # of the frame
+_SHEARED = 5e-4  # of a print on its way: longer along one axis, or at no right angle
 _STILL_BINS = 3e-3  # of a frame: a lattice so near is kept
 _LEAST = 1e-3  # of the frame's mean: darker local means tell nothing of the shadow
 
@@ -120,7 +121,7 @@ def shadow_of(
         if (finer := equations.lattice()) is None:
             break
         # Where pixels are left out, a block's middle is not where its samples are.
-        equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half)
+        equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half, found)
     first = equations.fitted(0)
     kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
     lost = bool(np.any(np.abs(kept) > _KEPT))
@@ -131,9 +132,9 @@ def shadow_of(
     if known := first.depth > _DEEP or mosaic.valid is not None or lost:
         means = _Means.of(mosaic, means.period, first)  # where the light was is known better behind a known shadow
     if known or equations.at != found:
-        equations = _Equations.of(means, equations.at, half)
+        equations = _Equations.of(means, equations.at, half, found)
     if mosaic.valid is None and equations.at != found and (finer := equations.lattice()) is not None:
-        equations = _Equations.of(means, finer, half)
+        equations = _Equations.of(means, finer, half, found)
     best, gain = no_shadow(mosaic.shape, equations.at, half, mosaic.colours), 0.0
     for degree in _DEGREES:
         held = equations.held_out(degree)
@@ -261,6 +262,7 @@ class _Equations:
 
     shape: tuple[int, int]
     at: Lattice
+    like: Lattice  # but for a turn and a scale, about as it is
     orders: tuple[Order, ...]
     centres: Floats
     gram: NDArray[np.complex64]
@@ -270,7 +272,7 @@ class _Equations:
     odd: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, means: _Means, lattice: Lattice, orders: tuple[Order, ...]) -> _Equations:
+    def of(cls, means: _Means, lattice: Lattice, orders: tuple[Order, ...], like: Lattice | None = None) -> _Equations:
         mosaic, floor = means.mosaic, means.floor()
         every = np.array([(0, 0), *orders, *((-ky, -kx) for ky, kx in orders)], dtype=np.intp)
         apart = every[:, None] - every[None, :]
@@ -312,9 +314,8 @@ class _Equations:
             middles.append((ends[1:] + ends[:-1]) / 2 - full / 2)
         y, x = np.meshgrid(*middles, indexing="ij")
         odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
-        return cls(
-            mosaic.shape, lattice, orders, np.column_stack([y.ravel(), x.ravel()]), whole, right, energy, count, odd
-        )
+        centres = np.column_stack([y.ravel(), x.ravel()])
+        return cls(mosaic.shape, lattice, like or lattice, orders, centres, whole, right, energy, count, odd)
 
     def moved(self, lattice: Lattice) -> _Equations:
         """About the same at a lattice so near that waves turn little within a block."""
@@ -455,8 +456,20 @@ class _Equations:
             scores[:, 4:] += turned
         normal[4:, :4] = normal[:4, 4:].T
         normal += np.diag([*[1 / _FOUND_BINS**2] * 4, *[1e-9] * count])
+        total = scores.sum(axis=0)
+        back, bins = np.linalg.inv(self.like.matrix()), 1 / np.array(self.shape)
+        moves = np.einsum("ak,jb,j->jkab", back, np.eye(2), bins).reshape(
+            4, 2, 2
+        )  # of back @ lattice, by a bin of each
+        now = back @ self.at.matrix()
+        for unlike, pull in (
+            (moves[:, 0, 0] - moves[:, 1, 1], now[0, 0] - now[1, 1]),
+            (moves[:, 0, 1] + moves[:, 1, 0], now[0, 1] + now[1, 0]),
+        ):
+            normal[:4, :4] += np.outer(unlike, unlike) / _SHEARED**2
+            total[:4] -= unlike * pull / _SHEARED**2
         inverse = np.linalg.inv(normal)
-        step = inverse @ scores.sum(axis=0)
+        step = inverse @ total
         sure = np.sum(parts, axis=0)
         left = scores.copy()
         left[:, :4] -= np.einsum("bki,bk->bi", levers, sure * (levers @ step[:4] + step[4:]))
