@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from dappled.decode.optics.carriers import MaskedOptics, Sensor
+from dappled.decode.optics.carriers import Lattice, MaskedOptics, Sensor
 from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import MosaicPlane
 from dappled.decode.picture.picture import picture_of
-from dappled.decode.picture.shadow import period_of, shadow_of
+from dappled.decode.picture.shadow import Shadow, period_of, shadow_of
 from tests.decode.picture.drawn import COUNT, FILMS, SHAPE, V_MM, Drawn, draw
 from tests.decode.ray_trials import mask_of
 
@@ -29,15 +29,20 @@ class Judged:
     shares: tuple[float, float]
 
 
-def judged(shot: Drawn) -> Judged:
+def shadow_in(shot: Drawn) -> tuple[MosaicPlane, Shadow, Lattice]:
+    """The frame, the shadow that is found in it, and the true lattice."""
     sensor = Sensor(SHAPE, (shot.pitch_mm[0], 0.0), (0.0, shot.pitch_mm[1]))
     optics = MaskedOptics(sensor, mask_of(shot.film), "geometric", shot.distance_mm)
     lattice = optics.lattice(V_MM)
     there = [one for one in order_strengths(optics, lattice, shot.f_number) if one.on_sensor]
     orders = [one.order for one in there if one.most > _SEEN] or [one.order for one in there]
-    frame = shot.frame()
-    mosaic = MosaicPlane(frame, shot.pattern)
-    shadow = shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02)
+    mosaic = MosaicPlane(shot.frame(), shot.pattern)
+    return mosaic, shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02), lattice
+
+
+def judged(shot: Drawn) -> Judged:
+    mosaic, shadow, lattice = shadow_in(shot)
+    frame = mosaic.plane
     made = picture_of(mosaic, shadow, period_of(lattice))
     others = [shot.psnr(frame / np.maximum(shot.lights[2], 0.01)), shot.psnr(shot.band(frame))]
     cut = np.zeros(SHAPE, dtype=bool)
@@ -70,6 +75,18 @@ def test_orders_that_fold_into_local_means_on_samples_that_stand_far_apart_are_f
     assert judged(draw()[155]).short_db > -0.3
 
 
+def test_what_the_lattice_is_off_is_a_part_of_the_shadow_s_error() -> None:
+    shot = draw()[50]
+    mosaic, shadow, _ = shadow_in(shot)
+    off = np.concatenate([(shadow.at(one) - shot.lights[2][one.cut]).ravel() for one in mosaic.places()])
+    assert 0.5 < off.std() / shadow.sigma.mean() < 2
+
+
+def test_a_weak_shadow_s_lattice_is_turned_and_scaled_rather_than_sheared() -> None:
+    _, shadow, true = shadow_in(draw()[110])
+    assert np.abs((shadow.lattice.matrix() - true.matrix()) * SHAPE).max() < 0.05
+
+
 @pytest.mark.slow
 def test_shares_within_one_and_two_sigma_where_detail_ends_before_the_noise() -> None:
     shares = judged(draw()[20]).shares
@@ -86,8 +103,8 @@ def test_two_hundred_drawn_pictures() -> None:
         assert min(levels.values()) >= 20
     assert {one.mask for one in drawn} == set(FILMS)
     found = [judged(one) for one in drawn]
-    for deep, tenth in ((True, -2.0), (False, -0.5)):
+    for deep, tenth in ((True, -1.0), (False, -0.5)):
         short = np.array([one.short_db for one in found if (one.depth > 0.1) == deep])
         assert np.median(short) > 1, deep
         assert np.quantile(short, 0.1) > tenth, deep
-        assert short.min() > -6, deep
+        assert short.min() > -5.5, deep
