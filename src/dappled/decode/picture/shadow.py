@@ -460,7 +460,7 @@ class _Equations:
         back, bins = np.linalg.inv(self.like.matrix()), 1 / np.array(self.shape)
         moves = np.einsum("ak,jb,j->jkab", back, np.eye(2), bins).reshape(
             4, 2, 2
-        )  # of now, by a bin of each
+        )
         now = back @ self.at.matrix()
         for unlike, pull in (
             (moves[:, 0, 0] - moves[:, 1, 1], now[0, 0] - now[1, 1]),
