@@ -458,9 +458,7 @@ class _Equations:
         normal += np.diag([*[1 / _FOUND_BINS**2] * 4, *[1e-9] * count])
         total = scores.sum(axis=0)
         back, bins = np.linalg.inv(self.like.matrix()), 1 / np.array(self.shape)
-        moves = np.einsum("ak,jb,j->jkab", back, np.eye(2), bins).reshape(
-            4, 2, 2
-        )
+        moves = np.einsum("ak,jb,j->jkab", back, np.eye(2), bins).reshape(4, 2, 2)
         now = back @ self.at.matrix()
         for unlike, pull in (
             (moves[:, 0, 0] - moves[:, 1, 1], now[0, 0] - now[1, 1]),
