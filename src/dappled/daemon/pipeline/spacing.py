@@ -63,7 +63,7 @@ class Height:
     def of(cls, pose: Pose) -> Self | None:
         """By what measures it, else above the take-off place; None where both are unknown."""
         if pose.ground is not None:
-            return cls(pose.ground.metres, pose.ground.source)
+            return cls(pose.ground.metres, f"by {pose.ground.source}")
         above_m = pose.height_above_home_m
         return None if above_m is None else cls(above_m, "above the take-off place")
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from dappled import codec
 from dappled.config.profiles import VerdictBounds
-from dappled.decode.geometry import FrameGeometry, Pose, Vector3, image_motion
+from dappled.daemon.pipeline.spacing import Height
+from dappled.decode.geometry import FrameGeometry, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
 from dappled.findings import FRAME, Code, Finding, Level, Subject, Value, finding, text, told
 from dappled.flight import Tag
@@ -251,15 +252,15 @@ class Judge:
             return unjudged("the decoder said nothing about its pixels")
         blur, blur_unknown = self._blur(tag, rates, seen)
         circle, focus_unknown = self._defocus((tag.focal_length_mm, tag.f_number), seen)
-        height_m, height_source = _height(tag.pose)
+        height = Height.of(tag.pose)
         gnss = tag.pose.gnss
         fresh = gnss is not None and gnss.age_ms <= _SILENT_MS
         facts = FrameFacts(
             blur_px=blur and _pixels(blur, seen.pixel_mm),
             blur_view_px=blur and _pixels(blur, seen.view_mm),
             blur_unknown=blur_unknown,
-            height_m=height_m,
-            height_source=height_source,
+            height_m=None if height is None else height.metres,
+            height_source="" if height is None else height.source,
             clipped_share=seen.clipped_share,
             black_share=seen.black_share,
             mean_share=seen.mean_share,
@@ -315,7 +316,7 @@ class Judge:
 
     def _blur(self, tag: Tag, rates: Vector3 | None, seen: PictureFacts) -> tuple[tuple[float, float] | None, str]:
         """How far ground moved over the sensor during the exposure, (down, right) in mm; or None, and why."""
-        pose: Pose = tag.pose
+        pose, height = tag.pose, Height.of(tag.pose)
         missing = [
             (tag.exposure_s is None, "the frame has no exposure time"),
             (tag.focal_length_mm is None, "the frame has no focal length"),
@@ -327,14 +328,13 @@ class Judge:
             (pose.source != "interpolated", f"the telemetry is {(pose.age_ms or 0) / 1e3:.1f} s old"),
             (self._on_gimbal, "the camera is on a gimbal, whose turn rate is not reported"),
             (rates is None, "the telemetry has no turn rates, or too few (10 a second are needed)"),
-            (_height(pose)[0] is None, "the telemetry has no height"),
+            (height is None, "the telemetry has no height"),
         ]
         if why := next((text for is_so, text in missing if is_so), None):
             return None, why
-        height_m, source = _height(pose)
-        assert height_m is not None
-        if not height_m >= (_LOW_M if pose.ground is None else 0.0):
-            return None, f"the height is {height_m:.1f} m ({source}), too little to be known"
+        assert height is not None
+        if not height.metres >= (_LOW_M if pose.ground is None else 0.0):
+            return None, f"the height is {height.metres:.1f} m ({height.source}), too little to be known"
         assert tag.exposure_s is not None
         assert tag.focal_length_mm is not None
         assert seen.side_mm is not None
@@ -342,20 +342,13 @@ class Judge:
         assert pose.attitude is not None
         assert pose.velocity_ned_m_s is not None
         assert rates is not None
-        camera = FrameGeometry(self._mount, tag.focal_length_mm, seen.side_mm, seen.view_mm, height_m)
+        camera = FrameGeometry(self._mount, tag.focal_length_mm, seen.side_mm, seen.view_mm, height.metres)
         moving = image_motion(camera, pose.attitude, pose.velocity_ned_m_s, rates)
         if moving is None:
             return None, "the camera sees no ground"
         if not all(map(math.isfinite, (*pose.velocity_ned_m_s, *rates, *moving))):
             return None, "the telemetry's numbers are not finite"
         return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), ""
-
-
-def _height(pose: Pose) -> tuple[float | None, str]:
-    """Above the ground, in metres, and by what."""
-    if pose.ground is not None:
-        return pose.ground.metres, f"by {pose.ground.source}"
-    return pose.height_above_home_m, "above the take-off place"
 
 
 def _moved(before: LensSettings, now: LensSettings) -> str:
