@@ -15,7 +15,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.stats import qmc
 
 from tests.decode.ray_frames import CANON, FUJI, MASKS, WAVELENGTH_MM, Film, Stop
 
@@ -153,6 +152,8 @@ class Drawn:
 
 def draw() -> list[Drawn]:
     """Configurations by Latin hypercube: of each factor, each level equally often."""
+    from scipy.stats import qmc  # noqa: PLC0415  half a second, which each collection of tests would take
+
     made = []
     for seed, row in enumerate(qmc.LatinHypercube(8, rng=np.random.default_rng(SEED)).random(COUNT)):
 
