@@ -31,19 +31,31 @@ def built() -> Path:
 
 
 @pytest.fixture(scope="session")
-def installed(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A disk on which the package was installed while the machine ran."""
+def package(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package of this state of the source."""
     names = subprocess.run(
         ["/usr/bin/git", "ls-files", *PACKAGED], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
     ).stdout
     state = hashlib.sha256(b"".join((ROOT / name).read_bytes() for name in names.split()))
-    disk = built / f"installed-{state.hexdigest()[:16]}"
+    made = built / f"package-{state.hexdigest()[:16]}.deb"
+    if not made.exists():
+        folder = tmp_path_factory.mktemp("package")
+        make = [sys.executable, ROOT / "tools/deb.py", "--arch=amd64", "--suite=bookworm", "--out", folder]
+        subprocess.run([str(word) for word in make], check=True, stdout=sys.stderr)
+        for older in built.glob("package-*"):
+            older.unlink()
+        (found,) = folder.glob("*.deb")
+        copy(found, made)
+    return made
+
+
+@pytest.fixture(scope="session")
+def installed(built: Path, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A disk on which the package was installed while the machine ran."""
+    disk = built / package.with_suffix("").name.replace("package", "installed")
     if disk.exists():
         return disk
     folder = tmp_path_factory.mktemp("install")
-    make = [sys.executable, ROOT / "tools/deb.py", "--arch=amd64", "--suite=bookworm", "--out", folder]
-    subprocess.run([str(word) for word in make], check=True, stdout=sys.stderr)
-    (package,) = folder.glob("*.deb")
     with own_network():
         machine = Machine(built, [copy(built / "disk", folder / "disk")], folder / "console")
         try:

@@ -226,14 +226,14 @@ class Station:
         self._socket.sendto(_MARK, (HERE, STATION_PORT))
         self.until(lambda it: it._marks > marks, "its own mark")
 
-    def request(self) -> None:
-        """Ask for one photograph, and don't wait."""
+    def request(self, *, every_s: float = 0, count: int = 1) -> None:
+        """Ask for one photograph, or for one every so often (`count` 0: without an end), and don't wait."""
         self.until(lambda it: it.camera is not None, "a camera's heartbeat")
         assert self.camera is not None
         assert self._peer is not None
         self._sequence += 1
         name = mavlink.MAV_CMD_IMAGE_START_CAPTURE
-        asked = mavlink.MAVLink_command_long_message(*self.camera, name, 0, 0, 0, 1, self._sequence, 0, 0, 0)
+        asked = mavlink.MAVLink_command_long_message(*self.camera, name, 0, 0, every_s, count, self._sequence, 0, 0, 0)
         self._socket.sendto(asked.pack(self._mav), self._peer)
 
     def shoot(self) -> None:
