@@ -1,4 +1,4 @@
-"""A camera on the USB bus of a whole machine: plugged in late, another card in it, a card with old pictures.
+"""A camera on the USB bus of a whole machine, and a shutter line: what only a kernel of one's own shows.
 
 The kernel is compiled by `make long`; elsewhere these scenes run where that was done.
 """
@@ -11,25 +11,28 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from dappled.mocks.body.body import BodyOptions, pattern
+from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from tests.machine.conftest import FLIGHTS, ROOT, Scene
 from tests.machine.uml import HERE
 from tests.waiting import eventually
 
 pytestmark = [pytest.mark.long, pytest.mark.machine, pytest.mark.alone, pytest.mark.timeout(3600)]
 SMALL = 300_000
+SLOW = 8_000_000  # 16 s at the rate of "crawl"; a silent body is given up after 12
 OLD = 130
+BODY = BodyOptions(picture=f"pattern:{SMALL}:cr2", bind=HERE, usbip=True)
 CGROUP = "/sys/fs/cgroup/system.slice/dappled.service/cgroup.procs"
 ACM, USB_SERIAL = 166, 188
 
 
 @pytest.fixture
-def on_usb(scene: Callable[..., Scene]) -> Scene:
-    """A machine with an empty USB bus, and a body that can be plugged in."""
+def on_usb(scene: Callable[..., Scene], request: pytest.FixtureRequest) -> Scene:
+    """A machine with an empty USB bus, a body to be plugged in; its pictures are small, or as large as given."""
     build = [
         sys.executable,
         str(ROOT / "tools/machine/build.py"),
@@ -40,7 +43,7 @@ def on_usb(scene: Callable[..., Scene]) -> Scene:
     if done.returncode:
         pytest.skip("there is no kernel with a USB bus: make one with tools/machine/build.py --usb")
     kernel = Path(done.stdout.strip())
-    made = scene(body=BodyOptions(picture=f"pattern:{SMALL}:cr2", bind=HERE, usbip=True), usb=kernel)
+    made = scene(body=replace(BODY, **getattr(request, "param", {})), usb=kernel)
     made.machine.put("/root/modules.tar", (kernel / "modules.tar").read_bytes())
     made.machine.run("tar -C /usr --no-same-owner -xf /root/modules.tar && depmod")
     made.configure("usb:")
@@ -120,3 +123,75 @@ def test_old_pictures_on_the_card_are_listed_and_not_fetched(
         flown.station.shoot()
     assert sorted(flown.frames().values()) == pictures(OLD + 1, OLD + 2, OLD + 3)
     assert "stray" not in flown.machine.run(f"ls {FLIGHTS}/*/frames")
+
+
+@pytest.mark.parametrize("on_usb", [{"picture": f"pattern:{SLOW}:cr2"}], indirect=True)
+def test_a_slow_cable_is_no_silence(on_usb: Scene) -> None:
+    """Bytes that arrive are a sign of life: a file that takes longer than a silent body is waited for comes whole."""
+    flown = on_usb
+    plug_in(flown)
+    flown.begin()
+    flown.body.fault("crawl")
+    flown.station.shoot()
+    assert list(flown.frames().values()) == [hashlib.sha256(pattern(1, SLOW)).hexdigest()]
+    assert flown.shown("NRestarts") == "0"
+
+
+def test_a_body_as_mass_storage_is_told_how_it_has_to_be_set(on_usb: Scene) -> None:
+    flown = on_usb
+    flown.body.fault("storage")
+    flown.machine.run("echo 0 >/sys/bus/usb/devices/usb1/interface_authorized_default")  # no disk is looked for
+    plug_in(flown)
+    flown.machine.run("udevadm settle")
+    said = flown.machine.run("dappled doctor --config /etc/dappled/dappled.toml 2>&1", check=False)
+    assert "(mass storage): it can't be fired in this USB mode" in said
+    assert "set the camera's USB mode to PTP" in said
+
+
+@pytest.mark.parametrize("on_usb", [{"serial": ""}], indirect=True)
+def test_of_two_bodies_without_a_serial_number_one_stays_the_camera_when_the_bus_counts_anew(on_usb: Scene) -> None:
+    flown = on_usb
+    with SimulatedBody.start(replace(BODY, serial="")) as other:
+        attach = f"usbip --tcp-port {{}} attach -r {HERE} -b 1-1"
+        plug_in(flown)
+        flown.begin()
+        flown.machine.run(attach.format(other.tcp_ports[0]))
+        flown.station.shoot()
+        numbers = "cat /sys/bus/usb/devices/1-[12]/devnum"
+        first, second = map(int, flown.machine.run(numbers).split())
+        assert first < second
+        flown.machine.run(
+            "systemctl kill -s STOP dappled && usbip detach -p 0 && "  # it sees both bodies, before and after
+            f"{attach.format(flown.body.tcp_ports[0])} && systemctl kill -s CONT dappled"
+        )
+        first, second = map(int, flown.machine.run(numbers).split())
+        assert first > second
+        flown.machine.run("until journalctl -u dappled | grep -c 'camera ready' | grep -q 2; do sleep 0.2; done")
+        flown.station.shoot()
+        assert (flown.body.releases, other.releases) == (2, 0)
+
+
+def test_a_shutter_line_is_closed_from_inside_the_service(on_usb: Scene) -> None:
+    flown = on_usb
+    chip = flown.machine.run(
+        "mount -t configfs none /sys/kernel/config 2>/dev/null; cd /sys/kernel/config/gpio-sim && mkdir -p s/bank && "
+        "echo 8 >s/bank/num_lines && echo 1 >s/live && cat s/bank/chip_name"
+    ).strip()
+    rule = f'SUBSYSTEM=="gpio", KERNEL=="{chip}", MODE="0660", GROUP="dappled"\n'
+    flown.machine.put("/etc/udev/rules.d/71-dappled-shutter.rules", rule.encode())
+    flown.machine.run("udevadm control --reload && udevadm trigger --subsystem-match=gpio && udevadm settle")
+    flown.machine.put(
+        "/etc/dappled/dappled.toml",
+        (
+            f'[camera]\ndriver = "fujifilm"\nprofile = "fujifilm-s5200"\nshutter = "gpio:/dev/{chip}:3"\n'
+            f'pickup = "later"\n[camera.options]\nhold_ms = 1000\n[mavlink]\nurl = "udpout:{HERE}:14550"\n'
+            f'[record]\ndirectory = "{FLIGHTS}"\n'
+        ).encode(),
+    )
+    flown.begin()
+    value = f"/sys/devices/platform/gpio-sim.0/{chip}/sim_gpio3/value"
+    assert flown.machine.run(f"cat {value}").strip() == "0"
+    seen = f"for level in 1 0; do until grep -q $level {value}; do sleep 0.05; done; done"
+    flown.machine.run(f"systemd-run -q --unit=seen --remain-after-exit sh -c '{seen}'")
+    flown.station.request()
+    flown.machine.run("until systemctl show -P SubState seen | grep -q exited; do sleep 0.2; done")

@@ -166,6 +166,13 @@ def test_the_list_and_the_descriptors_are_those_of_a_450d(responder: UsbIpRespon
     host.link.close()
 
 
+def test_a_body_in_the_mode_of_mass_storage_says_so(responder: UsbIpResponder, faults: BodyFaults) -> None:
+    faults.command("storage")
+    host = Bus(responder.ports[0])
+    assert host.control(0x80, 6, 0x0200, room=255)[1][14:17] == bytes((8, 6, 0x50))
+    host.link.close()
+
+
 @pytest.mark.parametrize("bus_id", [b"1-2", b"1-1"])
 def test_one_host_has_the_body_and_no_other(responder: UsbIpResponder, bus: Bus, bus_id: bytes) -> None:
     assert Bus(responder.ports[0], bus_id).status == 1

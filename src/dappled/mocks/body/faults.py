@@ -12,10 +12,10 @@ from collections.abc import Callable, Iterator
 
 from dappled.clock import Clock
 
-LASTING = ("busy", "silence", "refuse", "unplug", "slow", "crawl", "full")
+LASTING = ("busy", "silence", "refuse", "unplug", "slow", "crawl", "full", "storage")
 """busy: a release is answered DeviceBusy. silence: nothing is answered. refuse: no new connection is accepted, as if
 another program held the body. unplug: the links are cut, and no new one is accepted. slow: an object's data come
-at 2 MB/s; crawl: at 0.5 MB/s. full: the card takes no more."""
+at 2 MB/s; crawl: at 0.5 MB/s. full: the card takes no more. storage: a body on USB describes itself as mass storage."""
 
 COUNTED = ("error", "no-event", "short", "drop-transfer", "unplug-transfer", "stall", "babble", "no-focus")
 """error: a release is answered GeneralError. no-event: a new object isn't announced. short: an object's data end one

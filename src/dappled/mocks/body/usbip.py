@@ -32,10 +32,11 @@ _COMMAND, _DATA, _RESPONSE = 1, 2, 3  # types of containers
 _MOST_BYTES = 16 << 20
 _CANON, _EOS_450D = 0x04A9, 0x3145
 _DEVICE = struct.pack("<BBHBBBBHHHBBBB", 18, 1, 0x200, 0, 0, 0, 64, _CANON, _EOS_450D, 1, 1, 2, 0, 1)
+_PTP, _STORAGE = bytes((6, 1, 1)), bytes((8, 6, 0x50))  # class, subclass and protocol of an interface
 _CONFIGURATION = b"".join(
     (
         struct.pack("<BBHBBBBB", 9, 2, 39, 1, 1, 0, 0xC0, 1),
-        struct.pack("<BBBBBBBBB", 9, 4, 0, 0, 3, 6, 1, 1, 0),  # still image, PTP
+        struct.pack("<BBBBB", 9, 4, 0, 0, 3) + _PTP + b"\0",
         struct.pack("<BBBBHB", 7, 5, 0x80 | _BULK_IN, 2, _PACKET, 0),
         struct.pack("<BBBBHB", 7, 5, _BULK_OUT, 2, _PACKET, 0),
         struct.pack("<BBBBHB", 7, 5, 0x80 | _INTERRUPT, 3, 8, 9),
@@ -122,7 +123,7 @@ class UsbIpResponder:
         with link, contextlib.suppress(OSError, ptp.MalformedPacketError):  # the host is gone, or was none
             version, code, _status = struct.unpack(">HHI", exactly(link, 8))
             if code == _DEVLIST:
-                link.sendall(struct.pack(">HHII", version, 0x0005, 0, 1) + _described() + bytes((6, 1, 1, 0)))
+                link.sendall(struct.pack(">HHII", version, 0x0005, 0, 1) + _described() + _PTP + b"\0")
             elif code == _IMPORT:
                 wanted = exactly(link, 32).rstrip(b"\0").decode("ascii", "replace")
                 with self._lock:
@@ -244,6 +245,8 @@ class _Bus:
         match kind, request:
             case 0x80, 6:
                 answer = dict(enumerate(_DESCRIPTORS.get(value >> 8, ()))).get(value & 0xFF)
+                if answer is _CONFIGURATION and self._faults.lasts("storage"):
+                    answer = answer.replace(_PTP, _STORAGE)
             case ((0x80 | 0x81 | 0x82), 0):
                 answer = struct.pack("<H", int(kind == 0x82 and index & 0xF in self._halted))
             case 0x80, 8:
