@@ -55,7 +55,7 @@ class World:
 
 
 _APART_M = 1.6  # of frames that see 5.6 m along the way
-_FRAME_BENCHES = 2.0  # a frame of the ground takes so many times as long as the bench's with its calibration
+_FRAME_BENCHES = 3.0  # a frame of the ground takes so many times as long as the bench's with its calibration
 _ATTITUDE_SIGMA_DEG = 0.01  # the simulated autopilot knows its attitude; only its messages are rounded
 
 
