@@ -252,6 +252,7 @@ class Code(StrEnum):
     MARKS_UNPLACED = "marks.unplaced"
     MARKS_UNTIMED = "marks.untimed"
     MASK_NAMED = "mask.named"
+    MASK_OVER_FLIGHT = "mask.over_flight"
     MASK_SHIFTED = "mask.shifted"
     MASK_TURNED = "mask.turned"
     MASK_TURNED_FARTHER = "mask.turned_farther"

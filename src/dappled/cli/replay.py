@@ -24,6 +24,7 @@ if not words_only:
     from dappled.config import profiles
     from dappled.daemon.navigation import BodyLatency
     from dappled.daemon.pipeline import recipes
+    from dappled.daemon.pipeline.capture import PendingShot
     from dappled.daemon.pipeline.recipes import Names
     from dappled.daemon.replay import playback, replay, runs
     from dappled.daemon.replay.playback import FlownWith
@@ -145,7 +146,14 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         recording = self._recording()
         found: list[Finding] = list(recording.findings)
         flown = self._as_recorded(facts, recipe)
-        progress = ReplayProgress(lambda shot: output.row(frame_values(shot), frame_line(shot)))
+        flight: dict[str, tuple[Finding, ...]] = {}
+
+        def tell(shot: PendingShot) -> None:
+            output.row(frame_values(shot), frame_line(shot))
+            if shot.decoded:
+                flight["last"] = shot.decoded.about_flight
+
+        progress = ReplayProgress(tell)
         with ExitStack() as stack:
             keep: RunWriter | None = None
             if self._is_flight and recipe and (self.run_name or any(self._given.values())) and not self.verify:
@@ -167,7 +175,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
                 pace=self._pace(),
                 report=found.append,
             )
-        told = first_of_each(found)
+        told = first_of_each([*found, *flight.get("last", ())])
         if not self.verify:
             if told:
                 output.row({"findings": codec.plain(in_order(told))})

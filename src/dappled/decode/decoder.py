@@ -20,8 +20,8 @@ from dappled.decode.calibration.calibration import Calibration, LatticeFit, move
 from dappled.decode.calibration.testimony import LatticeChange, lattice_change
 from dappled.decode.errors import DecodeError
 from dappled.decode.joint.clipping import clipped_shares, unclipped
-from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of
-from dappled.decode.joint.mask_place import MaskPlace, cycles_per_radian
+from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of, witness_of
+from dappled.decode.joint.mask_place import SEEN, MaskPlace, MaskWitness, cycles_per_radian
 from dappled.decode.lightfield.aperture import (
     Aperture,
     UsedAperture,
@@ -63,6 +63,7 @@ _UNKNOWN: Mapping[str, Any] = {
     "views_unclipped": False,
 }
 _BY_CHANCE = 3  # carriers, with the mean, that a scene may seem to show
+_CARRIERS_NATS = 20.0  # that the mask is there, where more carriers than by chance are seen
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
 _UNLIKE = frozenset({Code.APERTURE_DISAGREES, Code.APERTURE_UNEXPLAINED})
 _FARTHEST_TURN = 0.035  # radians: patches of a mask turned farther tell nothing
@@ -76,7 +77,7 @@ class MadeViews:
 
     `facts` say what each slice is of the light field: `transfers`, rows [ωv, ωu, Re T, Im T], T = 0 where a slice was
     not used, and the `aperture` that it was taken through (see `Aperture.shape`). `findings` say what may be wrong with
-    aperture and views, `moved` how far the mask lies from its calibration, `unseen` that parallax shows none.
+    aperture and views, `moved` how far the mask lies from its calibration, `nats` the log odds that it is there.
     """
 
     values: Views
@@ -85,7 +86,7 @@ class MadeViews:
     facts: Mapping[str, Any] = field(default_factory=lambda: _UNKNOWN)
     findings: tuple[Finding, ...] = ()
     moved: tuple[Finding, ...] = ()
-    unseen: tuple[Finding, ...] = ()
+    nats: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +97,8 @@ class DecodeReport:
     each (None: nothing there), `used` those that the slices were cut at. `carriers_from`: "measured" in this frame;
     "calibrated": predicted by the calibration, as too few were seen; "predicted": by the law alone; "found": an
     unknown lattice found in the frame. `views_from`: whose phases and transfer made the views. `noise_rms` is the
-    plane's white noise, 1.0 = sensor white. `findings` say what is unusual about mask, aperture and views.
+    plane's white noise, 1.0 = sensor white. `findings` say what is unusual about mask, aperture and views, `mask_nats`
+    the log odds that the mask is where it was calibrated; None: nothing tells.
     """
 
     predicted: tuple[Carrier, ...]
@@ -106,6 +108,7 @@ class DecodeReport:
     views_from: ViewsFrom
     noise_rms: float
     findings: tuple[Finding, ...] = ()
+    mask_nats: float | None = None
 
     @property
     def found(self) -> int:
@@ -168,7 +171,8 @@ class MaskDecoder:
     lattice where a search has found it, `ratio` the matrix, row by row, of the lattice found in a flight over the
     law's: a print scaled and turned. Without `joint_views` the views are made quickly, each spatial frequency alike
     (see `views`): depth is computed from slices and needs no better ones. `clipped` (H, W) is 1 where this frame's
-    pixels are clipped, else 0; None: nowhere. `buffers` are reused from frame to frame.
+    pixels are clipped, else 0; None: nowhere. `buffers` are reused from frame to frame, as are the `witnesses` of a
+    mask, one for each focal length and f-number.
     """
 
     optics: MaskedOptics
@@ -184,6 +188,9 @@ class MaskDecoder:
     joint_views: bool = True
     clipped: Singles | None = None
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
+    witnesses: dict[tuple[float, float], tuple[TakenSlices, MaskWitness] | None] = field(
+        default_factory=dict, repr=False
+    )
 
     def __post_init__(self) -> None:
         """Raises DecodeError for another camera's calibration."""
@@ -246,6 +253,7 @@ class MaskDecoder:
                 spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=min(0.5, needed))
             slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
             noise = noise_rms(spectrum)
+        few = carriers_from == "calibrated" and sum(one is not None for one in measured) <= _BY_CHANCE
         if views:
             clips = self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
             made = self.views(
@@ -258,13 +266,18 @@ class MaskDecoder:
                 plane=plane if clips else None,
             )
         else:
-            made = MadeViews(*no_views(slices.values.shape[1:]))
+            nats = (
+                None
+                if f_number is None or not few
+                else self._witnessed(slices, lattice, focal_length_mm, f_number, noise)
+            )
+            made = MadeViews(*no_views(slices.values.shape[1:]), nats=nats)
         place = made.moved or self._moved(slices, lattice, focal_length_mm)
-        if carriers_from == "calibrated" and sum(one is not None for one in measured) <= _BY_CHANCE:
+        if few:
             if np.var(slices.values[0].real) < _ONLY_NOISE * noise**2 * slices.band:
                 place = (finding(Code.FRAME_ONLY_NOISE, FRAME),)
-            elif made.unseen:
-                place = made.unseen
+            elif made.nats is not None and made.nats <= SEEN:
+                place = (finding(Code.MASK_UNSEEN, FRAME, nats=made.nats),)
         if carriers_from == "measured" and any(one.code in _UNLIKE for one in made.findings):
             change = self.change(spectrum, focal_length_mm, predicted, measured)  # the cause, rather than the aperture
             place = place if change is None else (change.finding, *place)
@@ -276,6 +289,7 @@ class MaskDecoder:
             made.source,
             noise,
             (*place, *made.findings),
+            made.nats if few or self.calibration is None else _CARRIERS_NATS,
         )
         facts: dict[str, Any] = {
             "law": self.optics.law,
@@ -412,26 +426,8 @@ class MaskDecoder:
         none = MadeViews(*no_views(slices.values.shape[1:]))
         if f_number is None:
             return none
-        printed = self.optics.mask.frequency_per_mm
-        if self.calibration is not None:
-            printed *= self.calibration.nearest(focal_length_mm).print_scale
-        cycles = kappa(printed, self._distance(focal_length_mm), focal_length_mm, f_number)
-        across, down = math.hypot(*self.optics.sensor.column_mm), math.hypot(*self.optics.sensor.row_mm)
-        taken = TakenSlices(
-            slices.values,
-            slices.carriers,
-            np.ones(len(slices.carriers), dtype=np.complex128),
-            kappa_cycles=cycles,
-            rotation_rad=0.0,
-            aperture=self.aperture or Aperture(self.optics.mask.views_per_axis),
-            samples_px=(float(np.hypot(*slices.grid[:, 0])), float(np.hypot(*slices.grid[:, 1]))),
-            row_over_column=down / across,
-            noise_variance=noise_rms**2 * slices.band,
-            colours=self.colours,
-            clipped=None
-            if self.clipped is None
-            else clipped_shares(self.clipped, slices.values.shape[1:], slices.grid) > 0,
-        )
+        taken = self._taken(slices, focal_length_mm, f_number, noise_rms)
+        cycles = taken.kappa_cycles
         width: UsedAperture | None = None
         place, told = None, False
         if self.calibration is not None:
@@ -489,8 +485,52 @@ class MaskDecoder:
             facts,
             made.findings if strange is None else (strange, *made.findings),
             () if place is None else moved(place.periods, place.turn_rad, self.optics.mask.frequency_per_mm),
-            () if place is None or place.seen else (finding(Code.MASK_UNSEEN, FRAME, nats=place.nats),),
+            None if place is None else place.nats,
         )
+
+    def _taken(self, slices: Slices, focal_length_mm: float, f_number: float, noise_rms: float) -> TakenSlices:
+        """How slices were taken, with transfers of 1."""
+        printed = self.optics.mask.frequency_per_mm
+        if self.calibration is not None:
+            printed *= self.calibration.nearest(focal_length_mm).print_scale
+        cycles = kappa(printed, self._distance(focal_length_mm), focal_length_mm, f_number)
+        across, down = math.hypot(*self.optics.sensor.column_mm), math.hypot(*self.optics.sensor.row_mm)
+        return TakenSlices(
+            slices.values,
+            slices.carriers,
+            np.ones(len(slices.carriers), dtype=np.complex128),
+            kappa_cycles=cycles,
+            rotation_rad=0.0,
+            aperture=self.aperture or Aperture(self.optics.mask.views_per_axis),
+            samples_px=(float(np.hypot(*slices.grid[:, 0])), float(np.hypot(*slices.grid[:, 1]))),
+            row_over_column=down / across,
+            noise_variance=noise_rms**2 * slices.band,
+            colours=self.colours,
+            clipped=None
+            if self.clipped is None
+            else clipped_shares(self.clipped, slices.values.shape[1:], slices.grid) > 0,
+        )
+
+    def _witnessed(
+        self, slices: Slices, lattice: Lattice, focal_length_mm: float, f_number: float, noise_rms: float
+    ) -> float | None:
+        """The log odds that slices show the mask in its place; None where nothing tells."""
+        assert self.calibration is not None
+        lens = focal_length_mm, f_number
+        taken = self._taken(slices, focal_length_mm, f_number, noise_rms)
+        if lens not in self.witnesses:
+            known = self.calibration.nearest(focal_length_mm)
+            turn = turn_between(lattice, self.lattice_at(focal_length_mm))
+            through = replace(self, joint_views=False)._calibrated(taken, lattice, known, turn)[0]
+            witness = witness_of(through.used(), workers=self.workers)
+            self.witnesses[lens] = (
+                None if witness is None else (replace(through, values=through.values[:, :0]), witness)
+            )
+        kept = self.witnesses[lens]
+        if kept is None:
+            return None
+        used = replace(kept[0], values=slices.values, noise_variance=taken.noise_variance).used()
+        return kept[1].nats(used.values, used.noise(), self.workers)
 
     def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:
         """The slices of a plane whose clipped pixels are as bright as what is around them tells."""

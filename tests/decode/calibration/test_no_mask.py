@@ -36,20 +36,24 @@ def calibrated() -> tuple[Camera, Calibration]:
     return camera, calibrate([CalibrationFrame(plane, FOCAL_MM, STOPPED_F)], OPTICS)
 
 
-def _doubts(camera: Camera, known: Calibration) -> tuple[Finding, ...]:
+def _doubts(camera: Camera, known: Calibration, *, views: bool = True) -> tuple[Finding, ...]:
     rng = np.random.default_rng(3)
     layers = [(Texture.random(rng, mean=0.2, rms=0.08, waves=60), shift) for shift in (1.4, -0.6)]
     plane = camera.expose(layers)
     plane = (plane + rng.normal(0, 0.004, plane.shape)).astype(np.float32)
-    return MaskDecoder(OPTICS, known).decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=FULL_F)[1].doubts
+    decoder = MaskDecoder(OPTICS, known)
+    return decoder.decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=FULL_F, views=views)[1].doubts
 
 
 @pytest.mark.slow
-def test_a_frame_with_its_mask_is_right_and_one_without_is_in_doubt(calibrated: tuple[Camera, Calibration]) -> None:
+@pytest.mark.parametrize("views", [True, False], ids=["with views", "as in flight"])
+def test_a_frame_with_its_mask_is_right_and_one_without_is_in_doubt(
+    calibrated: tuple[Camera, Calibration], views: bool
+) -> None:
     camera, known = calibrated
-    assert _doubts(camera, known) == ()
+    assert _doubts(camera, known, views=views) == ()
     bare = Bare(camera.distance_mm, camera.rotation_rad, camera.shift_mm, sensor=SENSOR)
-    (told,) = _doubts(bare, known)
+    (told,) = _doubts(bare, known, views=views)
     assert told.code is Code.MASK_UNSEEN
 
 

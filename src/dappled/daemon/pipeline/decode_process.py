@@ -32,13 +32,15 @@ from dappled.drivers.child_process import (
 )
 from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.errors import DappledError
-from dappled.findings import Finding
+from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import Result
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 NICENESS = 10
 _LOOK_S = 0.1
+_MOST_NATS = 20.0  # a mask that falls out is in doubt after five frames with texture: each tells 3.4 nats at most
+_SURE_NATS = 4.6  # odds of 100, as for one frame
 _SEND_S = 5.0
 
 
@@ -54,7 +56,8 @@ class DecodedFrame:
     `preview` is a JPEG of `preview_size` (width, height). `ms` names what took how long. `seen` is what viewers need
     besides, in the words of the `slices` schema. `carriers_found` is None where no carriers can be seen at the frame's
     aperture, `decision` the law for the flight where this frame decided it; `fingerprint` see
-    `decode.lightfield.light_field.fingerprint`. `picture` is what the frame is judged by.
+    `decode.lightfield.light_field.fingerprint`. `picture` is what the frame is judged by, `mask_nats` the log odds that
+    the mask is where it was calibrated (None: nothing tells), `about_flight` what all frames so far tell together.
     """
 
     body: mmap.mmap
@@ -74,6 +77,8 @@ class DecodedFrame:
     decision: LawDecision | None = None
     fingerprint: Mapping[str, Any] | None = None
     picture: PictureFacts | None = None
+    mask_nats: float | None = None
+    about_flight: tuple[Finding, ...] = ()
 
     def result(
         self, index: int, decode_ms: float | None, run: str = "live", judged: Mapping[str, Any] | None = None
@@ -115,6 +120,37 @@ class FrameDepth:
     doubts: tuple[Finding, ...] = ()
 
 
+class FlightMask:
+    """Adds up what the frames of a flight, each counted once, tell of their mask."""
+
+    def __init__(self) -> None:
+        self._nats = 0.0
+        self._shown: dict[int, bool] = {}
+
+    def judged(self, index: int, decoded: DecodedFrame) -> DecodedFrame:
+        """A frame that can't show the mask is not in doubt where the flight's odds are that the mask is there."""
+        if decoded.mask_nats is None:
+            return decoded
+        if index not in self._shown:
+            self._shown[index] = decoded.mask_nats > _SURE_NATS
+            self._nats = min(max(self._nats + decoded.mask_nats, -_MOST_NATS), _MOST_NATS)
+        seen, frames = sum(self._shown.values()), len(self._shown)
+        if seen == frames:
+            return decoded
+        there = self._nats > _SURE_NATS
+        told = finding(
+            Code.MASK_OVER_FLIGHT,
+            Subject("mask"),
+            Level.NOTE if there else None,
+            seen=seen,
+            frames=frames,
+            unseen=frames - seen,
+            nats=self._nats,
+        )
+        doubts = tuple(one for one in decoded.doubts if not (there and one.code is Code.MASK_UNSEEN))
+        return replace(decoded, doubts=doubts, about_flight=(told,))
+
+
 class FrameDecoder(Protocol):
     """Decodes recorded frames, for the pipeline and for answers to subscribers."""
 
@@ -144,6 +180,7 @@ class DecodeProcess:
         self._recipe, self._timeout_s, self._preview_px = recipe, timeout_s, preview_px
         self._budget, self._clock = budget or RestartBudget(limit=6, window_s=60.0), clock or SystemClock()
         self._turn = threading.Lock()
+        self._mask = FlightMask()
         self._process: subprocess.Popen[bytes] | None = None
         self._channel: ProcessChannel | None = None
         self._closed, self._may_look = False, True
@@ -173,7 +210,7 @@ class DecodeProcess:
         with self._turn:
             look = look and self._may_look
             try:
-                decoded = _decoded(self._ask({"do": "decode", "look": look, **frame}))
+                decoded = self._mask.judged(index, _decoded(self._ask({"do": "decode", "look": look, **frame})))
             except DecodeProcessError:
                 self._may_look = self._may_look and not (look and self._process is None)  # it may have died of a search
                 raise

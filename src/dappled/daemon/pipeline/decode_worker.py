@@ -121,6 +121,7 @@ class DecodeWorker:
             "carriers_from": done.report.carriers_from,
             "carriers_found": found,
             "carriers_predicted": done.carriers_predicted,
+            "mask_nats": done.report.mask_nats,
             "law": field.attributes["law"],
             "grid": field.grid.tolist(),
             "seen": _seen(done),

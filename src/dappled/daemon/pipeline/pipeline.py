@@ -162,7 +162,7 @@ class Decoding:
         )
         law = decoded.decision
         decided = () if law is None else (finding(Code.DECODE_LAW_DECIDED, FRAME, why=law.sentence),)
-        self.failures = replace(self.failures, in_a_row=0, found=(*decoded.doubts, *decided))
+        self.failures = replace(self.failures, in_a_row=0, found=(*decoded.doubts, *decoded.about_flight, *decided))
         pending.decoded = decoded
         self._unrecorded = decoded.decision or self._unrecorded
         if self._unrecorded is not None:  # tried again with the next frame where the disk refuses

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.joint.joint_views import PatchShares, joint_views
-from dappled.decode.joint.mask_place import MaskPlace, mask_place
+from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, mask_place
 from dappled.decode.joint.patch_model import FARTHEST, SIDE
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, UsedAperture, angular_frequencies, used_aperture
@@ -159,6 +159,14 @@ def place_of(
         steps_px=steps_px,
         workers=workers,
     )
+
+
+def witness_of(taken: TakenSlices, *, workers: int = 1) -> MaskWitness | None:
+    """What tells whether slices taken so show the mask; None where the joint model is not for them."""
+    if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
+        return None
+    height, width = taken.values.shape[1:]
+    return MaskWitness.of((height, width), taken.model(), samples_px=taken.samples, reach=taken.reach, workers=workers)
 
 
 def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews:

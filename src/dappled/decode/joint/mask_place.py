@@ -31,6 +31,7 @@ from dappled.decode.joint.patch_model import (
     USUAL,
     FrameModel,
     TexturePower,
+    detail_of,
     likelihoods,
     rests_of,
     wholes_of,
@@ -43,9 +44,11 @@ from dappled.workers import each, spans
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
 _MOST_PATCHES = 400  # those with the most texture
+_WITNESSES = 60  # patches that tell in flight whether there is a mask
 _FEWEST = 12  # patches, for an answer at all
 _AT_A_TIME = 50  # patches
 _FAINT = 0.3  # of the mean texture: fainter patches are not scaled up to it, noise and all
+_TRIED = 3  # of so many frequencies one is looked at to choose the kind of witnesses
 _STEPS = 48  # of a period: how finely moves are tried, up to half a period
 _MOST_TURN, _TURNS = 0.007, 81  # radians to either side, and how many are tried
 _ROUNDS = 8  # of Newton's method, from the best that was tried
@@ -56,7 +59,7 @@ _LIKELY, _MANY_NATS = 2.0, 30.0  # or both of these: clean frames gain 14 nats a
 _AT_EDGE = 0.95  # of the farthest turn: beyond it the best is elsewhere
 # Of the patches may lie in anything that places no mask, edges between depths or no parallax: any share is as probable.
 _ASTRAY = (np.arange(32) + 0.5) / 32
-_SEEN = 4.6  # nats: without a mask the odds are 1 on average, whatever the scene, and 100 in at most 1 % of frames
+SEEN = 4.6  # nats: without a mask the odds are 1 on average, whatever the scene, and 100 in at most 1 % of frames
 _SEEN_ELSEWHERE = 1.5  # nats of each patch: turned and moved masks have 3 to 5, one 0.3 % off in scale 0.7
 _OVERLAP = 2.0  # patches that count as one measurement: they overlap by half
 
@@ -87,7 +90,7 @@ class MaskPlace:
     @property
     def seen(self) -> bool:
         """Whether the patches agree on this place: else there is no mask, or nothing has parallax or texture."""
-        return self.nats > _SEEN
+        return self.nats > SEEN
 
     def nowhere(self, nats: float) -> MaskPlace:
         """It without any move, and with these odds: a turn at the search's edge that led nowhere."""
@@ -134,19 +137,12 @@ def mask_place(
     inner = np.flatnonzero(~patches.at_edges)
     if len(inner) < _FEWEST:
         return None
-    cut, means = patches.less_means(patches.cut(slices, inner), model.common()[: len(slices)])
-    contrast = np.einsum("nyx,yx->n", cut[0].real ** 2, patches.window**2)
-    best = np.sort(np.argsort(-contrast, kind="stable")[:_MOST_PATCHES])
-    spectra = patches.spectra(cut[:, best])
+    spectra, means, best = _textured(slices, model, patches, inner, _MOST_PATCHES)
     both = np.concatenate([noise, noise[1:]])
     frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=(USUAL,), workers=workers)
-    radius = frame.radius(frame.frequencies)
-    power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
-    spectrum = TexturePower.of(power, radius)
-    own = spectrum.at(radius)
-    strength = (np.abs(spectra[1:, 0]) ** 2 / (own[1:, None] + frame.noise[0])).mean(axis=0)
-    spectra /= np.sqrt(np.maximum(strength, _FAINT)).astype(np.float32)  # no patch outvotes the others
-    corners = np.array(patches.corners)[inner[best]] - SIDE
+    spectrum, own = _texture(frame, spectra)
+    spectra /= _strengths(spectra, own + frame.noise[0])
+    corners = np.array(patches.corners)[best] - SIDE
     middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
     place: MaskPlace | None = None
     likely = -np.inf
@@ -155,7 +151,7 @@ def mask_place(
             more = FrameModel.of(patches, model, samples_px, both, reach, ranges=(some,), workers=workers)
             frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
         kinds = [kind for kind in KINDS if kind.range == some]
-        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means[best] ** 2))), kinds)
+        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means**2))), kinds)
         wholes = list(wholes_of(frame, rests, range(len(kinds))))
         found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
         if found.max() <= likely:
@@ -166,6 +162,72 @@ def mask_place(
         if place.seen:
             break
     return place
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MaskWitness:
+    """Tells at little cost whether slices taken through one lens show the mask where it was calibrated."""
+
+    patches: Patches
+    frame: FrameModel
+
+    @classmethod
+    def of(
+        cls,
+        shape: tuple[int, int],
+        model: SliceModel,
+        *,
+        samples_px: tuple[float, float],
+        reach: float,
+        workers: int = 1,
+    ) -> MaskWitness | None:
+        """For slices (h, w) of this shape, as `mask_place`; None for too small ones."""
+        patches = Patches(shape, SIDE)
+        if np.count_nonzero(~patches.at_edges) < _FEWEST:
+            return None
+        silent = np.zeros(len(model.orders))
+        return cls(patches, FrameModel.of(patches, model, samples_px, silent, reach, ranges=(USUAL,), workers=workers))
+
+    def nats(self, slices: Complexes, noise: Floats, workers: int = 1) -> float:
+        """The log odds of a mask in its place against none, by a frame with this `noise` (K,)."""
+        model, inner = self.frame.model, np.flatnonzero(~self.patches.at_edges)
+        spectra, means, best = _textured(slices, model, self.patches, inner, _WITNESSES)
+        frame = replace(self.frame, noise=np.concatenate([noise, noise[1:]]))
+        spectrum, own = _texture(frame, spectra)
+        spectra /= _strengths(spectra, own + frame.noise[0])
+        kinds = [kind for kind in KINDS if kind.range == USUAL]
+        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means**2))), kinds)
+        few = slice(None, None, _TRIED)
+        found = likelihoods(
+            list(wholes_of(frame, rests, range(len(kinds)), few)), spectra[few], frame.weights[few], workers
+        ).sum(axis=1)
+        whole = rests.whole(int(found.argmax()), detail_of(frame.ranges[USUAL].seen, own))
+        differences, terms = _terms(model.orders, whole, frame.weights, spectra, workers)
+        return _Likelihood(differences, terms, np.zeros((len(best), 2))).nats(np.zeros(3))
+
+
+def _texture(frame: FrameModel, spectra: Complexes) -> tuple[TexturePower, Floats]:
+    """The power of texture that patches (F, A, N) have, and at their frequencies (F,)."""
+    radius = frame.radius(frame.frequencies)
+    power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
+    spectrum = TexturePower.of(power, radius)
+    return spectrum, spectrum.at(radius)
+
+
+def _textured(
+    slices: Complexes, model: SliceModel, patches: Patches, inner: NDArray[np.intp], most: int
+) -> tuple[Complexes, Floats, NDArray[np.intp]]:
+    """The spectra (F, A, N), means (N,) and numbers (N,) of those `inner` patches with the most texture."""
+    contrast = patches.contrasts(slices[0].real, inner)
+    best = inner[np.sort(np.argsort(-contrast, kind="stable")[:most])]
+    cut, means = patches.less_means(patches.cut(slices, best), model.common()[: len(slices)])
+    return patches.spectra(cut), means, best
+
+
+def _strengths(spectra: Complexes, own: Floats) -> Singles:
+    """(N,) by how much patches (F, A, N) are stronger than power `own` (F,): divided by it none outvotes the others."""
+    strength = (np.abs(spectra[1:, 0]) ** 2 / own[1:, None]).mean(axis=0)
+    return np.asarray(np.sqrt(np.maximum(strength, _FAINT)), dtype=np.float32)
 
 
 def _terms(
@@ -218,12 +280,12 @@ class _Likelihood:
             apart = np.zeros(3)
         if np.hypot(*found[:2]) < _LEAST_PERIODS or not self._sure(found, apart):
             found = apart
-        nats = self._nats(found)
+        nats = self.nats(found)
         if (
             found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP
         ):  # patches that gain, each for a reason of its own
             found = np.zeros(3)
-            nats = self._nats(found)
+            nats = self.nats(found)
         sigma = self._sigma(found)
         return MaskPlace(
             (float(found[0]), float(found[1])),
@@ -234,7 +296,7 @@ class _Likelihood:
             len(self.terms),
         )
 
-    def _nats(self, move: Floats) -> float:
+    def nats(self, move: Floats) -> float:
         """The log odds of a mask there, against a place for each patch."""
         with_place = np.any(self.differences != 0, axis=1)
         terms, differences = self.terms[:, with_place], self.differences[with_place]

@@ -81,6 +81,11 @@ class Patches:
         patches -= (common[:, None] * means).astype(np.complex64)[:, :, None, None]
         return patches, means
 
+    def contrasts(self, image: NDArray[Any], which: NDArray[np.intp]) -> Floats:
+        """(N,) by the window, the variances of `which` (N,) patches of an image (h, w)."""
+        cut, _ = self.less_means(self.cut(image[None].astype(np.complex64), which), np.ones(1, dtype=np.complex128))
+        return np.asarray(np.einsum("nyx,yx->n", cut[0].real ** 2, self.window**2))
+
     def spectra(self, patches: Complexes) -> Complexes:
         """(F, 2K − 1, N) the spectra of patches (K, N, side, side), of the slices and then of their conjugates but the
         first's, scaled so that white noise keeps its variance."""
