@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
 
@@ -97,33 +98,9 @@ def _smooth(values: Singles, sizes: list[int]) -> Singles:
     made = values
     for axis, size in enumerate(sizes):
         if size > 1:
-            around = _PASSES * (size - 1)
-            widths = [(0, 0), (0, 0)]
-            widths[axis] = (around // 2, around - around // 2)
-            made = np.pad(made, widths, mode="edge")
-            for _ in range(_PASSES):
-                made = _running_sum(made, size, axis)
-            made *= np.float32(1 / size**_PASSES)
-    return made
-
-
-def _running_sum(values: Singles, size: int, axis: int) -> Singles:
-    """Sums of `size` neighbours along an axis, of sums of 1, 2, 4 … of them: few additions, no drift."""
-    length = values.shape[axis] - size + 1
-
-    def part(sums: Singles, start: int, count: int) -> Singles:
-        return sums[start : start + count] if axis == 0 else sums[:, start : start + count]
-
-    made, done, sums = None, 0, values
-    for power in range(size.bit_length()):
-        width = 1 << power
-        if size & width:
-            more = part(sums, done, length)
-            made, done = (more.copy() if made is None else np.add(made, more, out=made)), done + width
-        if size >> (power + 1):
-            count = sums.shape[axis] - width
-            sums = part(sums, 0, count) + part(sums, width, count)
-    assert made is not None
+            for turn in range(_PASSES):  # an even number of samples to either side by turns
+                origin = -1 if size % 2 == 0 and turn != 1 else 0
+                made = ndimage.uniform_filter1d(made, size, axis, mode="nearest", origin=origin)
     return made
 
 
