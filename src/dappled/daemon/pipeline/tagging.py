@@ -186,7 +186,7 @@ class Tagging:
         try:
             return FrameSettings.of(reading.read_metadata(self._ends.writer.path(frame)))
         except DappledError as error:
-            found = finding(Code.FILE_UNREADABLE, Subject("file", frame.name), why=str(error))
+            found = finding(Code.FILE_UNREADABLE, FRAME, name=frame.name, why=str(error))
             self._ends.note("unreadable", found, frame.index)
             return FrameSettings()
 
