@@ -3,7 +3,6 @@ said), and `finding_codes.pyi`, the codes for type checkers and editors."""
 
 from __future__ import annotations
 
-from itertools import groupby
 from pathlib import Path
 
 from dappled.findings import words
@@ -24,26 +23,23 @@ class Code(StrEnum):
 HEAD = """# What can be found
 
 Whatever a person may have to know is a finding: a code, a level, what it is about, and facts. Health record, ledger,
-wire and `--json` hold these; the console, `dappled status`, the pilot's messages, the metrics and the log show them in
-these words, worst first, then newest. A *note* stands in the way of nothing. Above it nothing is "go": a *caution*
-costs something, and with a *stop* no good frame is made, or none is taken. Words in braces are facts; one with `?` is
-left out where it is unknown. A finding ends when the part that reported it sees that it is over.
+wire and `--json` hold these; the console, `dappled status`, STATUSTEXT, metrics and the log show them in these words,
+worst first, then newest. A *note* needs no action. A *caution* costs something. With a *stop* no frame, or no good one,
+is made. Words in braces are facts; one with `?` is left out where it is unknown. A finding ends when the part that
+reported it sees that it is over. A code that is a link leads to the page that says more.
 
-This page is made from the table in the code: `python tools/findings_page.py`.
+`python tools/findings_page.py` makes this page from the table in the code.
 """
 TITLES = "| code | level | what was found | what to do |\n| --- | --- | --- | --- |"
 
 
 def page() -> str:
     """The page as it should be."""
-    parts = [HEAD]
-    for about, each in groupby(words().items(), lambda one: one[0].value.partition(".")[0]):
-        rows = [f"## {about}\n\n{TITLES}"]
-        for code, told in each:
-            more = f"{' ' if told.remedy else ''}([more]({told.page}))" if told.page else ""
-            rows.append(f"| `{code.value}` | {told.level.word} | {told.sentence} | {told.remedy}{more} |")
-        parts.append("\n".join(rows) + "\n")
-    return "\n".join(parts)
+    rows = []
+    for code, each in words().items():
+        name = f"[`{code.value}`]({each.page})" if each.page else f"`{code.value}`"
+        rows.append(f"| {name} | {each.level.word} | {each.sentence} | {each.remedy} |")
+    return "\n".join([HEAD, TITLES, *rows, ""])
 
 
 def stub() -> str:
