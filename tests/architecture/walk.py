@@ -200,7 +200,7 @@ def between(page: str, marks: tuple[str, str]) -> str:
 
 
 def module_list() -> str:
-    """All modules as Markdown, a list for each folder, with the first line of each docstring."""
+    """All modules as Markdown, a list for each folder, with each docstring's first line up to its colon."""
     parts = []
     for folder in sorted({file.parent for file in SOURCE.rglob("*.py")}):
         modules = sorted(file.stem for file in folder.glob("*.py") if file.stem != "__init__")
@@ -215,7 +215,10 @@ def _docstring(module: str) -> str:
     place = SOURCE / module.replace(".", "/")
     package = place / "__init__.py"
     file = package if package.exists() else place.with_suffix(".py")
-    return (ast.get_docstring(parsed(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+    line = (ast.get_docstring(parsed(file.read_text(encoding="utf-8"))) or "").partition("\n")[0]
+    said = re.split("[:;] ", line)[0]
+    whole = len(said.split()) > 5 and said.count("`") % 2 == 0 and said.count("(") == said.count(")")
+    return f"{said.rstrip('.')}." if whole else line
 
 
 def main() -> int:
