@@ -185,5 +185,5 @@ def test_what_a_slice_cannot_carry_is_taken_out_of_the_views() -> None:
 
 
 def test_carriers_that_no_grid_can_hold_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"between 0\.025 and 0\.4"):
+    with pytest.raises(ValueError, match=r"between 0\.00625 and 0\.4"):
         Grid.of((100, 100), Lattice((0.45, 0.0), (0.0, 0.45)))

@@ -57,7 +57,7 @@ class Grid:
         if not 2 <= step <= 128:
             raise ValueError(
                 f"carriers {spacing[0]:.4f} × {spacing[1]:.4f} cycles/pixel apart can't be simulated: "
-                "they must be between 0.003125 and 0.4"
+                "they must be between 0.00625 and 0.4"
             )
         if sharp:
             step = max(2, math.floor(step / SHARPER))
