@@ -24,7 +24,7 @@ CALLS: dict[str, list[str]] = {
     "doctor": ["--config", "none.toml"],
     "status": ["--config", "none.toml"],
     "open": ["none"],
-    "watch": ["tcp://127.0.0.1:5599"],
+    "watch": ["tcp://127.0.0.1:5599", "--timeout", "0.1"],
     "keys make": ["a/b"],
     "keys show": ["none.toml"],
     "keys token": ["none/token"],

@@ -85,10 +85,8 @@ def test_the_readme_leads_to_a_flight_report_with_a_simulated_450d(
     with LedgerReader.open(flight / "flight.sqlite") as ledger:  # on a busy machine a pose may be late, not the focus
         verdicts = [result.verdict for result in ledger.results().values()]
     assert len(verdicts) == 3
-    unsure = [
-        found for found in verdicts if found is None or Code.FRAME_FOCUS_UNKNOWN in {one.code for one in found.reasons}
-    ]
-    assert len(unsure) <= 1, verdicts  # over faint ground a flight's first frame can't be told from a soft one
+    # Views of mask 2 are 44 px a side: with so few frames to compare with, the focus can't be told.
+    assert all(found and Code.FRAME_FOCUS_UNKNOWN in {one.code for one in found.reasons} for found in verdicts)
     assert all(found is not None and found.state != "bad" for found in verdicts), verdicts
     recorded = dappled.open(flight)
     assert isinstance(recorded, OpenedFlight)
