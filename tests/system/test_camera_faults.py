@@ -153,7 +153,7 @@ def test_unplugged_in_mid_exposure(here: Path) -> None:
 
 @pytest.mark.slow
 def test_unplugged_in_mid_download(here: Path) -> None:
-    with a_body() as body, daemon_before(here, body) as daemon:
+    with a_body() as body, daemon_before(here, body, file_timeout_s=120) as daemon:
         body.fault("unplug-transfer")
         index = wished(daemon)
         eventually(lambda: daemon.camera == "absent", "the camera is absent")
