@@ -62,6 +62,7 @@ _UNKNOWN: Mapping[str, Any] = {
     "view_sigma": None,
     "views_unclipped": False,
 }
+_Seen = tuple[str, Lattice, float, float]
 _BY_CHANCE = 3  # carriers, with the mean, that a scene may seem to show
 _CARRIERS_NATS = 20.0  # that the mask is there, where more carriers than by chance are seen
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
@@ -171,8 +172,8 @@ class MaskDecoder:
     lattice where a search has found it, `ratio` the matrix, row by row, of the lattice found in a flight over the
     law's: a print scaled and turned. Without `joint_views` the views are made quickly, each spatial frequency alike
     (see `views`): depth is computed from slices and needs no better ones. `clipped` (H, W) is 1 where this frame's
-    pixels are clipped, else 0; None: nowhere. `buffers` are reused from frame to frame, as are the `witnesses` of a
-    mask, one for each focal length and f-number.
+    pixels are clipped, else 0; None: nowhere. `buffers` are reused from frame to frame, as is the one in
+    `witnesses`, of the last law, lattice, focal length and f-number.
     """
 
     optics: MaskedOptics
@@ -188,9 +189,7 @@ class MaskDecoder:
     joint_views: bool = True
     clipped: Singles | None = None
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
-    witnesses: dict[tuple[float, float], tuple[TakenSlices, MaskWitness] | None] = field(
-        default_factory=dict, repr=False
-    )
+    witnesses: dict[_Seen, tuple[TakenSlices, MaskWitness] | None] = field(default_factory=dict, repr=False)
 
     def __post_init__(self) -> None:
         """Raises DecodeError for another camera's calibration."""
@@ -516,17 +515,18 @@ class MaskDecoder:
     ) -> float | None:
         """The log odds that slices show the mask in its place; None where nothing tells."""
         assert self.calibration is not None
-        lens = focal_length_mm, f_number
+        through_this = self.optics.law, lattice, focal_length_mm, f_number
         taken = self._taken(slices, focal_length_mm, f_number, noise_rms)
-        if lens not in self.witnesses:
+        if through_this not in self.witnesses:
             known = self.calibration.nearest(focal_length_mm)
             turn = turn_between(lattice, self.lattice_at(focal_length_mm))
             through = replace(self, joint_views=False)._calibrated(taken, lattice, known, turn)[0]
             witness = witness_of(through.used(), workers=self.workers)
-            self.witnesses[lens] = (
+            self.witnesses.clear()  # one has 20 MB, and a lens that zooms would leave one at each length
+            self.witnesses[through_this] = (
                 None if witness is None else (replace(through, values=through.values[:, :0]), witness)
             )
-        kept = self.witnesses[lens]
+        kept = self.witnesses[through_this]
         if kept is None:
             return None
         used = replace(kept[0], values=slices.values, noise_variance=taken.noise_variance).used()
