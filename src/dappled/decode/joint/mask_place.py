@@ -133,25 +133,22 @@ def mask_place(
     `samples_px`, `noise` and `reach` as for `joint_views`. `turned` (2, 2) is by how many cycles per sensor pixel (rows
     ky and kx) the carriers move for each radian of turn, `steps_px` by how many rows and columns of it a sample steps.
     """
-    patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
-    inner = np.flatnonzero(~patches.at_edges)
-    if len(inner) < _FEWEST:
+    shape = (slices.shape[1], slices.shape[2])
+    witness = MaskWitness.of(shape, model, samples_px=samples_px, reach=reach, workers=workers)
+    if witness is None:
         return None
-    spectra, means, best = _textured(slices, model, patches, inner, _MOST_PATCHES)
-    both = np.concatenate([noise, noise[1:]])
-    frame = FrameModel.of(patches, model, samples_px, both, reach, ranges=(USUAL,), workers=workers)
-    spectrum, own = _texture(frame, spectra)
-    spectra /= _strengths(spectra, own + frame.noise[0])
-    corners = np.array(patches.corners)[best] - SIDE
-    middles = corners + SIDE / 2 - np.array(slices.shape[1:]) / 2
+    seen, patches = _Textured.of(witness, slices, noise, _MOST_PATCHES), witness.patches
+    frame, spectra = seen.frame, seen.spectra
+    corners = np.array(patches.corners)[seen.patches] - SIDE
+    middles = corners + SIDE / 2 - np.array(shape) / 2
     place: MaskPlace | None = None
     likely = -np.inf
     for some in (USUAL, AT_REST):  # at rest only where it matters: it costs half as much again
         if some not in frame.ranges:
-            more = FrameModel.of(patches, model, samples_px, both, reach, ranges=(some,), workers=workers)
+            more = FrameModel.of(patches, model, samples_px, frame.noise, reach, ranges=(some,), workers=workers)
             frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
         kinds = [kind for kind in KINDS if kind.range == some]
-        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means**2))), kinds)
+        rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
         wholes = list(wholes_of(frame, rests, range(len(kinds))))
         found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
         if found.max() <= likely:
@@ -190,44 +187,47 @@ class MaskWitness:
 
     def nats(self, slices: Complexes, noise: Floats, workers: int = 1) -> float:
         """The log odds of a mask in its place against none, by a frame with this `noise` (K,)."""
-        model, inner = self.frame.model, np.flatnonzero(~self.patches.at_edges)
-        spectra, means, best = _textured(slices, model, self.patches, inner, _WITNESSES)
-        frame = replace(self.frame, noise=np.concatenate([noise, noise[1:]]))
-        spectrum, own = _texture(frame, spectra)
-        spectra /= _strengths(spectra, own + frame.noise[0])
+        seen = _Textured.of(self, slices, noise, _WITNESSES)
+        frame, spectra = seen.frame, seen.spectra
         kinds = [kind for kind in KINDS if kind.range == USUAL]
-        rests = rests_of(frame, spectrum, own, float(np.sqrt(np.mean(means**2))), kinds)
+        rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
         few = slice(None, None, _TRIED)
-        found = likelihoods(
-            list(wholes_of(frame, rests, range(len(kinds)), few)), spectra[few], frame.weights[few], workers
-        ).sum(axis=1)
-        whole = rests.whole(int(found.argmax()), detail_of(frame.ranges[USUAL].seen, own))
-        differences, terms = _terms(model.orders, whole, frame.weights, spectra, workers)
-        return _Likelihood(differences, terms, np.zeros((len(best), 2))).nats(np.zeros(3))
+        wholes = wholes_of(frame, rests, range(len(kinds)), few)
+        found = likelihoods(wholes, spectra[few], frame.weights[few], workers).sum(axis=1)
+        whole = rests.whole(int(found.argmax()), detail_of(frame.ranges[USUAL].seen, seen.own))
+        differences, terms = _terms(frame.model.orders, whole, frame.weights, spectra, workers)
+        return _Likelihood(differences, terms, np.zeros((len(terms), 2))).nats(np.zeros(3))
 
 
-def _texture(frame: FrameModel, spectra: Complexes) -> tuple[TexturePower, Floats]:
-    """The power of texture that patches (F, A, N) have, and at their frequencies (F,)."""
-    radius = frame.radius(frame.frequencies)
-    power = np.maximum((np.abs(spectra[:, 0]) ** 2).mean(axis=1) - frame.noise[0], 0)
-    spectrum = TexturePower.of(power, radius)
-    return spectrum, spectrum.at(radius)
+@dataclass(frozen=True, slots=True, eq=False)
+class _Textured:
+    """The `patches` (N,) of a frame with the most texture: its model, the power of their texture, `own` (F,) at their
+    frequencies, the root of their mean square `mean`, and their `spectra` (F, A, N), so that none outvotes the others.
+    """
 
+    patches: NDArray[np.intp]
+    frame: FrameModel
+    spectrum: TexturePower
+    own: Floats
+    mean: float
+    spectra: Complexes
 
-def _textured(
-    slices: Complexes, model: SliceModel, patches: Patches, inner: NDArray[np.intp], most: int
-) -> tuple[Complexes, Floats, NDArray[np.intp]]:
-    """The spectra (F, A, N), means (N,) and numbers (N,) of those `inner` patches with the most texture."""
-    contrast = patches.contrasts(slices[0].real, inner)
-    best = inner[np.sort(np.argsort(-contrast, kind="stable")[:most])]
-    cut, means = patches.less_means(patches.cut(slices, best), model.common()[: len(slices)])
-    return patches.spectra(cut), means, best
-
-
-def _strengths(spectra: Complexes, own: Floats) -> Singles:
-    """(N,) by how much patches (F, A, N) are stronger than power `own` (F,): divided by it none outvotes the others."""
-    strength = (np.abs(spectra[1:, 0]) ** 2 / own[1:, None]).mean(axis=0)
-    return np.asarray(np.sqrt(np.maximum(strength, _FAINT)), dtype=np.float32)
+    @classmethod
+    def of(cls, witness: MaskWitness, slices: Complexes, noise: Floats, most: int) -> _Textured:
+        """Of slices (K, h, w) with this `noise` (K,), so many patches at most."""
+        patches = witness.patches
+        inner = np.flatnonzero(~patches.at_edges)
+        best = inner[np.sort(np.argsort(-patches.contrasts(slices[0].real, inner), kind="stable")[:most])]
+        cut, means = patches.less_means(patches.cut(slices, best), witness.frame.model.common()[: len(slices)])
+        spectra = patches.spectra(cut)
+        frame = replace(witness.frame, noise=np.concatenate([noise, noise[1:]]))
+        radius = frame.radius(frame.frequencies)
+        power = np.abs(spectra[:, 0]) ** 2
+        spectrum = TexturePower.of(np.maximum(power.mean(axis=1) - frame.noise[0], 0), radius)
+        own = spectrum.at(radius)
+        strength = (power[1:] / (own + frame.noise[0])[1:, None]).mean(axis=0)
+        spectra /= np.asarray(np.sqrt(np.maximum(strength, _FAINT)), dtype=np.float32)
+        return cls(best, frame, spectrum, own, float(np.sqrt(np.mean(means**2))), spectra)
 
 
 def _terms(
