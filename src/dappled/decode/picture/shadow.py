@@ -469,10 +469,10 @@ class _Equations:
         inverse = np.linalg.inv(normal)
         step = inverse @ total
         sure = np.sum(parts, axis=0)
-        left = scores.copy()
-        left[:, :4] -= np.einsum("bki,bk->bi", levers, sure * (levers @ step[:4] + step[4:]))
-        left[:, 4:] -= sure * (levers @ step[:4] + step[4:])
-        errors = left @ inverse[:, :4]
+        explained = sure * (levers @ step[:4] + step[4:])
+        scores[:, :4] -= np.einsum("bki,bk->bi", levers, explained)
+        scores[:, 4:] -= explained
+        errors = scores @ inverse[:, :4]
         return step[:4], np.asarray(errors.T @ errors)
 
     def displaced(self, shadow: Shadow) -> Floats:
