@@ -89,6 +89,7 @@ _HIGH = ["--camera", "reference-36mm", "--focal-length", "50", "--altitude", "50
         ["trigger", "--count", "0"],
         ["mask", "make", "--period", "nan", "-o", "x.png"],
         ["watch", "fish://"],
+        ["watch", "--ask", "fish://"],
         ["status", "tcp://nowhere"],
         ["mask", "plan", *_HIGH, "--speed", "0"],
         ["mask", "plan", *_HIGH, "--speed", "5", "--overlap", "80"],

@@ -35,8 +35,13 @@ class WatchStream(Verb):
     )  # fmt: skip
     config: Path | None = option("--config", "the daemon's settings file, which names the endpoint", None)
     ask: str | None = option(
-        "--ask", "endpoint that answers requests", None, metavar="ENDPOINT", otherwise="the one beside an ipc stream",
-    )  # fmt: skip
+        "--ask",
+        "endpoint that answers requests",
+        None,
+        metavar="ENDPOINT",
+        otherwise="the one beside an ipc stream",
+        parse=to_endpoint,
+    )
     save: Path | None = option("--save", "save each frame's header, slices and mosaic here", None, metavar="DIR")
     from_start: bool = flag("--from-start", "also fetch what the flight has sent already")
     count: int | None = option("--count", "end after the slices of N frames", None, low=1)
