@@ -146,12 +146,12 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         recording = self._recording()
         found: list[Finding] = list(recording.findings)
         flown = self._as_recorded(facts, recipe)
-        flight: dict[str, tuple[Finding, ...]] = {}
+        of_flight: list[Finding] = []
 
         def tell(shot: PendingShot) -> None:
             output.row(frame_values(shot), frame_line(shot))
             if shot.decoded:
-                flight["last"] = shot.decoded.about_flight
+                of_flight[:] = shot.decoded.about_flight
 
         progress = ReplayProgress(tell)
         with ExitStack() as stack:
@@ -175,7 +175,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
                 pace=self._pace(),
                 report=found.append,
             )
-        told = first_of_each([*found, *flight.get("last", ())])
+        told = first_of_each([*found, *of_flight])
         if not self.verify:
             if told:
                 output.row({"findings": codec.plain(in_order(told))})

@@ -42,8 +42,7 @@ class World:
     0 opens the lens, None stops it down until carriers show; `truth`, for tests, is a folder for the true values.
     `real`: with a round stop, a film printed 0.3 % too fine, and ground whose detail does not end with a slice's band.
     `overlapping`: the vehicle flies so slowly that frames overlap, however long this computer takes for each.
-    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in
-    software in the loop."""
+    `autopilot`: False where the links of the settings lead to one, such as ArduPilot in software in the loop."""
 
     seed: int = 1
     scale: float = 0.5

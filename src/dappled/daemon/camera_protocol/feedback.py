@@ -16,8 +16,8 @@ _IMAGES = 2**16  # img_idx has 16 bits
 
 
 class CameraFeedback:
-    """The CAMERA_FEEDBACK of our autopilot. `makes_shots`: each trigger that is
-    reported is a shot, as something else fires the camera."""
+    """The CAMERA_FEEDBACK of our autopilot. `makes_shots`: each trigger that is reported is a shot, as something
+    else fires the camera."""
 
     def __init__(self, autopilot: OwnAutopilot, clock: Clock, *, makes_shots: bool) -> None:
         self._autopilot, self._clock = autopilot, clock
