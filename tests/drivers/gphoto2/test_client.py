@@ -466,6 +466,22 @@ def test_a_process_that_keeps_dying_is_not_started_for_ever(body: SimulatedBody)
         assert len(started) == 3  # the first start and two restarts
 
 
+def test_what_changes_on_the_bus_ends_the_wait_of_a_process_that_kept_dying() -> None:
+    """A body that was plugged in again is another one; the budget would allow the next start an hour later."""
+    bus = ["1-1"]
+
+    def dies(settings: GPhoto2Settings, carryover: Carryover) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
+        channel, other = ProcessChannel.pair()
+        other.close()
+        return subprocess.Popen(["/bin/false"]), channel
+
+    camera = GPhoto2Camera(GPhoto2Settings(), spawn=dies, budget=RestartBudget(2, 3600.0), bus=lambda: tuple(bus))
+    with running(camera):
+        for place in ("1-2", "1-3"):
+            until(camera, lambda event: isinstance(event, StateChanged) and "too often" in event.reason)
+            bus.append(place)
+
+
 def test_the_process_dies_with_its_parent(body: SimulatedBody) -> None:
     """A parent that is killed can't end its child; the child must end all the same."""
     script = (

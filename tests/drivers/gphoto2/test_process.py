@@ -278,8 +278,12 @@ def test_a_camera_is_looked_for_when_the_bus_changes_and_else_rarely(harness: Ha
     nodes.append(1)
     harness.turn(1.1)
     assert len(camera.policies) == 2
-    harness.turn(20.0)  # what the bus doesn't tell
+    harness.turn(1.1)  # its descriptors come after its name
     assert len(camera.policies) == 3
+    camera.errors["open"] = [NotOnBusError("no camera is on USB") for _ in range(4)]
+    harness.turn(20.0)  # what the bus doesn't tell
+    harness.turn(1.1)
+    assert len(camera.policies) == 4
     camera.errors["open"] = [AbsentError("no camera answers at usb:001,002")]  # one that is there, and may answer yet
     nodes.append(2)
     harness.turn(1.1)

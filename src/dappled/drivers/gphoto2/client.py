@@ -1,7 +1,7 @@
 """Drive a camera over USB or PTP/IP through libgphoto2, which runs in a process of its own.
 
 This side never blocks: it passes commands to the process and events to the receiver, kills the process when it stops
-answering, and starts it again, at most five times a minute.
+answering, and starts it again, at most five times a minute, and once more where something changes on the USB bus.
 """
 
 from __future__ import annotations
@@ -46,6 +46,7 @@ from dappled.drivers.child_process import (
     start_child,
 )
 from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, lost_file, message_event
+from dappled.drivers.gphoto2.protocol import bus_nodes
 from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings, parse_settings
 from dappled.findings import Code, Subject, finding
 from dappled.workers import Loop
@@ -56,6 +57,7 @@ _STOP_S = 1.4
 _KILL_S = 0.6
 _SPAWN_S = 1.0
 _LIVE_S = 2.0
+_BUS_S = 0.5
 
 Spawn = Callable[[GPhoto2Settings, Carryover], tuple["subprocess.Popen[bytes]", ProcessChannel]]
 
@@ -95,12 +97,14 @@ class GPhoto2Camera(QueuedCamera):
         spawn: Spawn = spawn_process,
         clock: Clock | None = None,
         budget: RestartBudget | None = None,
+        bus: Callable[[], object] = bus_nodes,
     ) -> None:
         super().__init__()
         self._settings = settings
         self._spawn = spawn
         self._clock = clock or SystemClock()
         self._budget = budget or RestartBudget(limit=5, window_s=60.0)
+        self._bus = bus
         self._loop = Loop("gphoto2", self._supervise)
         self._lock = threading.Lock()  # guards the next three
         self._channel: ProcessChannel | None = None
@@ -318,8 +322,11 @@ class GPhoto2Camera(QueuedCamera):
         wait_ns = self._budget.wait_ns(now_ns)
         if wait_ns:
             reason = f"the camera's process ended too often; the next attempt is in {wait_ns / 1e9:.0f} s"
+            bus, end_ns = self._bus(), now_ns + wait_ns
             self.report(StateChanged("faulted", reason, now_ns))
-            self._loop.stopping.wait(wait_ns / 1e9)
+            while self._bus() == bus and self._clock.monotonic_ns() < end_ns:
+                if self._loop.stopping.wait(_BUS_S):
+                    break
         self._budget.spend(self._clock.monotonic_ns())
 
 

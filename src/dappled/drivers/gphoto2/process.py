@@ -43,8 +43,9 @@ from dappled.drivers.gphoto2.protocol import (
     Session,
     SessionError,
     SettingTurned,
+    bus_nodes,
 )
-from dappled.drivers.gphoto2.session import bus_nodes, open_session
+from dappled.drivers.gphoto2.session import open_session
 from dappled.drivers.gphoto2.settings import GPhoto2Settings
 from dappled.drivers.gphoto2.state import CameraState
 from dappled.drivers.gphoto2.viewfinder import Viewfinder
@@ -55,6 +56,8 @@ _POLL_IDLE_S = 0.3
 _REOPEN_S = 0.25
 _SURE_NS = 15 * 10**9
 """Looking for a camera loads all of libgphoto2's drivers: so often where the bus is as it was when there was none."""
+_SETTLED_NS = 5 * 10**9
+"""So long after a change of the bus something that is there may not be found yet."""
 _LAST_TRIES = 3
 _HEAD_BYTES = 65536
 _QUIET_S = 5.0
@@ -84,7 +87,7 @@ class CameraLoop:
         self._viewfinder = Viewfinder(channel)
         self._session: Session | None = None
         self._keeps_files = settings.capture_target == "card"
-        self._open_at_ns = self._sure_until_ns = 0
+        self._open_at_ns = self._sure_until_ns = self._settled_ns = 0
         self._bus = bus if "ptpip:" not in (settings.port or "") else object  # a network doesn't tell: never the same
         self._bus_then = self._bus()
 
@@ -247,6 +250,8 @@ class CameraLoop:
         if self._is_away and bus == self._bus_then and now_ns < self._sure_until_ns:
             self._open_at_ns = now_ns + round(self._settings.timeouts.retry_s * 1e9)
             return
+        if bus != self._bus_then:
+            self._settled_ns = now_ns + _SETTLED_NS
         self._bus_then, self._sure_until_ns = bus, 0
         if self._sender.state is None:
             self._send_state("starting")
@@ -258,7 +263,7 @@ class CameraLoop:
                 self._open_at_ns = self._now_ns() + round(_REOPEN_S * 1e9)
                 return
             self._open_at_ns = self._now_ns() + round(self._settings.timeouts.retry_s * 1e9)
-            if isinstance(error, NotOnBusError):
+            if isinstance(error, NotOnBusError) and now_ns >= self._settled_ns:
                 self._sure_until_ns = self._now_ns() + _SURE_NS
             self._send_state("absent" if isinstance(error, AbsentError) else "faulted", str(error))
             return

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
@@ -11,6 +13,16 @@ from dappled.drivers.camera import Blob, Identity, Setting, SettingName
 _MEMORY_FOLDER = "/"
 FileFacts: TypeAlias = tuple[int, int | None]
 """A file's size in bytes, and when it was made by the body's clock, in seconds; None where the body doesn't say."""
+
+
+def bus_nodes(dev: Path = Path("/dev/bus/usb")) -> frozenset[tuple[str, int, int, int, int]]:
+    """The device files of the USB bus, each with what tells that it was made anew or may be opened by others."""
+    found = set()
+    for path in dev.glob("*/*"):
+        with contextlib.suppress(OSError):  # it is gone
+            node = path.stat()
+            found.add((str(path), node.st_ino, node.st_mode, node.st_uid, node.st_gid))
+    return frozenset(found)
 
 
 class SessionError(Exception):

@@ -110,16 +110,6 @@ def open_session(settings: GPhoto2Settings, before: str | None = None) -> GPhoto
     raise _none_found(settings, trouble, others)
 
 
-def bus_nodes(dev: Path = Path("/dev/bus/usb")) -> frozenset[tuple[str, int, int, int, int]]:
-    """The device files of the USB bus, each with what tells that it was made anew or may be opened by others."""
-    found = set()
-    for path in dev.glob("*/*"):
-        with contextlib.suppress(OSError):  # it is gone
-            node = path.stat()
-            found.add((str(path), node.st_ino, node.st_mode, node.st_uid, node.st_gid))
-    return frozenset(found)
-
-
 def _none_found(settings: GPhoto2Settings, trouble: list[SessionError], others: list[str]) -> SessionError:
     for error in trouble:
         if not isinstance(error, AbsentError):
