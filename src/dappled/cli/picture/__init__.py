@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,18 @@ from dappled.findings import Finding
 if not words_only:
     from dappled.cli.picture import places
     from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
-    from dappled.products.handover import picture_files
+    from dappled.products.handover import picture_files, reflectance
+    from dappled.products.handover.reflectance import ReflectancePanel, ReflectancePicture
+
+_PANEL = "reflectance"
+
+
+def _rectangle(text: str) -> tuple[int, int, int, int]:
+    try:
+        left, top, right, bottom = (int(word) for word in text.split(","))
+    except ValueError:
+        raise ValueError(f"{text!r} is not four whole numbers: left,top,right,bottom") from None
+    return left, top, right, bottom
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,11 +38,26 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
     examples = (
         "dappled picture frame.cr2 --mask mask-2 -o frame.dng",
         "dappled picture FLIGHT -o pictures/ --as jpg    (by the flight's own mask, camera and calibration)",
+        "dappled picture panel.dng --mask mask-2 -o panel.tif --panel 900,700,1100,860 --reflectance 0.5",
+        "dappled picture FLIGHT -o reflectances/ --as tif --panel-file panel.panel.toml",
     )
 
     output: Path = option("-o --output", "picture (.dng, .tif, .jpg, .png); otherwise a folder", metavar="OUT")
     kind: str = option("--as", "kind of the pictures in a folder", "dng", choices=("dng", "tif", "jpg", "png"))
     sigma: bool = flag("--sigma", "write NAME.sigma.tif: each pixel's standard error, NaN where not trusted")
+    panel: tuple[int, int, int, int] | None = option(
+        "--panel", "a reflectance panel in the picture, in px: write its factors as NAME.panel.toml", None,
+        metavar="LEFT,TOP,RIGHT,BOTTOM", parse=_rectangle, group=_PANEL,
+    )  # fmt: skip
+    reflectance: float | None = option(
+        "--reflectance", "the panel's, as a share (0.5)", None, above=0.0, high=1.0, group=_PANEL
+    )
+    reflectance_sigma: float = option(
+        "--reflectance-sigma", "standard error of --reflectance", 0.0, low=0.0, high=1.0, group=_PANEL
+    )
+    panel_file: Path | None = option(
+        "--panel-file", "file written by --panel: TIFFs in reflectances", None, there=True, group=_PANEL
+    )
     json: bool = flag("--json", "print one JSON object per frame")
 
     def _maker(self) -> PictureMaker:
@@ -39,11 +65,23 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
 
     def check(self) -> None:
         """Refuse a call that is wrong by itself."""
+        if (self.panel is None) != (self.reflectance is None):
+            raise CallError("--panel and --reflectance belong together")
+        if self.panel_file is not None and self._suffix() not in (".tif", ".tiff"):
+            raise CallError("reflectances are written as TIFF: name a .tif, or a folder and --as tif")
         self._maker().check()
+
+    def _suffix(self) -> str:
+        """The kind of the pictures, as a file's ending."""
+        own = self.output.suffix.lower()
+        return own if own in picture_files.SUFFIXES else f".{self.kind}"
 
     def run(self, output: Output) -> Report:
         """Make photographs without the mask's shadow."""
         maker, found = self._maker(), frames(self.frames)
+        panel = None if self.panel_file is None else reflectance.read(self.panel_file)
+        if self.panel is not None and len(found) > 1:
+            raise CallError(f"{counted(len(found), 'frame')} don't show one panel at one place: name its frame")
         suffix = self.output.suffix.lower()
         single = len(found) == 1 and suffix in picture_files.SUFFIXES
         if not single:
@@ -54,19 +92,33 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
 
         def pictured(frame: Path) -> Sequence[Finding]:
             target = self.output if single else self.output / f"{frame.stem}.{self.kind}"
-            return self._made(maker, frame, target, output)
+            return self._made(maker, frame, target, output, panel)
 
         return each_frame(found, output, pictured, into_folder=not single, failure="gave no picture")
 
-    def _made(self, maker: PictureMaker, frame: Path, target: Path, output: Output) -> Sequence[Finding]:
+    def _made(
+        self, maker: PictureMaker, frame: Path, target: Path, output: Output, panel: ReflectancePanel | None
+    ) -> Sequence[Finding]:
         """Make and write one picture; what was found of it. Raises DappledError."""
-        beside = target.with_suffix(".sigma.tif")
-        self.refuse_existing(target, beside if self.sigma else None)
+        beside, factors = target.with_suffix(".sigma.tif"), target.with_suffix(".panel.toml")
+        self.refuse_existing(target, beside if self.sigma else None, None if self.panel is None else factors)
         made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
-        durable.write_file(target, picture_files.encoded(made, target.suffix, places.place_of(frame)))
+        measured = reflected = None
+        if self.panel is not None and self.reflectance is not None:
+            measured, more = reflectance.measured(
+                made, str(frame), self.panel, reflectance=self.reflectance, sigma=self.reflectance_sigma
+            )
+            made = replace(made, findings=(*made.findings, *more))
+        if panel is not None:
+            reflected, more = reflectance.reflected(made, str(frame), panel)
+            made = replace(made, findings=(*made.findings, *more))
+        durable.write_file(target, picture_files.encoded(made, target.suffix, places.place_of(frame), reflected))
         if self.sigma:
             durable.write_file(beside, picture_files.sigma_file(made))
-        output.row(_facts(target, made), f"{target}: {summary(made)}")
+        if measured is not None:
+            reflectance.write(measured, factors)
+        values = _facts(target, made) | _panel_facts(measured, reflected)
+        output.row(values, f"{target}: {summary(made)}", *_panel_lines(measured, reflected))
         return made.findings
 
 
@@ -101,3 +153,22 @@ def summary(made: MadePicture) -> str:
         f"{columns} × {rows} px; the mask's shadow is {told}: it varies by {shadow.depth:.1%} of its mean, "
         f"known to {float(shadow.sigma.max()):.2%}"
     )
+
+
+def _panel_facts(measured: ReflectancePanel | None, reflected: ReflectancePicture | None) -> dict[str, Any]:
+    told: dict[str, Any] = {} if measured is None else {"panel": codec.plain(measured)}
+    if reflected is not None:
+        told |= {"steps_at_reflectance_1": reflectance.STEPS, "above_share": reflected.above_share}
+    return told
+
+
+def _panel_lines(measured: ReflectancePanel | None, reflected: ReflectancePicture | None) -> list[str]:
+    lines = [
+        f"  {one.name}: mean {one.mean:.4g} of white, standard deviation {one.deviation:.2g}, {one.pixels} px; "
+        f"factor {one.factor:.4g} ± {one.factor_sigma:.2g}"
+        for one in (() if measured is None else measured.colours)
+    ]
+    if reflected is not None:
+        above = f"; {reflected.above_share:.1%} of the pixels are brighter than that holds"
+        lines.append(f"  reflectance 1 is {reflectance.STEPS} of 65535{above if reflected.above_share > 0 else ''}")
+    return lines

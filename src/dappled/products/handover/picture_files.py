@@ -22,6 +22,7 @@ from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.products.geotags import exif_gps
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
+from dappled.products.handover.reflectance import ReflectancePicture
 
 SUFFIXES = (".dng", ".tif", ".tiff", ".jpg", ".jpeg", ".png")
 _EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
@@ -30,8 +31,11 @@ _QUALITY = 95
 _FILM_MM = 36.0
 
 
-def encoded(made: MadePicture, suffix: str, where: exif_gps.Place | None) -> bytes:
-    """The bytes of a picture's file of this kind; `where` is its position, where known."""
+def encoded(
+    made: MadePicture, suffix: str, where: exif_gps.Place | None, reflected: ReflectancePicture | None = None
+) -> bytes:
+    """The bytes of a picture's file of this kind; `where` is its position, where known. A TIFF may show it in
+    reflectances."""
     kind = suffix.lower()
     first, inner = _settings(made)
     if kind == ".dng":
@@ -39,7 +43,9 @@ def encoded(made: MadePicture, suffix: str, where: exif_gps.Place | None) -> byt
             first.append((0x0106, _SHORT, 1, struct.pack("<H", developing.LINEAR_RAW)))
         data = exif_gps.with_directory(developing.dng(made), _EXIF_IFD, inner, first)
         return data if where is None else exif_gps.tagged(data, where)
-    shown = developing.developed(made)
+    if reflected is not None:
+        first.append(text_entry(0x010E, reflected.description))
+    shown = developing.developed(made) if reflected is None else reflected.values
     buffer = io.BytesIO()
     if kind in (".tif", ".tiff"):
         colours = "rgb" if shown.ndim == 3 else "minisblack"
