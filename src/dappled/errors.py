@@ -14,10 +14,15 @@ PACKAGED = "packaged"  # which the Debian package has beside dappled's own folde
 class DappledError(Exception):
     """Something a person can mend. The message is the whole sentence; no traceback is shown with it.
 
-    `exit_code` is what a command ends with: 1 for a failure, 2 where the call itself was wrong.
+    `exit_code` is what a command ends with: 1 for a failure, 2 where the call itself was wrong. `setting` is the one
+    that is wrong, as "table.key", where the code that found it knows.
     """
 
     exit_code: ClassVar[int] = 1
+
+    def __init__(self, *text: object, setting: str = "") -> None:
+        super().__init__(*text)
+        self.setting = setting
 
     @property
     def sentences(self) -> list[str]:

@@ -23,8 +23,8 @@ class ConfigError(DappledError):
 
     exit_code = 2
 
-    def __init__(self, *sentences: str) -> None:
-        super().__init__("\n".join(sentences))
+    def __init__(self, *sentences: str, setting: str = "") -> None:
+        super().__init__("\n".join(sentences), setting=setting)
         self._sentences = list(sentences)  # a name in one may hold a line break
 
     @property

@@ -7,14 +7,13 @@ may come, and the daemon waits for it.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.config import profiles
 from dappled.config.schema import BadSetting, ConfigError, refuse
-from dappled.config.settings import TABLES, Settings, SettingsFile
+from dappled.config.settings import Settings, SettingsFile
 from dappled.daemon.console import placement
 from dappled.daemon.console import process as console_process
 from dappled.daemon.stream import curve, sockets
@@ -28,8 +27,6 @@ from dappled.errors import DappledError
 from dappled.findings import told
 from dappled.flight import seal_key
 
-_KEY = re.compile(rf"\b({'|'.join(TABLES)})\.([a-z_]+)\b")
-
 
 def _none(_: Settings) -> tuple[str, ...]:
     return ()
@@ -37,7 +34,7 @@ def _none(_: Settings) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class SettingsRule:
-    """One thing that must be so. `place` is the setting to blame where the sentence names none; `reads` are further
+    """One thing that must be so. `place` is the setting to blame where the error tells of none; `reads` are further
     ones that `check` needs, as "table.key". `check` raises DappledError: what is wrong, a line for each thing.
 
     Who runs the daemon decides rules of `secrets`: files that only their owner can read. What `may_come` keeps no
@@ -70,6 +67,7 @@ def findings(file: SettingsFile, *, by_this_user: bool = True, starting: bool = 
     wrong already is left out; where another user may run the daemon, a rule that depends on the user; and for a daemon
     that is `starting`, one whose subject may come."""
     found = list(file.findings)
+    said: set[str] = set()  # a rule may need what another one checks
     wrong = {f"{finding.table}.{finding.key}" if finding.key else finding.table for finding in found}
     for rule in RULES:
         read = {rule.place, *rule.reads}
@@ -82,9 +80,9 @@ def findings(file: SettingsFile, *, by_this_user: bool = True, starting: bool = 
         try:
             rule.check(file.settings)
         except DappledError as error:
-            for text in error.sentences:
-                if not any(text in other.text for other in found):  # a rule may need what another one checks
-                    found.append(_finding(file, rule.place, text))
+            new = [text for text in error.sentences if text not in said]
+            said.update(new)
+            found += [_finding(file, rule.place, error.setting, text) for text in new]
     return found
 
 
@@ -94,11 +92,11 @@ def checked(file: SettingsFile, *, by_this_user: bool = True, starting: bool = F
     return file.settings
 
 
-def _finding(file: SettingsFile, place: str, text: str) -> BadSetting:
-    """A finding at the setting that the sentence names, if the file has it; else at `place`."""
-    table, _, key = place.partition(".")
-    named = (match[2] for match in _KEY.finditer(text) if match[1] == table)
-    key = next((name for name in named if file.source.has(table, name)), key)
+def _finding(file: SettingsFile, place: str, setting: str, text: str) -> BadSetting:
+    """A finding at the setting that an error tells of, if the file has it; else at `place`."""
+    table, _, key = setting.partition(".")
+    if not file.source.has(table, key):
+        table, _, key = place.partition(".")
     return BadSetting(table, key, f"{file.source.where(table, key)}: {text}")
 
 
@@ -136,7 +134,10 @@ def _gnss(settings: Settings) -> None:
 def _trigger(settings: Settings) -> None:
     trigger = settings.trigger
     if trigger.distance_m and trigger.overlap:
-        raise ConfigError("trigger.distance_m and trigger.overlap both say how far photographs are apart: keep one")
+        raise ConfigError(
+            "trigger.distance_m and trigger.overlap both say how far photographs are apart: keep one",
+            setting="trigger.distance_m",
+        )
     if trigger.from_height_m and not (trigger.distance_m or trigger.overlap):
         raise ConfigError("trigger.from_height_m begins photographs by distance or overlap: set one of those")
     if trigger.from_height_m and settings.camera.fired_outside:

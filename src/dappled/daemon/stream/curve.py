@@ -130,7 +130,8 @@ def server(own: str, allowed: str) -> ServerKeys | None:
         return None
     if not own or not allowed:
         raise DappledError(
-            "publish.keys and publish.clients go together: your secret key, and the folder of subscribers' keys"
+            "publish.keys and publish.clients go together: your secret key, and the folder of subscribers' keys",
+            setting="publish.keys" if own else "publish.clients",
         )
     return ServerKeys(load_own(Path(own)), load_allowed(Path(allowed)))
 

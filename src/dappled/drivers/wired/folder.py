@@ -16,6 +16,7 @@ from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.shutter_line import hold_s, shutter
 from dappled.drivers.wired.sources import FolderSource
 
+_PICKUP = "camera.pickup"
 _KNOWN = ("shutter", "pickup", "timeouts", "model", "hold_ms", "half_press", "half_press_ms")
 
 
@@ -24,10 +25,10 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
     check_options(settings, _KNOWN)
     folder = text_option(settings, "pickup").removeprefix("folder:")
     if not folder:
-        raise CameraError("camera.pickup is not set: name the folder that the other program writes to")
+        raise CameraError("camera.pickup is not set: name the folder that the other program writes to", setting=_PICKUP)
     path = Path(folder).expanduser()
     if not path.is_dir():
-        raise CameraError(f"camera.pickup = {folder!r} is not a folder: make it, or correct the path")
+        raise CameraError(f"camera.pickup = {folder!r} is not a folder: make it, or correct the path", setting=_PICKUP)
     identity = Identity("folder", text_option(settings, "model") or path.name, "", str(path))
     composed = ComposedSettings(file_s=seconds_option(settings, "file_s", 30.0), hold_s=hold_s(settings))
     return ComposedCamera(identity, shutter(settings, "outside"), FolderSource(path), composed)

@@ -236,7 +236,7 @@ def parse_line(text: str, key: str = "camera.shutter") -> ShutterLine:
     try:
         return _LINES[kind](parts)
     except (KeyError, ValueError, IndexError):
-        raise CameraError(f"{key} = {text!r} is not a shutter line; the kinds are {KINDS}") from None
+        raise CameraError(f"{key} = {text!r} is not a shutter line; the kinds are {KINDS}", setting=key) from None
 
 
 def _gpio(parts: list[str]) -> ShutterLine:
