@@ -422,7 +422,7 @@ def _flight(flights: Path) -> Path:
     path = flight.folder.path
     line = b'{"destination":"/d","name":"frames/000001.cr2","sha256":"%s","size":300,"utc_ns":1}\n' % (b"0" * 64)
     (path / "offloaded.jsonl").write_bytes(line)
-    with seals.reopened(flight.folder, clock, "a test"), Ledger(flight.folder.ledger, clock) as ledger:
+    with seals.reopened(flight.folder, clock, seals.Occasion.GEOTAG), Ledger(flight.folder.ledger, clock) as ledger:
         sha256 = hashlib.sha256(line).hexdigest()
         removed = finding(Code.FLIGHT_FILES_REMOVED, Subject("flight"), files=1, which="", there="", sha256=sha256)
         ledger.add_event("offloaded", removed)

@@ -34,7 +34,7 @@ def sealed(flight: Recording, key: SealKey) -> Path:
         deliver(flight, index, b"raw %d" % index * 1000)
     flight.telemetry.append(1, mavlink_2(b"a"))
     flight.close()
-    seals.seal(layout.open_folder(flight.folder.path), RecordedClock(START_UTC_NS), "a test", key)
+    seals.seal(layout.open_folder(flight.folder.path), RecordedClock(START_UTC_NS), seals.Occasion.GEOTAG, key)
     return flight.folder.path
 
 

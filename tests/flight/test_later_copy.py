@@ -62,7 +62,7 @@ def go(flight: Path, there: Path, *, prune: bool = False, key: SealKey | None = 
 
 def geotag(flight: Path, words: bytes, key: SealKey | None = None) -> None:
     """What `dappled geotag` writes: sidecars, lists, and a seal."""
-    with seals.work(layout.open_folder(flight), CLOCK, "geotag", "geotags flights in", key):
+    with seals.work(layout.open_folder(flight), CLOCK, seals.Occasion.GEOTAG, "geotags flights in", key):
         (flight / "geotags").mkdir(exist_ok=True)
         for name in ("frames/000000.cr2.xmp", "geotags/geo.txt"):
             (flight / name).write_bytes(words)
@@ -71,7 +71,7 @@ def geotag(flight: Path, words: bytes, key: SealKey | None = None) -> None:
 def pick_up(flight: Path) -> None:
     """What `dappled flight pickup` writes."""
     folder = layout.open_folder(flight)
-    with seals.work(folder, CLOCK, "pickup", "picks up files into", None):
+    with seals.work(folder, CLOCK, seals.Occasion.PICKUP, "picks up files into", None):
         (folder.frames / "000002.cr2").write_bytes(b"late")
         late = hashlib.sha256(b"late").hexdigest()
         with Ledger(folder.ledger, CLOCK) as ledger:
@@ -126,7 +126,7 @@ def test_a_frame_that_came_to_the_copy_alone_is_known_here_to_be_there(closed: P
 def test_a_prune_signs_what_the_key_signed_there(closed: Path, tmp_path: Path, signs: bool) -> None:
     seal_key.make(tmp_path / "key")
     key = seal_key.load(tmp_path / "key")
-    seals.seal(layout.open_folder(closed), CLOCK, "a test", key)
+    seals.seal(layout.open_folder(closed), CLOCK, seals.Occasion.GEOTAG, key)
     copy = go(closed, tmp_path / "disk").destination
     geotag(copy, b"there", key if signs else None)
     go(closed, tmp_path / "disk", prune=True, key=key)

@@ -80,7 +80,9 @@ def test_a_flight_is_copied_and_verified(closed: Path, tmp_path: Path) -> None:
 
 def geotag(flight: Path, words: bytes) -> None:
     """What `dappled geotag` writes: sidecars, lists, and a seal."""
-    with seals.work(layout.open_folder(flight), RecordedClock(START_UTC_NS), "geotag", "geotags flights in", None):
+    with seals.work(
+        layout.open_folder(flight), RecordedClock(START_UTC_NS), seals.Occasion.GEOTAG, "geotags flights in", None
+    ):
         (flight / "geotags").mkdir(exist_ok=True)
         for name in ("frames/000000.cr2.xmp", "geotags/geo.txt"):
             (flight / name).write_bytes(words)

@@ -44,7 +44,7 @@ def sealed(flight: Recording) -> FlightFolder:
     (inputs / "white.npy").write_bytes(b"what frames were decoded with" * 10)
     flight.note_inputs("inputs")
     folder = fly(flight)
-    with seals.reopened(folder, LATER, "geotag"):
+    with seals.reopened(folder, LATER, seals.Occasion.GEOTAG):
         (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>" * 20)
         (folder.path / "geotags").mkdir()
         (folder.path / "geotags/geo.txt").write_bytes(b"EPSG:4326\n")
@@ -84,7 +84,7 @@ def test_a_seal_covers_every_file_but_itself(sealed: FlightFolder) -> None:
     for name, (size, sha256) in last.files.items():
         path = sealed.path / name
         assert (path.stat().st_size, durable.hash_file(path)) == (size, sha256)
-    assert (last.seal, last.why, last.flight) == (2, "geotag", sealed.name)
+    assert (last.seal, last.why, last.flight) == (2, seals.Occasion.GEOTAG, sealed.name)
 
 
 def flips(folder: FlightFolder, count: int, seed: int) -> list[str]:
@@ -249,7 +249,7 @@ def test_work_that_was_killed_leaves_rows_that_the_chain_vouches_for(sealed: Fli
     report = check(sealed.path)
     assert words_of(report.problems) == ()
     assert any("opened again after seal 2 (geotag): 1 link of the chain" in note for note in words_of(report.notes))
-    with seals.reopened(sealed, LATER, "late tags"):
+    with seals.reopened(sealed, LATER, seals.Occasion.LATE_TAGS):
         pass
     assert (words_of(check(sealed.path).problems), words_of(check(sealed.path).notes)) == ((), ())
     with attacked(sealed) as db:
@@ -266,9 +266,9 @@ def test_a_crash_between_announcement_and_seal_is_told_and_sealed_again(
     with monkeypatch.context() as dying:
         dying.setattr(durable, "write_file", crash)
         with pytest.raises(KeyboardInterrupt):
-            seals.seal(sealed, LATER, "late tags")
+            seals.seal(sealed, LATER, seals.Occasion.LATE_TAGS)
     assert any("seal 3 is missing" in problem for problem in words_of(check(sealed.path).problems))
-    seals.seal(sealed, LATER, "late tags")
+    seals.seal(sealed, LATER, seals.Occasion.LATE_TAGS)
     report = check(sealed.path)
     assert words_of(report.problems) == ()
     assert words_of(report.notes) == ("seal 3 was never written: its work was interrupted",)
@@ -287,13 +287,13 @@ def test_the_next_flight_seals_one_that_was_closed_and_not_sealed(
     assert (words_of(report.problems), report.vouched) == ((), "not signed")
     last = seals.read(folder).last
     assert last is not None
-    assert last.why == "recovered"
+    assert last.why == seals.Occasion.RECOVERED
 
 
 def test_an_open_flight_is_not_sealed(flight: Recording) -> None:
-    with seals.reopened(flight.folder, LATER, "geotag"):
+    with seals.reopened(flight.folder, LATER, seals.Occasion.GEOTAG):
         pass
-    seals.seal(flight.folder, LATER, "geotag")
+    seals.seal(flight.folder, LATER, seals.Occasion.GEOTAG)
     assert not flight.folder.seals.exists()
     assert check(flight.folder.path).vouched == "not sealed"
 
@@ -307,7 +307,7 @@ def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: 
     assert (report.verdict.code, report.verdict.facts) == (Code.SEAL_SIGNED, {"key": key.name})
     assert check(folder.path).vouched == check(folder.path, other).vouched == "not verified"
 
-    reseal(folder, why="forged")  # its digests fit; its signature doesn't
+    reseal(folder, why="geotag")  # its digests fit; its signature doesn't
     assert words_of(check(folder.path).problems) == ()
     assert words_of(check(folder.path, key).problems) == (
         f"the signature of seal 1 is wrong: key {key.name} did not make it",
@@ -316,7 +316,7 @@ def test_a_key_tells_a_genuine_seal_from_one_made_anew(flights: Path, tmp_path: 
     assert check(folder.path, key).vouched == "not signed"
 
     folder.seals.write_bytes(genuine)
-    with seals.reopened(folder, LATER, "geotag"):
+    with seals.reopened(folder, LATER, seals.Occasion.GEOTAG):
         pass
     report = check(folder.path, key)
     assert words_of(report.problems) == ()
@@ -371,7 +371,7 @@ def test_a_flight_is_sealed_beside_a_reader_and_under_another_name(sealed: Fligh
     shutil.copytree(sealed.path, copy.path)
     with LedgerReader.open(copy.ledger) as reader:
         assert reader.shots()
-        with seals.reopened(copy, LATER, "geotag"):
+        with seals.reopened(copy, LATER, seals.Occasion.GEOTAG):
             pass
         assert words_of(check(copy.path).problems) == ()
     said = f"the folder is called renamed, and the flight was recorded as {sealed.name}"
@@ -386,8 +386,8 @@ def test_a_ledger_that_can_not_be_folded_is_not_sealed(sealed: FlightFolder, mon
         reader.execute("BEGIN")
         reader.execute("SELECT count(*) FROM events").fetchone()
         with pytest.raises(FlightError, match="another program holds it"):
-            seals.seal(sealed, LATER, "late tags")
-    seals.seal(sealed, LATER, "late tags")
+            seals.seal(sealed, LATER, seals.Occasion.LATE_TAGS)
+    seals.seal(sealed, LATER, seals.Occasion.LATE_TAGS)
     assert words_of(check(sealed.path).problems) == ()
 
 
@@ -404,7 +404,7 @@ def test_a_record_that_was_rewritten_with_links_and_a_seal_of_its_own_is_named(f
                 "UPDATE frames SET sha256 = ? WHERE idx = 1", (durable.hash_file(folder.frames / "000001.cr2"),)
             )
             writer._written["frames", (1,)] = None
-    seals.seal(folder, LATER, "late tags")
+    seals.seal(folder, LATER, seals.Occasion.LATE_TAGS)
     problems = words_of(check(folder.path, key).problems)
     assert "the row of frames 1 was written again, which dappled never does" in problems
     for name in ("frames/000001.cr2", "telemetry.tlog"):
@@ -414,7 +414,7 @@ def test_a_record_that_was_rewritten_with_links_and_a_seal_of_its_own_is_named(f
 def test_later_work_is_signed_where_the_key_signed_all_before_it(flights: Path, tmp_path: Path) -> None:
     key = seal_key.load(key_file(tmp_path))
     folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
-    with seals.work(folder, LATER, "geotag", "geotags flights in", key):
+    with seals.work(folder, LATER, seals.Occasion.GEOTAG, "geotags flights in", key):
         (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
     assert check(folder.path, key).verdict.code is Code.SEAL_SIGNED
 
@@ -433,7 +433,7 @@ def missing_sidecar(folder: FlightFolder) -> None:
 
 
 def unsigned_seal(folder: FlightFolder) -> None:
-    seals.seal(folder, LATER, "geotag")
+    seals.seal(folder, LATER, seals.Occasion.GEOTAG)
 
 
 def unused_bytes(folder: FlightFolder) -> None:
@@ -447,10 +447,10 @@ def test_later_work_does_not_sign_what_somebody_else_did_before_it(
 ) -> None:
     key = seal_key.load(key_file(tmp_path))
     folder = fly(recording.begin(flights, RecordedClock(START_UTC_NS), seal_key=key))
-    with seals.reopened(folder, LATER, "geotag", key):
+    with seals.reopened(folder, LATER, seals.Occasion.GEOTAG, key):
         (folder.frames / "000000.cr2.xmp").write_bytes(b"<x:xmpmeta/>")
     attack(folder)
-    with seals.reopened(folder, LATER, "late tags", key):
+    with seals.reopened(folder, LATER, seals.Occasion.LATE_TAGS, key):
         pass
     report = check(folder.path, key)
     assert report.vouched == "not signed"
@@ -465,7 +465,7 @@ def test_what_was_changed_between_two_works_stays_known(
 ) -> None:
     """Without a key too: the next seal covers what is there, and the ledger tells that something else made it."""
     attack(sealed)
-    with seals.reopened(sealed, LATER, "late tags"):
+    with seals.reopened(sealed, LATER, seals.Occasion.LATE_TAGS):
         pass
     report = check(sealed.path)
     assert words_of(report.problems) == ()

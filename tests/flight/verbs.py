@@ -111,7 +111,7 @@ def _worked_on_at_the_copy(place: Path) -> None:
     """The copy is there already, and was geotagged there since."""
     _offloaded_before(place)
     (copy,) = layout.flights(place / "disk")
-    with seals.work(copy, clock(), "geotag", "geotags flights in", None):
+    with seals.work(copy, clock(), seals.Occasion.GEOTAG, "geotags flights in", None):
         geotags.write(copy.path, Mounting())
 
 
@@ -180,7 +180,7 @@ def _to_tag(place: Path) -> None:
 
 def _geotag(place: Path, say: Say) -> None:
     for flight in flown(place):
-        with seals.work(layout.open_folder(flight), clock(), "geotag", "geotags flights in", None):
+        with seals.work(layout.open_folder(flight), clock(), seals.Occasion.GEOTAG, "geotags flights in", None):
             geotags.write(flight, Mounting())
 
 

@@ -123,7 +123,8 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
             marked = marks.find(self.flight, self.pos, geoid, self.mark_arm(mounting, output))
         folder = layout.open_folder(self.flight)
         clock = TimeOfDayClock()
-        with seals.work(folder, clock, "geotag", "geotags flights in", key) if into_flight else nullcontext():
+        work = seals.work(folder, clock, seals.Occasion.GEOTAG, "geotags flights in", key)
+        with work if into_flight else nullcontext():
             written = geotags.write(
                 self.flight,
                 mounting,

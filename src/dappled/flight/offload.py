@@ -29,8 +29,6 @@ from dappled.flight.seal_key import SealKey
 from dappled.flight.trees import Tree
 from dappled.flight.verified_copy import Proved, copy_of, copy_verified, hashed, prove
 
-PRUNES = "offload --prune"
-
 
 @dataclass(frozen=True, slots=True)
 class Offloaded:
@@ -190,7 +188,7 @@ class _Copying:
         if added:
             added.bring_home(self._folder, self._source, self._there, clock)
         known = {**self._proved, **self._acknowledged()}
-        with seals.opened_again(self._folder, clock, PRUNES, signs):
+        with seals.opened_again(self._folder, clock, seals.Occasion.PRUNE, signs):
             pruning.note(self._folder, self._there.path, sure, added.frames, clock)
         if self._acknowledged().keys() <= known.keys():  # else a file came meanwhile: the next offload brings both
             self._bring_ledger()
@@ -284,15 +282,11 @@ def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
     what was done in between. Raises FlightError."""
     with LedgerReader.open(folder.ledger) as ledger:
         count, missing = seals.announced(ledger.facts())
-        reasons = [
-            found.facts.get("why")
-            for event in ledger.events()
-            if event.kind == seals.OPENED and (found := event.finding)
-        ]
+        opened = [one for event in ledger.events() if event.kind == seals.OPENED and (one := event.finding)]
     last = seals.read(folder).last
     written = 0 if last is None else last.seal
-    if reasons[-1:] == [PRUNES] and count > written and count not in missing:
-        seals.seal(folder, clock, PRUNES)
+    if opened and opened[-1].facts.get("work") == seals.Occasion.PRUNE and count > written and count not in missing:
+        seals.seal(folder, clock, seals.Occasion.PRUNE)
 
 
 def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, prune: bool, same_device: bool) -> Tree:

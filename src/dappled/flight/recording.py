@@ -249,7 +249,7 @@ class Recording:
             recovery.close_ledger(self.folder, self.ledger, self._clock.utc_ns(), telemetry, report)
             report += recovery.recover_flight(self.folder, self._clock)
             self.ledger.close()
-            seals.seal(self.folder, self._clock, "closed", self._key)
+            seals.seal(self.folder, self._clock, seals.Occasion.CLOSED, self._key)
             report += self.index.take_in(self.folder, seal=True)
         return report
 

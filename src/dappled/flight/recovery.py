@@ -49,7 +49,7 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
             signs = key if key is not None and (cut_short or seals.may_sign(folder, key)) else None
             report += [replace(one, subject=Subject("flight", folder.name)) for one in recover_flight(folder, clock)]
             if not seals.is_sealed(folder):
-                seals.seal(folder, clock, "recovered", signs)
+                seals.seal(folder, clock, seals.Occasion.RECOVERED, signs)
             report += index.take_in(folder, seal=True, cut_short=cut_short)
         except (DappledError, OSError) as error:
             report.append(finding(Code.FLIGHT_UNREPAIRED, Subject("flight", folder.name), why=str(error)))

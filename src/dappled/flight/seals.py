@@ -12,6 +12,7 @@ import os
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 
 from dappled import codec, durable, file_lock
@@ -29,7 +30,6 @@ from dappled.shown import printable
 
 SEAL = Subject("seal")
 FACT = "seals"  # {"count": seals announced, "missing": those that were never written}
-BY_OWNER = "signed by its owner"  # why a seal was made that `flight seal` adds
 OPENED = "opened again"  # an event: for what later work
 CHANGED = "changed in between"  # an event: what later work found that was not as the seal before it covers it
 _NAMED = 5
@@ -37,6 +37,19 @@ _BESIDE_LEDGER = ("-wal", "-shm")
 _MOST_SEALS = 100_000
 _MAC = "mac"
 _DIGEST = "sha256"
+
+
+class Occasion(StrEnum):
+    """What a seal is made for, and a closed flight opened again."""
+
+    CLOSED = "closed"
+    RECOVERED = "recovered"
+    RUN = "run"
+    LATE_TAGS = "late tags"
+    PICKUP = "pickup"
+    GEOTAG = "geotag"
+    PRUNE = "offload --prune"
+    OWNER = "signed by its owner"
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +62,7 @@ class Seal:
     seal: int
     flight: str
     utc_ns: int
-    why: str
+    why: Occasion
     links: int
     head: str
     files: Mapping[str, tuple[int, str]]
@@ -80,7 +93,7 @@ class SealFile:
         return self.seals[max(self.seals)] if self.seals else None
 
 
-def seal(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None = None) -> None:
+def seal(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None = None) -> None:
     """Seal a closed flight; one that is not closed yet is left alone. The caller has closed the ledger.
 
     The ledger says first how many seals there are, so that one cut off is missed. Frames and telemetry count with the
@@ -115,7 +128,7 @@ def seal(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None = Non
 
 
 @contextmanager
-def work(folder: FlightFolder, clock: Clock, why: str, doing: str, key: SealKey | None) -> Iterator[None]:
+def work(folder: FlightFolder, clock: Clock, why: Occasion, doing: str, key: SealKey | None) -> Iterator[None]:
     """Hold the flights' lock, and open the flight again (see `reopened`). `doing` is a verb for those who find the lock
     held: "tags frames in". Raises FlightError, also where another process holds the lock."""
     with layout.work_lock(folder.path.resolve().parent, doing), reopened(folder, clock, why, key):
@@ -123,7 +136,7 @@ def work(folder: FlightFolder, clock: Clock, why: str, doing: str, key: SealKey 
 
 
 @contextmanager
-def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None = None) -> Iterator[None]:
+def reopened(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None = None) -> Iterator[None]:
     """Work on a closed flight: the ledger says so first, and the flight is sealed again after the work, also where that
     raised. Should the work be killed, `flight check` says what is not sealed. A flight that is still open is left to
     the daemon.
@@ -141,14 +154,14 @@ def reopened(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None =
 
 
 @contextmanager
-def opened_again(folder: FlightFolder, clock: Clock, why: str, key: SealKey | None) -> Iterator[None]:
+def opened_again(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None) -> Iterator[None]:
     """Work on a closed flight as `reopened` does, where the caller has judged whether `key` may sign. Raises
     FlightError."""
     layout.refuse_unfinished(folder)
     layout.remove_parts(folder)
     last, changed = read(folder).last, changed_since(folder)
     with Ledger(folder.ledger, clock) as ledger:
-        ledger.add_event(OPENED, finding(Code.FLIGHT_OPENED_AGAIN, Subject("flight"), why=why))
+        ledger.add_event(OPENED, finding(Code.FLIGHT_OPENED_AGAIN, Subject("flight"), work=why.value))
         if last is not None and changed:
             names, more = printable(", ".join(changed[:_NAMED])), max(0, len(changed) - _NAMED)
             found = finding(Code.SEAL_CHANGED, SEAL, seal=last.seal, names=names, more=f"{more} more" if more else "")

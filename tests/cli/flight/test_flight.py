@@ -222,7 +222,7 @@ def test_a_flight_is_signed_later_by_its_owner(
         assert f"intact, sealed with key {name}" in verdict
     (closed / "notes.txt").write_bytes(b"windy")  # a file of somebody's own is no fault, and not signed along
     assert lines(["check", str(closed), "--key", str(tmp_path / "key")], capsys)[-1] == verdict
-    seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), "work without the key")
+    seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), seals.Occasion.RUN)
     assert (
         "up to seal 2, then not signed" in lines(["check", str(closed), "--key", str(tmp_path / "key")], capsys, 1)[-1]
     )
@@ -236,7 +236,7 @@ def test_what_a_check_notes_before_the_owner_signs_is_noted_ever_after(
     seal_key.make(tmp_path / "key")
     words = [str(closed), "--key", str(tmp_path / "key")]
     (closed / "frames" / "000000.xmp").write_bytes(b"<x:xmpmeta/>")
-    seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), "geotag")
+    seals.seal(layout.open_folder(closed), RecordedClock(START_UTC_NS), seals.Occasion.GEOTAG)
     lines(["seal", *words], capsys)
     with Ledger(closed / "flight.sqlite", RecordedClock(START_UTC_NS)) as ledger:
         ledger.add_event("opened again", CARD_FULL)

@@ -76,7 +76,7 @@ def add_missing(flight: Path, clock: Clock, key: SealKey | None, vehicle: int | 
     settings = configuration.of_tables(facts["settings"], str(folder.settings))
     flown = FlownWith(Names(**facts["names"]), BodyLatency.of(settings.camera), settings)
     with ExitStack() as stack:
-        stack.enter_context(seals.work(folder, clock, "late tags", "tags frames in", key))
+        stack.enter_context(seals.work(folder, clock, seals.Occasion.LATE_TAGS, "tags frames in", key))
         last = max(_untagged(folder), default=-1)  # another process may have tagged them meanwhile
         recording = replay.of_flight(flight)
         followed = {system for _, system in recording.vehicles}

@@ -174,7 +174,7 @@ def bring(
     with ExitStack() as stack:
         stack.enter_context(FlightsLock(root, "picks up files into"))
         index = stack.enter_context(ImageIndex(root))
-        stack.enter_context(seals.reopened(folder, clock, "pickup", key))
+        stack.enter_context(seals.reopened(folder, clock, seals.Occasion.PICKUP, key))
         ledger = stack.enter_context(Ledger(folder.ledger, clock))
         recorder = Recorder(folder, ledger)
         stack.callback(recorder.close)

@@ -60,7 +60,7 @@ class RunWriter:
                 known = run.name in ledger.runs() or _fact(run.name) in ledger.facts()
             if known:
                 raise DappledError(f"{flight} has a run {run.name!r} already: give another name with --run")
-            stack.enter_context(seals.reopened(folder, clock, f"run {run.name}", key))
+            stack.enter_context(seals.reopened(folder, clock, seals.Occasion.RUN, key))
             kept = recipes.keep(run.recipe, flight, run.name)
             self.run = replace(run, recipe=kept)
             self._ledger = stack.enter_context(Ledger(folder.ledger, clock))
