@@ -286,7 +286,7 @@ def test_a_raw_that_is_no_raw_is_kept_and_not_decoded(here: Path, caplog: pytest
     assert pending.tag is not None
     assert pending.tag.focal_length_mm is None
     assert any(line.startswith("unreadable: ") and "000000.dng" in line for line in told(flight))
-    assert any(line.startswith("not decoded: ") for line in told(flight))
+    assert any("not decoded: " in line for line in told(flight))
     assert "Traceback" not in caplog.text
 
 
@@ -298,7 +298,7 @@ def test_a_truncated_raw_is_kept_and_not_decoded(frame: Path, here: Path, tmp_pa
     daemon, flight = photographed(cut, here)
     assert words(daemon.shots[0].problem).startswith("not decoded: ")
     assert "000000.dng" in words(daemon.shots[0].problem)
-    assert any(line.startswith("not decoded: ") for line in told(flight))
+    assert any("not decoded: " in line for line in told(flight))
 
 
 @pytest.mark.slow

@@ -177,7 +177,7 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
                 assert pending.problem is None
             eventually(lambda: "decoding: off" in "\n".join(told(daemon.service.folder)), "the event")
             folder = daemon.service.folder
-    assert "not decoded: not decoded: decoding was switched off" in told(folder)
+    assert "left: not decoded: decoding was switched off" in told(folder)
     verified = dappled("replay", str(folder), "--verify", timeout_s=150)
     assert verified.returncode == 0, verified.stderr
     assert verified.stdout.endswith("verified 2 frames: all hashes the same (1 left undecoded in flight)\n")

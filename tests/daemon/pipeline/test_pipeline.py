@@ -241,7 +241,7 @@ def test_a_frame_that_does_not_decode_is_told_and_the_next_does(tmp_path: Path) 
         one.decoder.problem = ""
         one.request(2)
         assert one.ended(1).problem is None
-        assert "not decoded: frame 0: not decoded: no carriers" in one.events()
+        assert "left: frame 0: not decoded: no carriers" in one.events()
 
 
 def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> None:
@@ -285,8 +285,8 @@ def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path:
             one.request(number)
             pending = one.ended(number)
             assert ((pending.decoded is not None), pending.problem) == (decoding, None)
-        assert [text for text in one.events() if text.startswith("not decoded")] == [
-            "not decoded: not decoded: decoding was switched off"
+        assert [text for text in one.events() if text.startswith("left")] == [
+            "left: not decoded: decoding was switched off"
         ]
 
 
@@ -294,7 +294,7 @@ def test_a_flight_that_decodes_nothing_tells_it_of_no_frame(tmp_path: Path) -> N
     with rig(tmp_path, decode=False) as one:
         one.request(1)
         assert one.ended(0).problem is None
-        assert not any(text.startswith("not decoded") for text in one.events())
+        assert not any(text.startswith("left") for text in one.events())
 
 
 @pytest.mark.parametrize("method", ["fired", "add_tag", "add_result", "add_event", "safe"])
@@ -523,7 +523,7 @@ def test_a_law_that_a_full_disk_refuses_is_written_down_with_the_next_frame(
             one.ended(number - 1)
         assert [one.flight.ledger.result(index) is not None for index in (0, 1, 2)] == [False, False, True]
         events = one.events()
-        assert sum(text.startswith("not decoded: ") and "no space left" in text for text in events) == 2
+        assert sum(text.startswith("left: ") and "no space left" in text for text in events) == 2
         assert events.count(f"law: {decision.sentence}") == 1
         assert any("no space left" in words for words in judged(one))
     facts = layout.read_facts(one.flight.folder)

@@ -77,7 +77,7 @@ def test_another_or_a_missing_hash_is_a_difference(tmp_path: Path, what: str) ->
 
 
 def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path: Path) -> None:
-    left = {"slices_sha256": None, "events": frozenset({"not decoded"})}
+    left = {"slices_sha256": None, "undecoded": True}
     verifier, frame = replay(tmp_path, **left)
     assert play(verifier, frame) == []  # the replay could decode it
     verifier, frame = replay(tmp_path, **left)
@@ -85,7 +85,7 @@ def test_a_frame_that_the_flight_left_undecoded_has_no_slices_to_differ(tmp_path
     verifier.record(0, "IMG_0001.DNG", recorded_again)
     verifier.tagged(tag(frame))
     assert said(verifier) == []  # nor can the replay
-    verifier, frame = replay(tmp_path, events=frozenset({"not decoded"}))
+    verifier, frame = replay(tmp_path, undecoded=True)
     verifier.tagged(tag(frame))
     assert said(verifier) == ["frame 0: the replay made no slices"]  # somebody decoded it after all
 

@@ -32,7 +32,7 @@ from dappled.drivers.camera import (
 from dappled.errors import report, sentence
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Frame, Shot, Tag
-from dappled.flight.records import DOUBT, LATER_DOUBT, NOTICED
+from dappled.flight.records import DOUBT, LATER_DOUBT, LEFT, NOTICED
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
@@ -43,6 +43,7 @@ _WITHOUT_CAMERA = {
 }
 GIVEN_UP = 16  # failed shots that a late file can still belong to
 FOLLOWING = 4096  # the same for shots whose file stays at the camera; `geotag` tags the frames of older ones
+_DROPPED = "the queue was full, or the flight ended; the frame is in the record"
 _LOOK_S = 0.1
 _LAST_EVENTS_NS = 10**9
 
@@ -242,17 +243,10 @@ class ShotEnds:
             self.shots.add(pending)
         return pending
 
-    def drop(self, pending: PendingShot, what: str) -> None:
-        """A safe frame found a full queue, or was still in it at the flight's end."""
-        self._leave(pending, what, finding(Code.FRAME_DROPPED, _frame(pending), what=what))
-
-    def leave(self, pending: PendingShot, what: str, why: str) -> None:
+    def leave(self, pending: PendingShot, code: Code, why: str = _DROPPED) -> None:
         """A safe frame is not processed further."""
-        self._leave(pending, what, finding(Code.FRAME_LEFT, _frame(pending), what=what, why=why))
-
-    def _leave(self, pending: PendingShot, what: str, why: Finding) -> None:
-        pending.problem = why
-        self.note(what, why, pending.shot.index)
+        pending.problem = finding(code, _frame(pending), why=why)
+        self.note(LEFT, pending.problem, pending.shot.index)
         self.finish(pending)
 
     def finish(self, pending: PendingShot) -> None:

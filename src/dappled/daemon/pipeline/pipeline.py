@@ -24,6 +24,7 @@ from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import report, sentence
 from dappled.findings import FRAME, Code, Finding, Level, Subject, finding
 from dappled.flight import Tag
+from dappled.flight.records import LEFT
 from dappled.workers import Statistics, Worker
 
 log = logging.getLogger(__name__)
@@ -145,8 +146,8 @@ class Decoding:
             self.worker.put(pending)
         else:
             self._unjudged(pending, "it was not decoded: decoding was switched off")
-            off = finding(Code.FRAME_LEFT, FRAME, Level.NOTE, what="not decoded", why="decoding was switched off")
-            self.ends.note("not decoded", off, pending.shot.index)
+            off = finding(Code.FRAME_UNDECODED, FRAME, Level.NOTE, why="decoding was switched off")
+            self.ends.note(LEFT, off, pending.shot.index)
             self.ends.finish(pending)
 
     def _work(self, pending: PendingShot) -> None:
@@ -200,11 +201,11 @@ class Decoding:
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         self.failures = self.failures.after(sentence(error))
         self._unjudged(pending, "it could not be decoded")
-        self.ends.leave(pending, "not decoded", sentence(error))
+        self.ends.leave(pending, Code.FRAME_UNDECODED, sentence(error))
 
     def _dropped(self, pending: PendingShot) -> None:
         self._unjudged(pending, "it was not decoded: decoding fell behind")
-        self.ends.drop(pending, "not decoded")
+        self.ends.leave(pending, Code.FRAME_UNDECODED)
 
     def _publish(self, tag: Tag, decoded: DecodedFrame, judged: Mapping[str, Any]) -> None:
         if self.publisher is None:

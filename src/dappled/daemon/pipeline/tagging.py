@@ -149,10 +149,10 @@ class Tagging:
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         """A frame that can't be tagged."""
         self._ends.tell(self._ends.observer.tagged, pending)
-        self._ends.leave(pending, "not tagged", sentence(error))
+        self._ends.leave(pending, Code.FRAME_UNTAGGED, sentence(error))
 
     def _dropped(self, pending: PendingShot) -> None:
-        self._ends.drop(pending, "not tagged")
+        self._ends.leave(pending, Code.FRAME_UNTAGGED)
 
     def _tag(self, pending: PendingShot, frame: Frame) -> None:
         began = self._clock.monotonic_ns()

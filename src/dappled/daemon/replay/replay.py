@@ -39,7 +39,7 @@ from dappled.flight import (
     layout,
     log_reading,
 )
-from dappled.flight.records import DOUBT
+from dappled.flight.records import DOUBT, LEFT
 
 _DATED = 8  # frames whose own time is asked
 _ZONES_S = 900  # time zones are whole quarters of an hour apart
@@ -85,6 +85,8 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
     for event in events:
         kinds[event.index].add(event.kind)
     doubts = {event.index: event.finding for event in events if event.kind == DOUBT}
+    left = [(event.index, event.finding) for event in events if event.kind == LEFT]
+    undecoded = {index for index, found in left if found and found.code is Code.FRAME_UNDECODED}
     expected, files = [], []
     for row in rows:
         index = row.shot.index
@@ -100,6 +102,7 @@ def of_flight(folder: Path, run: str = LIVE) -> RecordedFlight:
                 tags.get(index),
                 None if result is None else result.details.get("fingerprint"),
                 frozenset(kinds[index]),
+                index in undecoded,
             )
         )
         files.append(_file(flight, row, frame, doubts.get(index)))

@@ -21,7 +21,8 @@ MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platfo
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What a recording says of one shot. Digests that it lacks are None; `events` are the kinds of its events.
+    """What a recording says of one shot. Digests that it lacks are None; `events` are the kinds of its events,
+    `undecoded` whether one says that it was not decoded.
 
     `tag` (with its pose) and `fingerprint` (of the slices) are compared where the last bits can't be the same."""
 
@@ -33,11 +34,12 @@ class Expected:
     tag: Tag | None = None
     fingerprint: Mapping[str, Any] | None = None
     events: frozenset[str] = frozenset()
+    undecoded: bool = False
 
     @property
     def left_undecoded(self) -> bool:
         """Whether the flight says that it did not decode this frame: fallen behind, switched off, or nothing in it."""
-        return self.slices_sha256 is None and "not decoded" in self.events
+        return self.slices_sha256 is None and self.undecoded
 
 
 class ResultWriter(Protocol):
