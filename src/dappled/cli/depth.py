@@ -114,7 +114,7 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         written = [str(path) for path in self.output]
         with ExitStack() as stack:
             if self.together:
-                return self._together(placing.placed(self.flight, output, stack), output)
+                return self._together(placing.placed(self.flight, output, stack, foresee=flight_sweep.check), output)
             scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
             seen = FrameDepths(
                 scratch,

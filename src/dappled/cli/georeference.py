@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from dappled.cli.calibrate import lens
@@ -17,6 +18,7 @@ from dappled.errors import DappledError, counted
 
 if not words_only:
     from dappled.flight import layout
+    from dappled.products.extras import need
     from dappled.products.maps import difference, map_files, photographs, terrain
     from dappled.products.maps.difference import DifferenceError, MapDifference
     from dappled.products.maps.georeference import Survey
@@ -112,7 +114,10 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
             if "frame-terrain" in self.kinds:
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
                 depths = FrameDepths(scratch, lambda found: found.depth(), self.focus)
-            made = self.survey(flight, output, stack, missing, watch=depths)
+            told: list[str] = []  # what is missing that poses alone told, before the first frame was decoded
+            foresee = partial(self._foresee, told, output)
+            made = self.survey(flight, output, stack, missing, watch=depths, foresee=foresee)
+            missing += told
             files = self._draw(made, folder, output)
             if made.lens is not None and self.solve_lens is not None:
                 lens.write(self.camera or _camera_of(flight), made.lens.lens, self.solve_lens)
@@ -126,7 +131,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                     missing.append(str(error))
                 made = replace(made, notes=(*made.notes, *(why for _, why in depths.left)))
             terrain_of = None
-            if "terrain" in self.kinds:
+            if "terrain" in self.kinds and not told:
                 try:
                     terrain_of = self._heights(made, output)
                     files.append(terrain.write_raster(made, terrain_of, folder / "terrain.tif"))
@@ -138,7 +143,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                 files += self._changes(made, terrain_of, folder, output, missing)
         made = replace(made, notes=(*made.notes, *missing))
         report = map_files.write_report(made, folder, files)
-        for why in (*(why for _, why in made.left), *made.notes):
+        for why in (*(why for _, why in made.left), *(why for why in made.notes if why not in told)):
             output.remark(why)
         frames = counted(len(made.photographs), "frame")
         lines = [f"{frames} on {made.projection.name}, {made.gsd_m:g} m per cell, {made.ground.name}"]
@@ -149,6 +154,20 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
             findings=made.doubts,
             failed=bool(missing),
         )
+
+    def _foresee(self, told: list[str], output: Output, planned: Survey) -> None:
+        """Say what will be missing by poses alone, and add it to `told`. Raises HyperstereoError where that is all."""
+        if "terrain" not in self.kinds:
+            return
+        need("laspy")
+        low, high = self.between or (None, None)
+        try:
+            terrain.check(planned, lowest_m=low, highest_m=high)
+        except HyperstereoError as error:
+            if self.kinds == ("terrain",):
+                raise
+            told.append(str(error))
+            output.remark(str(error))
 
     def _heights(self, made: Survey, output: Output) -> TerrainModel:
         low, high = self.between or (None, None)

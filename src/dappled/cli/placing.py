@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ if not words_only:
     from dappled.decode.geometry import camera_pose
     from dappled.drivers.raw.darkroom import Recipe
     from dappled.flight import layout
-    from dappled.products.maps import earth, georeference
+    from dappled.products.maps import earth, georeference, references, self_calibration
     from dappled.products.maps.earth import EarthError
     from dappled.products.maps.georeference import Options, Survey, Watch
     from dappled.products.maps.references import BaseMapError
@@ -194,14 +194,28 @@ class Refining(Placing):
             raise CallError(f"--refine takes one base map, not {len(self._base_maps)}")
 
     def survey(
-        self, flight: Path, output: Output, stack: ExitStack, missing: list[str], *, watch: Watch | None = None
+        self,
+        flight: Path,
+        output: Output,
+        stack: ExitStack,
+        missing: list[str],
+        *,
+        watch: Watch | None = None,
+        foresee: Callable[[Survey], None] = lambda _: None,
     ) -> Survey:
-        """Decode, place and refine a flight; `watch` gets each decoded frame. Adds what could not be done to `missing`.
-        Raises DappledError."""
+        """Decode, place and refine a flight; `watch` gets each decoded frame, `foresee` the survey that poses alone
+        tell. Adds what could not be done to `missing`. Raises DappledError."""
         facts = layout.read_facts(layout.open_folder(flight))
-        made = georeference.survey(
-            flight, self.recipe(flight, facts), self.options(facts), output.show, stack, watch=watch
-        )
+
+        def foreseen(planned: Survey) -> None:
+            if self.gcp is not None:
+                references.read_control_points(self.gcp, planned.projection)
+            if self.solve_lens is not None:
+                self_calibration.check(planned.photographs, planned.ground)
+            foresee(planned)
+
+        recipe, options = self.recipe(flight, facts), self.options(facts)
+        made = georeference.survey(flight, recipe, options, output.show, stack, watch=watch, foresee=foreseen)
         if self.solve_lens is not None:
             made = georeference.with_own_lens(made, control=self.gcp, sigmas=self._sigmas, progress=output.show)
         for base in self._base_maps:
@@ -213,9 +227,17 @@ class Refining(Placing):
             return self._refined(made, None, output)
         return made
 
-    def placed(self, flight: Path, output: Output, stack: ExitStack, *, watch: Watch | None = None) -> Survey:
+    def placed(
+        self,
+        flight: Path,
+        output: Output,
+        stack: ExitStack,
+        *,
+        watch: Watch | None = None,
+        foresee: Callable[[Survey], None] = lambda _: None,
+    ) -> Survey:
         """A flight's frames on the map, for verbs that make no map. Raises DappledError."""
-        made = self.survey(flight, output, stack, [], watch=watch)
+        made = self.survey(flight, output, stack, [], watch=watch, foresee=foresee)
         for _, why in made.left:
             output.remark(why)
         return made

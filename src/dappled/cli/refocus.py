@@ -198,7 +198,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         assert self.flight is not None
         heights = self.height or (0.0,)
         with ExitStack() as stack:
-            made = self.placing().placed(self.flight, output, stack)
+            foresee = stereo_pair.check if self.eyes else synthetic_aperture.check
+            made = self.placing().placed(self.flight, output, stack, foresee=foresee)
             if self.eyes:
                 return self._flight_eyes(made, self.eyes)
             found = [

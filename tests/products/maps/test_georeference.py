@@ -27,8 +27,8 @@ from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Subject, finding
 from dappled.flight import Tag, TimeSource, recording
-from dappled.mocks.autopilot.path import TruePose
-from dappled.mocks.scene.masked_camera import Truth
+from dappled.mocks.autopilot.path import FlightPath, TruePose
+from dappled.mocks.scene.masked_camera import Truth, reference_camera
 from dappled.mocks.simulation import CAMERA, MASK
 from dappled.products.maps import difference, georeference, photographs
 from dappled.products.maps.earth import Projection
@@ -247,6 +247,64 @@ def test_a_base_map_elsewhere_leaves_the_recorded_poses(short_flight: Flown, tmp
     assert why.startswith(f"not refined against a base map: the base map {elsewhere} lies elsewhere")
     assert report["frames"] == [{"name": "000000"}]
     assert report["files"] == ["footprints.geojson"]
+
+
+@pytest.fixture(scope="module")
+def frames_apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A flight of two tiny frames, half a kilometre from each other. Not to be written to."""
+    begun = recording.begin(tmp_path_factory.mktemp("apart"), RecordedClock(flown.START_NS))
+    path = FlightPath(3)
+    file = reference_camera(3, scale=0.125, scene="bench").bench_frame().file
+    for index in range(2):
+        true = path.pose(float(index))
+        there = replace(true, latitude_deg=path.home_latitude_deg + 0.005 * index)
+        flown.record(begun, index, file, flown.F_NUMBER, flown.as_recorded(there))
+    begun.close()
+    return begun.folder.path
+
+
+@pytest.mark.parametrize(
+    ("asked", "why"),
+    [
+        ("georeference FLIGHT --as terrain", "no two frames of the flight overlap by a fifth"),
+        ("georeference FLIGHT --solve-lens OUT/lens.toml", "neighbouring frames have 0 points in common"),
+        ("georeference FLIGHT --gcp FLIGHT/flight.toml", "flight.toml"),
+        ("georeference FLIGHT --terrain FLIGHT/flight.toml", "flight.toml can't be read"),
+        ("refocus --flight FLIGHT --eyes anaglyph -o OUT/a.png", "no two frames share 30% of their ground"),
+        ("depth --flight FLIGHT --together -o OUT/a.tif", "no two frames of the flight show the same ground"),
+    ],
+)
+def test_what_poses_tell_is_told_before_a_frame_is_made(
+    frames_apart: Path, asked: str, why: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[str] = []
+
+    def begun(*_: Any, **__: Any) -> None:
+        made.append("a frame")
+        raise DappledError("too late")
+
+    monkeypatch.setattr(PictureMaker, "picture", begun)
+    monkeypatch.setattr(Darkroom, "decode", begun)
+    given = asked.replace("FLIGHT", str(frames_apart)).replace("OUT", str(frames_apart.parent)).split()
+    assert main([*given, "--camera", CAMERA, "--mask", MASK]) == 1
+    assert why in capsys.readouterr().err
+    assert made == []
+
+
+def test_heights_are_refused_before_the_frames_are_made_for_other_maps(
+    frames_apart: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+
+    def listening(*_: Any, **__: Any) -> None:
+        said.append(capsys.readouterr().err)
+        raise DappledError("no picture")
+
+    monkeypatch.setattr(PictureMaker, "picture", listening)
+    given = ["georeference", str(frames_apart), "-o", str(frames_apart.parent / "maps")]
+    assert main([*given, "--camera", CAMERA, "--mask", MASK, "--as", "footprints", "terrain"]) == 1
+    assert len(said) == 2
+    assert "no two frames of the flight overlap by a fifth" in said[0]
 
 
 @pytest.mark.long

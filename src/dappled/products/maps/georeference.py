@@ -13,13 +13,16 @@ from typing import Any, Protocol
 import numpy as np
 
 from dappled.decode.lightfield import LightField
+from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Finding, first_by_name, text
+from dappled.flight import FlightFolder
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
 from dappled.products.maps.ground import Flat, Ground, Raster
+from dappled.products.maps.ground import check as check_ground
 from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.laboratory import MEAN, Laboratory
 from dappled.products.maps.map_grid import MapError
@@ -116,10 +119,12 @@ def survey(
     stack: ExitStack,
     *,
     watch: Watch | None = None,
+    foresee: Callable[[Survey], None] = lambda _: None,
 ) -> Survey:
     """Decode and place a flight's frames. Those that can't be decoded or placed are left out and named; `stack` owns
-    the pictures' scratch folder; `watch` gets each frame. Raises DappledError where no frame is left, or the
-    options are wrong."""
+    the pictures' scratch folder; `watch` gets each frame. `foresee` gets the survey without pictures before the first
+    one is made, where poses and optics tell it, and raises what needs no picture to be known. Raises DappledError where
+    no frame is left, or the options are wrong."""
     stations, left = photographs.stations(flight, options.mounting)
     if options.frames is not None:
         stations = [one for one in stations if one.frame.index in options.frames]
@@ -133,6 +138,10 @@ def survey(
     scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
     laboratory = Laboratory(recipe)
     laboratory.darkroom.check()
+    if options.terrain is not None:
+        check_ground(options.terrain)
+    if (planned := _foreseen(flight, laboratory, stations, projection, options)) is not None:
+        foresee(planned)
     taken: list[Photograph] = []
     for number, station in enumerate(stations):
         progress("develop", number, len(stations))
@@ -149,6 +158,30 @@ def survey(
         taken.append(_shelved(one, scratch))
     progress("develop", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
+
+
+def _foreseen(
+    flight: Path,
+    laboratory: Laboratory,
+    stations: Sequence[Station],
+    projection: Projection,
+    options: Options,
+) -> Survey | None:
+    """The survey of all that poses and optics tell; None where they don't."""
+    try:
+        read = reading.read_metadata(FlightFolder(flight).file(stations[0].frame.name))
+        profile = laboratory.darkroom.camera(read.model or "")
+        length = options.focal_length_mm
+        photos = [
+            photographs.foreseen(
+                one, profile, projection, length or one.tag.focal_length_mm or read.focal_length_mm, options.focus_m
+            )
+            for one in stations
+        ]
+        level = level_of(stations, options)
+        return on_ground(flight.name, photos, [], projection=projection, level_m=level, options=options)
+    except DappledError:
+        return None
 
 
 def on_ground(

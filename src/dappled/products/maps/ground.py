@@ -6,6 +6,8 @@ Heights are above sea level. `sigma_m` is the uncertainty of the ground's height
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -146,13 +148,8 @@ def load(
     Heights are taken as above sea level (DTED's are); with a `geoid` they are taken as ellipsoidal and converted.
     Raises DappledError where the file can't be read, is not georeferenced, or does not overlap.
     """
-    try:
-        with open_raster(path) as source:
-            values, west, north, step = _posts(source, path, projection, bounds)
-    except DappledError:
-        raise
-    except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
-        raise DappledError(f"the terrain {path} can't be read: {first_line(error)}") from error
+    with _opened(path) as source:
+        values, west, north, step = _posts(source, path, projection, bounds)
     if np.isnan(values).all():
         raise DappledError(f"the terrain {path} has no heights under the flight: give one that covers it")
     if geoid is not None:
@@ -161,14 +158,35 @@ def load(
     return Raster(values, west, north, step, 0.05 * step if sigma_m is None else sigma_m, path.name)
 
 
+def check(path: Path) -> None:
+    """Raise DappledError where a terrain raster can't be read or is not georeferenced."""
+    with _opened(path):
+        pass
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    try:
+        with open_raster(path) as source:
+            _check_placed(source, path)
+            yield source
+    except DappledError:
+        raise
+    except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
+        raise DappledError(f"the terrain {path} can't be read: {first_line(error)}") from error
+
+
+def _check_placed(source: Any, path: Path) -> None:
+    if source.crs is None or source.transform.is_identity:
+        raise DappledError(f"the terrain {path} has no coordinates: give one with a coordinate system")
+
+
 def _posts(
     source: Any, path: Path, projection: Projection, bounds: tuple[float, float, float, float]
 ) -> tuple[Floats, float, float, float]:
     """The heights under the flight, the west and north of the first post, and the step. Raises DappledError, ClaimError
     and what GDAL raises."""
     rasterio, warp = need("rasterio"), need("rasterio.warp")
-    if source.crs is None or source.transform.is_identity:
-        raise DappledError(f"the terrain {path} has no coordinates: give one with a coordinate system")
     target = projection.crs.to_wkt()
     step = _step(source, projection, bounds)
     margin = 4 * step

@@ -27,6 +27,9 @@ _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _STEP_PX = 0.7  # of parallax between heights
 _LEAST_SCORE = 0.88  # lower scores come from edges and false matches: wrong more often than not
 _MOST_PARTNERS = 3
+_APART = "no two frames of the flight overlap by a fifth: heights need ground that was seen twice"
+_FORESEEN = 0.5  # of the least overlap: where poses alone tell less, no picture will have enough
+_BULGE = 0.05  # of a frame: its border may bend out of the box around some of its points
 
 
 class HyperstereoError(DappledError):
@@ -70,9 +73,10 @@ def surface(
     sigma = np.full(grid.shape, np.nan, dtype=np.float32)
     best = np.full(grid.shape, -1.0, dtype=np.float32)
     levels: list[float] = []
+    boxes = _boxes(photographs, middle)
     for number, one in enumerate(photographs):
         progress("hyperstereo", number, len(photographs))
-        partners = _partners(number, photographs, middle)
+        partners = _partners(number, photographs, boxes, middle)
         if not partners:
             continue
         levels.append(_level_sigma(one, partners[0], middle))
@@ -85,9 +89,7 @@ def surface(
         for mine, theirs in ((height, found.height_m), (sigma, found.sigma_m), (best, found.score)):
             mine[cells][better] = theirs[better]
     if not levels:
-        raise HyperstereoError(
-            "no two frames of the flight overlap by a fifth: heights need ground that was seen twice"
-        )
+        raise HyperstereoError(_APART)
     score = np.where(np.isfinite(height), best, np.nan).astype(np.float32)
     return Surface(grid, height, sigma, score, float(np.median(levels)))
 
@@ -99,7 +101,36 @@ def _level_sigma(one: Photograph, two: Photograph, level_m: float) -> float:
     return above / max(baseline, 1e-6) * math.sqrt(2) * math.hypot(one.position_sigma_m, above * one.attitude_sigma_rad)
 
 
-def _partners(number: int, photographs: Sequence[Photograph], level_m: float) -> list[Photograph]:
+def check_overlap(photographs: Sequence[Photograph], level_m: float) -> None:
+    """Raise HyperstereoError where the poses tell, without a picture, that no two frames will overlap enough."""
+    boxes, least = _boxes(photographs, level_m), _FORESEEN * LEAST_OVERLAP
+    if not any(_partners(number, photographs, boxes, level_m, least) for number in range(len(photographs))):
+        raise HyperstereoError(_APART)
+
+
+def meet(photographs: Sequence[Photograph], level_m: float) -> bool:
+    """Whether any two frames may show the same ground at a level."""
+    boxes = _boxes(photographs, level_m)
+    return any(_near(number, boxes).size for number in range(len(photographs)))
+
+
+def _boxes(photographs: Sequence[Photograph], level_m: float) -> Floats:
+    """(n, 2, 2): the lowest and highest east and north that each frame shows at a level, and a little more."""
+    rings = [one.eye.on_plane(one.eye.border(4), level_m) for one in photographs]
+    boxes = np.array([(ring.min(axis=0), ring.max(axis=0)) for ring in rings])
+    more = _BULGE * (boxes[:, 1] - boxes[:, 0])
+    return np.stack([boxes[:, 0] - more, boxes[:, 1] + more], axis=1)
+
+
+def _near(number: int, boxes: Floats) -> NDArray[np.intp]:
+    """The other frames whose boxes meet that of one."""
+    apart = (boxes[:, 0] > boxes[number, 1]) | (boxes[:, 1] < boxes[number, 0])
+    return np.setdiff1d(np.flatnonzero(~apart.any(axis=1)), number)
+
+
+def _partners(
+    number: int, photographs: Sequence[Photograph], boxes: Floats, level_m: float, least: float = LEAST_OVERLAP
+) -> list[Photograph]:
     """The frames with the longest baselines that still share enough ground with this one."""
     one = photographs[number]
     ring = one.eye.on_plane(one.eye.border(4), level_m)
@@ -109,13 +140,12 @@ def _partners(number: int, photographs: Sequence[Photograph], level_m: float) ->
     places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level_m)], axis=1)
     mine = _inside(one, places)
     shared = []
-    for other, two in enumerate(photographs):
-        if other == number:
-            continue
+    for other in _near(number, boxes):
+        two = photographs[other]
         share = float(np.sum(mine & _inside(two, places))) / max(1, int(mine.sum()))
-        if share >= LEAST_OVERLAP:
+        if share >= least:
             baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2]))
-            shared.append((baseline * math.sqrt(share), other))
+            shared.append((baseline * math.sqrt(share), int(other)))
     return [photographs[other] for _, other in sorted(shared, reverse=True)[:_MOST_PARTNERS]]
 
 

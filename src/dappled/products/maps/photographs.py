@@ -174,6 +174,19 @@ def eye_of(
     return _eye(station, lens, intrinsics(sensor, lens, field.grid), shape, projection)
 
 
+def foreseen(
+    station: Station, profile: CameraProfile, projection: Projection, focal_length_mm: float | None, focus_m: float
+) -> Photograph:
+    """What a frame will show, by its pose and the camera's largest raw shape: a photograph without a picture. Raises as
+    `eye_of`."""
+    sensor = max((known.sensor for known in profile.raw), key=lambda one: math.prod(one.size_mm))
+    lens = lens_of(profile, _focal_length_mm(station, focal_length_mm), focus_m)
+    grid: Matrix = np.eye(2, 3)
+    eye = _eye(station, lens, intrinsics(sensor, lens, grid), sensor.shape, projection)
+    nothing = np.empty((0, 0), np.float32)
+    return Photograph(station.name, station.tag.utc_ns, nothing, eye, *_sigmas(station.tag.pose), grid, lens=lens)
+
+
 def _eye(station: Station, lens: Lens, matrix: Matrix, shape: tuple[int, int], projection: Projection) -> Eye:
     camera = station.camera
     return look(

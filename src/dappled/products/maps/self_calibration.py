@@ -15,7 +15,7 @@ from dappled.config.profiles import Lens
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, counted
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.products.maps import lens_solution, matching
+from dappled.products.maps import hyperstereo, lens_solution, map_grid, matching
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.lens_solution import NAMES, LensSolution, Sightings
 from dappled.products.maps.photographs import Photograph
@@ -131,6 +131,19 @@ def with_lens(photographs: Sequence[Photograph], found: FlightLens) -> list[Phot
     return [replace(one, eye=eye, lens=found.lens) for one, eye in zip(photographs, found.solution.eyes, strict=True)]
 
 
+def check(photographs: Sequence[Photograph], ground: Ground) -> None:
+    """Raise DappledError where poses alone tell that no two frames show the same ground."""
+    lowest = min(float(map_grid.footprint(one.eye, ground)[:, 2].min()) for one in photographs)
+    if not hyperstereo.meet(photographs, lowest):
+        raise _few(0)
+
+
+def _few(points: int) -> DappledError:
+    return DappledError(
+        f"neighbouring frames have {points} points in common, and a lens needs {_LEAST_POINTS}: fly with more overlap"
+    )
+
+
 def sightings(
     photographs: Sequence[Photograph],
     ground: Ground,
@@ -166,10 +179,7 @@ def sightings(
         places.append(met)
         place_sigmas.append(np.inf)
     if len(places) < _LEAST_POINTS:
-        raise DappledError(
-            f"neighbouring frames have {len(places)} points in common, and a lens needs {_LEAST_POINTS}: fly with more "
-            "overlap"
-        )
+        raise _few(len(places))
     numbers = {one.name: number for number, one in enumerate(photographs)}
     by_name = defaultdict(list)
     for point in control:

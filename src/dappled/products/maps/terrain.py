@@ -56,15 +56,26 @@ def of(
     grid = map_grid.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
     east, north = grid.places(made.projection)
     given = made.ground.heights(east, north)
-    low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
-    high = float(np.nanmax(given)) + _SEARCH_M[1] if highest_m is None else highest_m
-    lowest_eye = min(float(one.eye.centre[2]) for one in made.photographs)
-    high = min(high, low + 0.8 * (lowest_eye - low))  # nothing nearer to the lowest camera than a fifth of its height
+    low, high = _searched(made, given, lowest_m, highest_m)
     surface = hyperstereo.surface(
         made.photographs, grid, made.projection, lowest_m=low, highest_m=high, progress=progress
     )
     flat = isinstance(made.ground, Flat)
     return TerrainModel(surface, None if flat else (surface.height_m - given).astype(np.float32))
+
+
+def check(made: Survey, *, lowest_m: float | None = None, highest_m: float | None = None) -> None:
+    """Raise HyperstereoError where poses alone tell that there will be no heights; `made` needs no pictures."""
+    given = np.concatenate([map_grid.footprint(one.eye, made.ground)[:, 2] for one in made.photographs])
+    hyperstereo.check_overlap(made.photographs, sum(_searched(made, given, lowest_m, highest_m)) / 2)
+
+
+def _searched(made: Survey, given: Floats, lowest_m: float | None, highest_m: float | None) -> tuple[float, float]:
+    """The lowest and highest height to look for, around the given ground's."""
+    low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
+    high = float(np.nanmax(given)) + _SEARCH_M[1] if highest_m is None else highest_m
+    lowest_eye = min(float(one.eye.centre[2]) for one in made.photographs)
+    return low, min(high, low + 0.8 * (lowest_eye - low))  # nothing nearer to it than a fifth of its height
 
 
 def write_raster(made: Survey, terrain: TerrainModel, path: Path) -> Path:

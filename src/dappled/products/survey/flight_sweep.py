@@ -14,7 +14,7 @@ import numpy as np
 from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
-from dappled.products.maps import map_grid
+from dappled.products.maps import hyperstereo, map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat
 from dappled.products.maps.hyperstereo import WINDOW, HyperstereoError, Surface, peaks
@@ -29,6 +29,14 @@ _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _LEAST_SCORE = 0.7  # the mean correlation of a cell's frames: lower ones are wrong more often than not
 _LEAST_TEXTURE = 1e-3  # standard deviation in a window, of its mean
 _SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
+_APART = "no two frames of the flight show the same ground from two places"
+
+
+def check(made: Survey) -> None:
+    """Raise HyperstereoError where poses alone tell that no cell will be seen twice; `made` needs no pictures."""
+    lowest = min(float(map_grid.footprint(one.eye, made.ground)[:, 2].min()) for one in made.photographs)
+    if not hyperstereo.meet(made.photographs, lowest - _SEARCH_M[0]):
+        raise HyperstereoError(_APART)
 
 
 def surface(
@@ -54,7 +62,7 @@ def surface(
     middle = (low + high) / 2
     sigmas = _height_sigmas(made, east, north, middle)
     if not np.isfinite(sigmas).any():
-        raise HyperstereoError("no two frames of the flight show the same ground from two places")
+        raise HyperstereoError(_APART)
     px_per_m = _PIXEL_SIGMA / np.nanmin(sigmas[0]) if np.isfinite(sigmas[0]).any() else 1.0
     levels = np.linspace(low, high, int(np.clip(math.ceil((high - low) * px_per_m / _STEP_PX), 4, _MOST_LEVELS)) + 1)
     seen_by = [(one, _grey(one, grid.step_y, middle)) for one in photos]

@@ -20,6 +20,11 @@ from dappled.products.maps.photographs import Photograph
 
 _STEEPEST = 0.3  # baseline over distance: more is hard to look at
 _LEAST_OVERLAP = 0.3
+_FORESEEN = 0.5  # of the least overlap: where poses alone tell less, no picture will have enough
+_APART = (
+    f"no two frames share {_LEAST_OVERLAP:.0%} of their ground from places far enough apart: a stereo pair needs "
+    "frames that overlap"
+)
 _PROBES = 12  # places a side, to see what two frames share
 _LARGEST = 4000  # px a side
 
@@ -35,6 +40,17 @@ class FlightPair:
     share: float
 
 
+def check(made: Survey) -> None:
+    """Raise DappledError where poses alone tell that there will be no pair; `made` needs no pictures."""
+    photos = made.photographs
+    if not any(
+        _worth(made, one, two, _FORESEEN * _LEAST_OVERLAP)
+        for number, one in enumerate(photos)
+        for two in photos[number + 1 :]
+    ):
+        raise DappledError(_APART)
+
+
 def pair(made: Survey, cell_m: float | None = None) -> FlightPair:
     """The two frames with the longest baseline that can be looked at, much of whose ground is the same.
 
@@ -47,10 +63,7 @@ def pair(made: Survey, cell_m: float | None = None) -> FlightPair:
             if score > 0 and (best is None or score > best[0]):
                 best = score, one, two
     if best is None:
-        raise DappledError(
-            f"no two frames share {_LEAST_OVERLAP:.0%} of their ground from places far enough apart: a stereo pair "
-            "needs frames that overlap"
-        )
+        raise DappledError(_APART)
     left, right = sorted(best[1:], key=lambda photo: float(photo.eye.centre[0]))
     step = (right.eye.centre - left.eye.centre)[:2]
     along = step / float(np.linalg.norm(step))
@@ -72,7 +85,7 @@ def pair(made: Survey, cell_m: float | None = None) -> FlightPair:
     )  # fmt: skip
 
 
-def _worth(made: Survey, one: Photograph, two: Photograph) -> float:
+def _worth(made: Survey, one: Photograph, two: Photograph, least: float = _LEAST_OVERLAP) -> float:
     """The baseline over the distance times the share of common ground; 0 for what can't be looked at."""
     steep = float(np.linalg.norm((two.eye.centre - one.eye.centre)[:2])) / one.eye.scale / _above(made, one)
     if not 0.005 < steep <= _STEEPEST:
@@ -84,7 +97,7 @@ def _worth(made: Survey, one: Photograph, two: Photograph) -> float:
     places = np.stack([east, north, made.ground.heights(east, north)], axis=-1).reshape(-1, 3)
     mine, theirs = _inside(one, places), _inside(two, places)
     common = float((mine & theirs).sum()) / max(1, int(mine.sum()))
-    return steep * common if common >= _LEAST_OVERLAP else 0.0
+    return steep * common if common >= least else 0.0
 
 
 def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:

@@ -57,8 +57,7 @@ def refocus(
     and where a camera is not above the surface.
     """
     photos = made.photographs
-    if len(photos) < 2:
-        raise DappledError("a flight of one frame has no aperture of its own: refocus its light field")
+    check(made)
     ground = raised(made.ground, above_m)
     levels = [float(ground.meet(one.eye, _middle(one))[0, 2]) for one in photos]
     low = [one.name for one, level in zip(photos, levels, strict=True) if not one.eye.centre[2] - level > 0.1]
@@ -90,6 +89,12 @@ def refocus(
     aperture = float(np.max(np.linalg.norm(centres[:, None] - centres[None], axis=-1)))
     distance = float(np.median([one.eye.centre[2] - level for one, level in zip(photos, levels, strict=True)]))
     return RefocusedGround(grid, picture, frames, aperture, distance, float(np.median(blurs)))
+
+
+def check(made: Survey) -> None:
+    """Raise DappledError for fewer than two frames; `made` needs no pictures."""
+    if len(made.photographs) < 2:
+        raise DappledError("a flight of one frame has no aperture of its own: refocus its light field")
 
 
 def raised(ground: Ground, above_m: float) -> Ground:
