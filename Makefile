@@ -74,7 +74,7 @@ long: ## what is too long for each change: the long tests, arm64, the README in 
 	@CUTS=$${CUTS:-100} .ci/run arm64 test-long mutations clean-room
 
 machine: everything ## the package in a whole machine: systemd as PID 1, 512 MB, a read-only disk, the plug pulled (CUTS=n times), USB; as root
-	@$(BIN)/pytest -v --no-header -m machine --durations=0 tests/machine
+	@$(BIN)/pytest -v --no-header -m "machine and long" --durations=0 tests/machine
 
 mutations: setup ## break the code in one place at a time: the default tests must catch each; ONE=word for some
 	@$(BIN)/python tools/mutations.py $(ONE)

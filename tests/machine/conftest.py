@@ -1,10 +1,15 @@
-"""The machine is built once; dappled is installed in it from its own package, once for each state of the source."""
+"""The machine is built once; dappled is installed in it from its own package, once for each state of the source.
+
+Scenes that want the same machine, and leave it whole, share it. Where none of the chosen scenes is a long one nothing
+is built: they run on what an earlier run left, with this state of the source put over its package, or not at all.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
-from tests.machine.uml import HERE, Machine, Station, copy, own_network, station
+from tests.machine.uml import HERE, Machine, Network, Station, copy, station
 
 ROOT = Path(__file__).parents[2]
 PACKAGED = ("src", "systemd", "tools/deb.py", "tools/install.py", "requirements-onboard.lock")
@@ -20,24 +25,43 @@ SIZE = 2_000_000
 FLIGHTS = "/var/lib/dappled/flights"
 
 
+# The machine as it was when the package had been installed: nothing of an earlier scene.
+ANEW = f"""
+systemctl stop dappled
+systemctl reset-failed
+for port in 0 1 2 3; do usbip detach -p $port 2>/dev/null; done
+until ! grep -qE '^[hs]s +[0-9]+ +00[56]' /sys/devices/platform/vhci_hcd.0/status 2>/dev/null; do sleep 0.1; done
+rm -rf /var/lib/dappled/* && systemd-tmpfiles --create dappled.conf && test -d {FLIGHTS} || exit 1
+journalctl -q --rotate
+journalctl -q --vacuum-size=1
+date -s @$now
+"""
+
+
 @pytest.fixture(scope="session")
-def built() -> Path:
-    done = subprocess.run(
-        [sys.executable, ROOT / "tools/machine/build.py"], stdout=subprocess.PIPE, text=True, check=False
-    )
+def builds(request: pytest.FixtureRequest) -> bool:
+    """Whether what is missing is made."""
+    return any(item.get_closest_marker("long") for item in request.session.items)
+
+
+@pytest.fixture(scope="session")
+def built(builds: bool) -> Path:
+    return machine_part(*([] if builds else ["--cached"]))
+
+
+def machine_part(*words: str) -> Path:
+    """The folder that tools/machine/build.py made; skips where there is none."""
+    build = [sys.executable, str(ROOT / "tools/machine/build.py"), *words]
+    done = subprocess.run(build, stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode:
-        pytest.skip("no whole machine can be built here: see what tools/machine/build.py says")
+        pytest.skip(f"no whole machine is here: see what tools/machine/build.py {' '.join(words)} says")
     return Path(done.stdout.strip())
 
 
 @pytest.fixture(scope="session")
 def package(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package of this state of the source."""
-    names = subprocess.run(
-        ["/usr/bin/git", "ls-files", *PACKAGED], cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True
-    ).stdout
-    state = hashlib.sha256(b"".join((ROOT / name).read_bytes() for name in names.split()))
-    made = built / f"package-{state.hexdigest()[:16]}.deb"
+    made = built / f"package-{_state()}.deb"
     if not made.exists():
         folder = tmp_path_factory.mktemp("package")
         make = [sys.executable, ROOT / "tools/deb.py", "--arch=amd64", "--suite=bookworm", "--out", folder]
@@ -49,14 +73,27 @@ def package(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
+def _state() -> str:
+    return hashlib.sha256(b"".join((ROOT / name).read_bytes() for name in _files(*PACKAGED))).hexdigest()[:16]
+
+
+def _files(*below: str) -> list[str]:
+    found = [path for name in below for path in (ROOT / name, *(ROOT / name).rglob("*"))]
+    return sorted(str(path.relative_to(ROOT)) for path in found if path.is_file() and path.parent.name != "__pycache__")
+
+
 @pytest.fixture(scope="session")
-def installed(built: Path, package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A disk on which the package was installed while the machine ran."""
-    disk = built / package.with_suffix("").name.replace("package", "installed")
-    if disk.exists():
+def installed(built: Path, builds: bool, request: pytest.FixtureRequest) -> Path:
+    """A disk on which the package was installed while the machine ran; where nothing is built, of any state."""
+    disk = built / f"installed-{_state()}"
+    older = list(built.glob("installed-*"))
+    if disk in older:
         return disk
-    folder = tmp_path_factory.mktemp("install")
-    with own_network():
+    if not builds:
+        return older[0] if older else pytest.skip("no package was installed in a machine here: run make machine")
+    package: Path = request.getfixturevalue("package")
+    folder = request.getfixturevalue("tmp_path_factory").mktemp("install")
+    with Network().inside():
         machine = Machine(built, [copy(built / "disk", folder / "disk")], folder / "console")
         try:
             machine.start()
@@ -65,8 +102,8 @@ def installed(built: Path, package: Path, tmp_path_factory: pytest.TempPathFacto
             machine.off()
         finally:
             machine.cut()
-    for older in built.glob("installed-*"):
-        older.unlink()
+    for one in older:
+        one.unlink()
     copy(folder / "disk", disk)
     return disk
 
@@ -97,6 +134,21 @@ class Scene:
         """A property of the service."""
         return self.machine.run(f"systemctl show -P {name} dappled").strip()
 
+    def photograph(self) -> None:
+        """One photograph; what is asked for while the camera is looked for anew may fail."""
+        known = len(self.station.captured)
+        for _ in range(10):
+            self.station.request()
+            try:
+                return self.station.until(lambda it: len(it.captured) > known, "an announced image", timeout_s=10)
+            except AssertionError:
+                continue
+        raise AssertionError(self.station)
+
+    def kept(self) -> int:
+        """How many frames all flights have."""
+        return int(self.machine.run(f"ls {FLIGHTS}/*/frames/*.cr2 2>/dev/null | wc -l"))
+
     def frames(self) -> dict[int, str]:
         """The hash of each shot's frame, of all flights."""
         listed = self.machine.run(f"cd {FLIGHTS} && sha256sum */frames/*.cr2 2>/dev/null || true").split()
@@ -106,23 +158,91 @@ class Scene:
         }
 
 
+class _Shared:
+    """The machine that is on. `must`: one that does not start is a failure."""
+
+    def __init__(self, built: Path, disk: Path, network: Network, folder: Callable[[], Path], *, must: bool) -> None:
+        self._built, self._disk, self._folder, self._must = built, disk, folder, must
+        self.network = network
+        self._on: Machine | None = None
+        self._kind: object = None
+
+    def machine(self, memory_mb: int, disks: Sequence[Path], usb: Path | None) -> Machine:
+        """The one that is on, as if it had been started now, or another one."""
+        kind = memory_mb, usb
+        if self._on is None or disks or kind != self._kind:
+            self.cut()
+            folder = self._folder()
+            root = f"{folder / 'written'},{self._disk}"
+            self._on, self._kind = Machine(self._built, [root, *disks], folder / "console", memory_mb, usb), kind
+            try:
+                self._on.start()
+            except (OSError, AssertionError) as error:
+                self.cut()
+                if self._must:
+                    raise
+                pytest.skip(f"no machine starts here: {error}")
+            if self._disk.name.rpartition("-")[2] != _state():
+                source = ["/bin/tar", "-C", "src", "-c", *(name.removeprefix("src/") for name in _files("src"))]
+                packed = subprocess.run(source, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
+                self._on.put("/root/source.tar", packed)
+                self._on.run(
+                    "cd /usr/lib/dappled && rm -r dappled && tar --no-same-owner -xf /root/source.tar && "
+                    "sh /var/lib/dpkg/info/dappled.postinst configure 2>&1"
+                )
+            if usb is not None:
+                self._on.put("/root/modules.tar", (usb / "modules.tar").read_bytes())
+                self._on.run("tar -C /usr --no-same-owner -xf /root/modules.tar && depmod")
+        else:
+            self._on.run(f"now={time.time():.0f}{ANEW}", timeout_s=300)
+        return self._on
+
+    def cut(self) -> None:
+        """Nobody wants it any more."""
+        if self._on is not None:
+            self._on.cut()
+            self._on = None
+
+
+@pytest.fixture(scope="package")
+def shared(builds: bool, built: Path, installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Shared]:
+    try:
+        network = Network()
+    except (OSError, subprocess.SubprocessError) as error:
+        if builds:
+            raise
+        pytest.skip(f"no machine can have a network here: {error}")
+    made = _Shared(built, installed, network, lambda: tmp_path_factory.mktemp("machine"), must=builds)
+    yield made
+    made.cut()
+
+
 @pytest.fixture
-def scene(built: Path, installed: Path, tmp_path: Path) -> Iterator[Callable[..., Scene]]:
-    """Makes the scene: a machine with so much memory that is on, a body, and a station. `disks`: it has these, too."""
+def scene(shared: _Shared, request: pytest.FixtureRequest) -> Iterator[Callable[..., Scene]]:
+    """Makes the scene: a machine with so much memory that is on, a body, and a station. `disks`: it has these, too.
+    `spoils`: no other scene can have this machine afterwards."""
+    failed = request.session.testsfailed
+    unfit = False
     with ExitStack() as stack:
-        stack.enter_context(own_network())
+        stack.enter_context(shared.network.inside())
 
         def made(
-            memory_mb: int = 1024, body: BodyOptions | None = None, disks: Sequence[Path] = (), usb: Path | None = None
+            memory_mb: int = 1024,
+            body: BodyOptions | None = None,
+            disks: Sequence[Path] = (),
+            usb: Path | None = None,
+            *,
+            spoils: bool = False,
         ) -> Scene:
-            root = f"{tmp_path / 'written'},{installed}"
-            machine = Machine(built, [root, *disks], tmp_path / "console", memory_mb, usb)
-            stack.callback(machine.cut)
-            machine.start()
+            nonlocal unfit
+            unfit = spoils or bool(disks)
+            machine = shared.machine(memory_mb, disks, usb)
             options = body or BodyOptions(picture=f"pattern:{SIZE}:cr2", bind=HERE)
             return Scene(machine, stack.enter_context(SimulatedBody.start(options)), stack.enter_context(station()))
 
         yield made
+    if unfit or request.session.testsfailed > failed:
+        shared.cut()
 
 
 _ROWS: list[tuple[str, str]] = []

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -17,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
-from tests.machine.conftest import FLIGHTS, ROOT, Scene
+from tests.machine.conftest import FLIGHTS, Scene, machine_part
 from tests.machine.uml import HERE
 from tests.waiting import eventually
 
@@ -30,22 +28,15 @@ CGROUP = "/sys/fs/cgroup/system.slice/dappled.service/cgroup.procs"
 ACM, USB_SERIAL = 166, 188
 
 
+@pytest.fixture(scope="session")
+def usb_kernel() -> Path:
+    return machine_part("--usb", *([] if "CI" in os.environ else ["--cached"]))
+
+
 @pytest.fixture
-def on_usb(scene: Callable[..., Scene], request: pytest.FixtureRequest) -> Scene:
+def on_usb(usb_kernel: Path, scene: Callable[..., Scene], request: pytest.FixtureRequest) -> Scene:
     """A machine with an empty USB bus, a body to be plugged in; its pictures are small, or as large as given."""
-    build = [
-        sys.executable,
-        str(ROOT / "tools/machine/build.py"),
-        "--usb",
-        *([] if "CI" in os.environ else ["--cached"]),
-    ]
-    done = subprocess.run(build, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        pytest.skip("there is no kernel with a USB bus: make one with tools/machine/build.py --usb")
-    kernel = Path(done.stdout.strip())
-    made = scene(body=replace(BODY, **getattr(request, "param", {})), usb=kernel)
-    made.machine.put("/root/modules.tar", (kernel / "modules.tar").read_bytes())
-    made.machine.run("tar -C /usr --no-same-owner -xf /root/modules.tar && depmod")
+    made = scene(body=replace(BODY, **getattr(request, "param", {})), usb=usb_kernel)
     made.configure("usb:")
     return made
 
@@ -81,6 +72,7 @@ def test_a_camera_that_is_plugged_in_late_is_found_and_every_byte_recorded(on_us
 def test_a_port_of_a_kind_that_was_not_there_when_the_service_started_may_be_opened(on_usb: Scene) -> None:
     """Of an autopilot on USB; without a device behind the number an open that is allowed ends in ENXIO."""
     flown = on_usb
+    flown.machine.run("rmmod cdc_acm usbserial 2>&1", check=False)
     assert "ttyACM" not in flown.machine.run("cat /proc/devices")
     flown.machine.run("systemctl start dappled")
     for major in (ACM, USB_SERIAL):
@@ -144,6 +136,7 @@ def test_a_body_as_mass_storage_is_told_how_it_has_to_be_set(on_usb: Scene) -> N
     plug_in(flown)
     flown.machine.run("udevadm settle")
     said = flown.machine.run("dappled doctor --config /etc/dappled/dappled.toml 2>&1", check=False)
+    flown.machine.run("echo 1 >/sys/bus/usb/devices/usb1/interface_authorized_default")
     assert "(mass storage): it can't be fired in this USB mode" in said
     assert "set the camera's USB mode to PTP" in said
 

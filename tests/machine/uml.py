@@ -23,27 +23,41 @@ from dappled.workers import Loop
 HERE, THERE = "192.168.77.1", "192.168.77.2"
 STATION_PORT = 14550
 _CLONE_NEWNET = 0x40000000
+_NETWORK = "/proc/thread-self/ns/net"
+_LIBC = ctypes.CDLL(None, use_errno=True)
 _BOOT_S = 240.0
 _MARK = b"mark"
 _PAGE = 4096  # what flash writes as a whole, and a block of ext4
 
 
-@contextlib.contextmanager
-def own_network() -> Iterator[None]:
-    """This thread, and what it starts, in a network of its own, with a wire to the machine; nothing else is touched."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    before = os.open("/proc/thread-self/ns/net", os.O_RDONLY)
-    try:
-        if libc.unshare(_CLONE_NEWNET):
-            raise OSError(ctypes.get_errno(), "unshare")
-        for words in (
-            "link set lo up", "tuntap add dev tap0 mode tap", f"addr add {HERE}/24 dev tap0", "link set tap0 up",
-        ):  # fmt: skip
-            subprocess.run(["/usr/sbin/ip", *words.split()], check=True)
-        yield
-    finally:
-        libc.setns(before, 0)
-        os.close(before)
+class Network:
+    """A network of its own, with a wire to the machine; nothing else is touched. Raises OSError, SubprocessError."""
+
+    def __init__(self) -> None:
+        before = os.open(_NETWORK, os.O_RDONLY)
+        try:
+            if _LIBC.unshare(_CLONE_NEWNET):
+                raise OSError(ctypes.get_errno(), "unshare")
+            self._fd = os.open(_NETWORK, os.O_RDONLY)
+            for words in (
+                "link set lo up", "tuntap add dev tap0 mode tap", f"addr add {HERE}/24 dev tap0", "link set tap0 up",
+            ):  # fmt: skip
+                subprocess.run(["/usr/sbin/ip", *words.split()], check=True)
+        finally:
+            _LIBC.setns(before, 0)
+            os.close(before)
+
+    @contextlib.contextmanager
+    def inside(self) -> Iterator[None]:
+        """This thread, and what it starts, is in it."""
+        before = os.open(_NETWORK, os.O_RDONLY)
+        try:
+            if _LIBC.setns(self._fd, 0):
+                raise OSError(ctypes.get_errno(), "setns")
+            yield
+        finally:
+            _LIBC.setns(before, 0)
+            os.close(before)
 
 
 class Machine:
@@ -56,6 +70,9 @@ class Machine:
         self._built, self._disks, self._log, self._memory_mb = built, disks, log, memory_mb
         self._kernel = (usb or built) / "linux"
         self._process: subprocess.Popen[bytes] | None = None
+        # One connection that all commands share: to make one takes the machine longer than most commands.
+        self._wire: subprocess.Popen[bytes] | None = None
+        self._socket = log.with_name("wire")
 
     def start(self) -> float:
         """Switch it on; seconds until its shell answers."""
@@ -74,6 +91,7 @@ class Machine:
         while time.monotonic() < began + _BOOT_S:
             with contextlib.suppress(subprocess.SubprocessError):
                 self.run("true", timeout_s=10)
+                self._wire = subprocess.Popen(self._shell("", "-M", "-N"), stdin=subprocess.DEVNULL)
                 return time.monotonic() - began
             assert self._process.poll() is None, self._log.read_text(errors="replace")[-2000:]
             time.sleep(0.5)  # a machine that boots has nothing to wait on, and each try is a process
@@ -90,10 +108,11 @@ class Machine:
         """Write a file there."""
         subprocess.run(self._shell(f"cat >{path}"), input=data, check=True, timeout=120)
 
-    def _shell(self, command: str) -> list[str]:
+    def _shell(self, command: str, *more: str) -> list[str]:
         options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "LogLevel=ERROR", "ConnectTimeout=5"]
+        options.append(f"ControlPath={self._socket}")
         there = ["-i", str(self._built / "key"), *(word for one in options for word in ("-o", one)), f"root@{THERE}"]
-        return ["ssh", *there, command]
+        return ["ssh", *more, *there, *([command] if command else [])]
 
     def cut(self) -> None:
         """Pull its plug. What was in its root disk's cache is not lost."""
@@ -101,6 +120,11 @@ class Machine:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.wait(30)
+        if self._wire is not None:
+            self._wire.kill()
+            self._wire.wait()
+            self._wire = None
+        self._socket.unlink(missing_ok=True)
 
     @contextlib.contextmanager
     def halted(self) -> Iterator[None]:
