@@ -39,8 +39,10 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, PlainCamera, StateChanged
+from dappled.findings import Code
 from dappled.flight import flight_report, recording
 from dappled.flight.checks import flight_check
+from dappled.flight.records import LEFT
 
 QUEUE = 4
 _SEEN = {"resident_mb": "resident_growth_mb", "memfd_mb": "memfd_growth_mb", "handles": "handles_growth"}
@@ -196,7 +198,8 @@ def _memfd_bytes(path: Path) -> int:
 
 def _account(flight: Path, count: int) -> dict[str, float]:
     balance, found = flight_report.balance(flight), flight_check.check(flight)
-    skipped = sum(event.kind == "not decoded" for event in flight_report.show(flight).events)
+    told = [event.finding for event in flight_report.show(flight).events if event.kind == LEFT]
+    skipped = sum(one is not None and one.code is Code.FRAME_UNDECODED for one in told)
     missing = count - balance.safe + max(0, balance.frames - balance.decoded - skipped)
     shutil.rmtree(flight / "frames")
     return {

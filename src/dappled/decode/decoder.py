@@ -21,7 +21,7 @@ from dappled.decode.calibration.testimony import LatticeChange, lattice_change
 from dappled.decode.errors import DecodeError
 from dappled.decode.joint.clipping import clipped_shares, unclipped
 from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of, witness_of
-from dappled.decode.joint.mask_place import SEEN, MaskPlace, MaskWitness, cycles_per_radian
+from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, cycles_per_radian
 from dappled.decode.lightfield.aperture import (
     Aperture,
     UsedAperture,
@@ -34,6 +34,7 @@ from dappled.decode.lightfield.aperture import (
 )
 from dappled.decode.lightfield.light_field import LightField, no_views
 from dappled.decode.lightfield.views import Views
+from dappled.decode.mask_odds import SEEN_NATS
 from dappled.decode.optics import MaskedOptics
 from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.optics.visibility import designs
@@ -275,7 +276,7 @@ class MaskDecoder:
         if few:
             if np.var(slices.values[0].real) < _ONLY_NOISE * noise**2 * slices.band:
                 place = (finding(Code.FRAME_ONLY_NOISE, FRAME),)
-            elif made.nats is not None and made.nats <= SEEN:
+            elif made.nats is not None and made.nats <= SEEN_NATS:
                 place = (finding(Code.MASK_UNSEEN, FRAME, nats=made.nats),)
         if carriers_from == "measured" and any(one.code in _UNLIKE for one in made.findings):
             change = self.change(spectrum, focal_length_mm, predicted, measured)  # the cause, rather than the aperture

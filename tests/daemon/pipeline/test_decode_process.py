@@ -16,9 +16,10 @@ import pytest
 
 from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess, DecodeProcessError, FlightMask, serve
+from dappled.decode.mask_odds import SEEN_NATS
 from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.findings import FRAME, Code, Level, finding
+from dappled.findings import FRAME, Code, Level, finding, remedy
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.workers import Loop
 from tests.waiting import eventually
@@ -238,4 +239,5 @@ def test_the_odds_of_a_mask_add_up_over_a_flight() -> None:
         fallen = one(index, -3.4)
     assert fallen.doubts == (unseen,)
     assert (fallen.about_flight[0].level, fallen.about_flight[0].facts["frames"]) == (Level.CAUTION, 7)
+    assert f"not above {SEEN_NATS}," in str(remedy(fallen.about_flight[0]))
     assert one(7, None).about_flight == ()

@@ -19,6 +19,7 @@ from typing import Any, Protocol
 from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.pipeline.verdicts import PictureFacts
+from dappled.decode.mask_odds import SEEN_NATS
 from dappled.drivers.child_process import (
     DECODER_GOES,
     ChannelError,
@@ -40,7 +41,6 @@ log = logging.getLogger(__name__)
 NICENESS = 10
 _LOOK_S = 0.1
 _MOST_NATS = 20.0  # a mask that falls out is in doubt after five frames with texture: each tells 3.4 nats at most
-_SURE_NATS = 4.6  # odds of 100, as for one frame
 _SEND_S = 5.0
 
 
@@ -132,12 +132,12 @@ class FlightMask:
         if decoded.mask_nats is None:
             return decoded
         if index not in self._shown:
-            self._shown[index] = decoded.mask_nats > _SURE_NATS
+            self._shown[index] = decoded.mask_nats > SEEN_NATS
             self._nats = min(max(self._nats + decoded.mask_nats, -_MOST_NATS), _MOST_NATS)
         seen, frames = sum(self._shown.values()), len(self._shown)
         if seen == frames:
             return decoded
-        there = self._nats > _SURE_NATS
+        there = self._nats > SEEN_NATS
         told = finding(
             Code.MASK_OVER_FLIGHT,
             Subject("mask"),
@@ -146,6 +146,7 @@ class FlightMask:
             frames=frames,
             unseen=frames - seen,
             nats=self._nats,
+            needed=SEEN_NATS,
         )
         doubts = tuple(one for one in decoded.doubts if not (there and one.code is Code.MASK_UNSEEN))
         return replace(decoded, doubts=doubts, about_flight=(told,))

@@ -38,6 +38,7 @@ from dappled.decode.joint.patch_model import (
 )
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
+from dappled.decode.mask_odds import SEEN_NATS
 from dappled.decode.optics import Lattice, Order, Sensor
 from dappled.workers import each, spans
 
@@ -59,7 +60,6 @@ _LIKELY, _MANY_NATS = 2.0, 30.0  # or both of these: clean frames gain 14 nats a
 _AT_EDGE = 0.95  # of the farthest turn: beyond it the best is elsewhere
 # Of the patches may lie in anything that places no mask, edges between depths or no parallax: any share is as probable.
 _ASTRAY = (np.arange(32) + 0.5) / 32
-SEEN = 4.6  # nats: without a mask the odds are 1 on average, whatever the scene, and 100 in at most 1 % of frames
 _SEEN_ELSEWHERE = 1.5  # nats of each patch: turned and moved masks have 3 to 5, one 0.3 % off in scale 0.7
 _OVERLAP = 2.0  # patches that count as one measurement: they overlap by half
 
@@ -90,7 +90,7 @@ class MaskPlace:
     @property
     def seen(self) -> bool:
         """Whether the patches agree on this place: else there is no mask, or nothing has parallax or texture."""
-        return self.nats > SEEN
+        return self.nats > SEEN_NATS
 
     def nowhere(self, nats: float) -> MaskPlace:
         """It without any move, and with these odds: a turn at the search's edge that led nowhere."""
