@@ -12,7 +12,10 @@ import pytest
 import tifffile
 
 from dappled.cli import main
+from dappled.config import profiles
 from dappled.mocks.scene import dng
+from dappled.mocks.scene.ray_camera import REAL_COLOURS, RayCamera
+from dappled.mocks.scene.sharp_boards import SharpBoard
 
 BLACK, WHITE = 1024, 15000
 SEEN = (0.6, 0.8, 0.4)  # of a white's light at 1/100 s, f/8 and ISO 100: what red, green and blue give
@@ -31,12 +34,16 @@ def frame(folder: Path, name: str, scene: np.ndarray, *, exposure_s: float = 1e-
     noise = np.random.default_rng(7).normal(0, 15, scene.shape)
     raw = np.clip(BLACK + light * (WHITE - BLACK) + noise, 0, WHITE).astype(np.uint16)
     exif = dng.Exif("Canon", "Canon EOS 450D", "1", 50.0, 8.0, exposure_s, iso, 0)
-    (folder / name).write_bytes(dng.encode(raw, black=BLACK, white=WHITE, exif=exif, mono=False))
-    (folder / "small.toml").write_text(
+    return written(folder / name, raw, exif)
+
+
+def written(path: Path, raw: np.ndarray, exif: dng.Exif) -> Path:
+    path.write_bytes(dng.encode(raw, black=BLACK, white=WHITE, exif=exif, mono=False))
+    path.with_name("small.toml").write_text(
         'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "small"\nshape = [160, 240]\n'
         "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
     )
-    return folder / name
+    return path
 
 
 def call(path: Path, output: Path, *more: str) -> int:
@@ -79,6 +86,33 @@ def test_a_picture_in_reflectances_is_what_was_there(tmp_path: Path, capsys: Cau
     assert made.shape == (160, 240, 3)
     assert made[40:120, 30:90].mean(axis=(0, 1)) == pytest.approx([0.3] * 3, rel=0.01)
     assert made[40:120, 150:210].mean(axis=(0, 1)) == pytest.approx([0.9] * 3, rel=0.01)
+
+
+def test_a_panel_behind_the_mask_is_even_and_its_factors_hold_for_what_is_beside_it(
+    tmp_path: Path, capsys: Caught
+) -> None:
+    """At f/22 the raw panel varies by 70 % of its mean: what a mean over it says depends on where its edges are."""
+    boards = [SharpBoard(colour=(0.2,) * 3, contrast=0.0)]
+    for level, left in ((0.5, -0.45), (0.1, -0.15), (0.8, 0.15)):
+        boards.append(SharpBoard(0.0, (-0.4, 0.4, left, left + 0.3), (level,) * 3, contrast=0.0))
+    mask = profiles.mask("reference-5x5").mask
+    camera = RayCamera(
+        mask, shape=(160, 240), boards=tuple(boards), f_number=22.0, print_scale=1.003, turn_rad=0.012, level=0.12,
+        colour_filters=REAL_COLOURS, views=2, points_per_view=1, lens_diffraction=False,
+    )  # fmt: skip
+    raw = camera.expose().raw(BLACK, WHITE)
+    shot = written(tmp_path / "shot.dng", raw, dng.Exif("Canon", "Canon EOS 450D", "1", 50.0, 22.0, 1e-2, 100, 0))
+    panel = raw[31:129:2, 18:74:2].astype(float) - BLACK  # its greens
+    assert panel.std() > 0.5 * panel.mean()
+    words = ["--panel", "17,30,75,129", "--reflectance", "0.5", "--json"]
+    assert call(shot, tmp_path / "p.png", *words) == 0
+    said, codes = told(capsys)
+    assert "picture.panel_uneven" not in codes
+    assert all(one["deviation"] < 0.03 * one["mean"] for one in said["panel"]["colours"])
+    assert call(shot, tmp_path / "r.tif", "--panel-file", str(tmp_path / "p.panel.toml")) == 0
+    made = tifffile.imread(tmp_path / "r.tif") / 32768
+    assert made[40:120, 92:140].mean(axis=(0, 1)) == pytest.approx([0.1] * 3, rel=0.01)
+    assert made[40:120, 164:212].mean(axis=(0, 1)) == pytest.approx([0.8] * 3, rel=0.01)
 
 
 @pytest.mark.parametrize(
