@@ -5,14 +5,23 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from PIL import Image
 
+from dappled import codec
 from dappled.cli import main
 from dappled.clock import RecordedClock
+from dappled.daemon.pipeline import decode_process
+from dappled.drivers.camera import Blob
+from dappled.drivers.child_process import ChannelMessage, ProcessChannel
+from dappled.findings import FRAME, Code, finding
 from dappled.flight import recording
+from dappled.workers import Loop
 
 
 @pytest.mark.parametrize(
@@ -70,3 +79,34 @@ def test_it_ends_when_its_reader_has_gone(
         assert main(["replay", str(tmp_path), "--rate", pace]) == 1
         monkeypatch.undo()
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("last", [-3.4, -16.0], ids=["there", "fallen out"])
+def test_a_mask_that_fell_out_is_in_doubt_and_frames_that_cant_show_it_are_not(
+    last: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first of three frames shows the mask."""
+    nats = [120.0, -0.5, last]
+    for index in range(len(nats)):
+        Image.new("RGB", (16, 16)).save(tmp_path / f"{index}.jpg")
+    unseen = finding(Code.MASK_UNSEEN, FRAME, nats=last)
+
+    def answer(question: ChannelMessage) -> tuple[Mapping[str, Any], tuple[int, ...]]:
+        if question.body["do"] != "decode":
+            return ({} if question.body["do"] == "set up" else {"ready": True}), ()
+        one = nats[question.body["index"]]
+        facts = {"sha256": "", "arrays": [], "carriers": [], "carriers_from": "calibrated", "carriers_found": 0}
+        facts |= {"carriers_predicted": 24, "law": "geometric", "grid": [], "preview_size": [1, 1], "picture": None}
+        facts |= {"mask_nats": one, "decision": None, "doubts": codec.plain((unseen,) if one < 0 else ())}
+        return facts, (Blob.of(b"x").fd, Blob.of(b"x").fd)
+
+    here, there = ProcessChannel.pair()
+    worker = Loop("worker", lambda: decode_process.serve(there, answer))
+    worker.start()
+    process = SimpleNamespace(poll=lambda: None, returncode=0)
+    monkeypatch.setattr(decode_process, "start_child", lambda *_, **__: (process, here))
+    monkeypatch.setattr(decode_process, "end_child", lambda *_: None)
+    assert main(["replay", str(tmp_path), "--mask", "reference-5x5"]) == (0 if last > -10 else 1)
+    assert "the mask is seen in 1 of 3 frames, and can't be seen in 2" in capsys.readouterr().err
+    assert worker.stop(60.0)
+    there.close()

@@ -12,10 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from dappled import codec
 from dappled.cli import main, status
 from dappled.cli.status import is_listening, stream_endpoint
+from dappled.daemon.health.standing import ALL_IS_WELL
 from dappled.daemon.stream.publisher import Publisher
 from dappled.errors import DappledError
+from dappled.flight.flight_mask import FlightMask
 from tests.daemon.health.test_metrics import HEALTH
 
 
@@ -47,6 +50,18 @@ def test_one_screen_says_how_it_is(stream: str, capsys: pytest.CaptureFixture[st
     assert "disk      unknown, /x" in said
     assert "shots     8 taken, 7 on disk, 3 refused, 3 lost" in said
     assert "stop      the camera is faulted: it hangs" in said
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_mask_that_fell_out_is_no_go(there: bool) -> None:
+    flight = FlightMask()
+    for index, nats in enumerate((120.0, -3.0 if there else -16.0)):
+        flight.add(index, nats)
+    rows = [{**codec.plain(one), "age_s": 0.0} for one in flight.unseen]
+    *_, verdict, line = status.screen({"flight": "one", **HEALTH, "findings": rows})
+    assert (verdict == ALL_IS_WELL) is there
+    word = "note" if there else "caution"
+    assert line.startswith(f"{word:9} the mask is seen in 1 of 2 frames, and can't be seen in 1")
 
 
 def test_the_record_itself_as_json(stream: str, capsys: pytest.CaptureFixture[str]) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -128,3 +130,23 @@ def test_the_report_says_why_a_frame_is_bad_or_unknown(flight: Recording, capsys
         "unknown: frame 2: 80% of the pixels are black",
         "unknown: frame 3: not judged in flight",
     ]
+
+
+@pytest.mark.parametrize(("nats", "there"), [((120.0, -3.4), True), ((120.0, *[-3.4] * 5), False)])
+def test_the_report_says_in_how_many_frames_the_mask_is_seen(
+    flight: Recording, nats: Sequence[float], there: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for index, one in enumerate(nats):
+        request(flight, index)
+        deliver(flight, index, bytes(1000))
+        details = {"mask_nats": one}
+        flight.ledger.add_result(Result(index, "ab", 1, 13, "geometric", "calibrated", details=details))
+    flight.close()
+    page = tmp_path / "page.html"
+    assert main(["flight", "report", str(flight.folder.path), "--page", str(page)]) == 0
+    said = [" ".join(line.split()) for line in capsys.readouterr().out.splitlines()]
+    (mask,) = [line for line in said if line.startswith("mask: ")]
+    odds = 16.6 if there else 3.0
+    assert f"the mask is seen in 1 of {len(nats)} frames" in mask
+    assert f"(log odds that it is there now: {odds:.0f})" in mask
+    assert f"<td>seen in</td><td>1 of {len(nats)} frames</td>" in page.read_text()

@@ -19,6 +19,7 @@ from dappled.products.handover import FORMS, KINDS
 
 if not words_only:
     from dappled.flight import disk_error, layout
+    from dappled.flight.flight_mask import FlightMask
     from dappled.products.batch import batch, workers
     from dappled.products.batch.batch import Done, Job, Manifest
     from dappled.products.geotags import geotags, marks
@@ -146,8 +147,12 @@ def _doubts(manifest: Manifest, jobs: Sequence[Job]) -> list[Finding]:
     """What is in doubt about the light fields of each flight."""
     found = []
     for flight in dict.fromkeys(job.flight for job in jobs):
-        known = [manifest.done[job.key] for job in jobs if job.flight == flight and job.key in manifest.done]
-        doubts = first_by_name((Path(done.frame).stem, done.doubts) for done in known)
+        mask, frames = FlightMask(), []
+        for job in jobs:
+            if job.flight == flight and (done := manifest.done.get(job.key)) is not None:
+                mask.add(job.frame.index, done.mask_nats)
+                frames.append((Path(done.frame).stem, mask.relieved(done.doubts)))
+        doubts = [*first_by_name(frames), *mask.unseen]
         found += [replace(one, subject=_of_flight(Path(flight).name, one.subject)) for one in doubts]
     return found
 

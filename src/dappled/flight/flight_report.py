@@ -11,6 +11,7 @@ from typing import Any
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import layout
 from dappled.flight.errors import FlightError
+from dappled.flight.flight_mask import FlightMask
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.records import (
     BEGAN,
@@ -51,7 +52,8 @@ class Balance:
     without one is unknown; empty where none was judged), `bad` says of each bad one why, `unknown` of each unknown one.
     `doubts` says of each frame that may be another shot's why, `card` what happened to the camera's card, and what
     stays on it. `stood` is what the service found, above notes, in the order of its beginning. `cut_short` says what
-    the numbers may lack, where the recording was not ended in order.
+    the numbers may lack, where the recording was not ended in order. `mask` says in how many decoded frames the mask is
+    seen; None where none tells.
     """
 
     flight: str
@@ -79,6 +81,7 @@ class Balance:
     card: tuple[Finding, ...] = ()
     stood: tuple[StoodFinding, ...] = ()
     cut_short: Finding | None = None
+    mask: Finding | None = None
 
     @property
     def balanced(self) -> bool:
@@ -168,7 +171,16 @@ def balance(path: Path) -> Balance:
                 shots_s=cut_short.get("shots_s"),
                 refusals_s=cut_short.get("refusals_s"),
             ),
+            mask=_mask(results),
         )
+
+
+def _mask(results: Mapping[int, Result]) -> Finding | None:
+    """What a flight's results tell of its mask."""
+    mask = FlightMask()
+    for index, one in sorted(results.items()):
+        mask.add(index, one.mask_nats)
+    return mask.told
 
 
 def _found(events: Iterable[LedgerEvent], *kinds: str) -> tuple[Finding, ...]:

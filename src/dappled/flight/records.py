@@ -161,6 +161,12 @@ class Result:
         except (KeyError, codec.CodecError):
             return None
 
+    @property
+    def mask_nats(self) -> float | None:
+        """The log odds that the mask is where it was calibrated; None where nothing tells."""
+        nats = self.details.get("mask_nats")
+        return float(nats) if isinstance(nats, int | float) else None
+
 
 @dataclass(frozen=True, slots=True)
 class Stray:

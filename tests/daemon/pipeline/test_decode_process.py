@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import mmap
 import os
 import signal
 import subprocess
@@ -15,11 +14,9 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess, DecodeProcessError, FlightMask, serve
-from dappled.decode.mask_odds import SEEN_NATS
+from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
 from dappled.drivers.child_process import ProcessChannel, RestartBudget
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.findings import FRAME, Code, Level, finding, remedy
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.workers import Loop
 from tests.waiting import eventually
@@ -142,7 +139,7 @@ def test_close_does_not_wait_for_a_frame_in_hand(frame: str) -> None:
 
 STARVED = """
 import contextlib, os, resource, sys, threading, time
-from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess, DecodeProcessError, FlightMask, serve
+from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
 from dappled.drivers.raw.darkroom import Recipe
 
 hogs = []
@@ -216,28 +213,3 @@ def test_an_answer_that_is_too_long_is_a_sentence_and_the_next_one_comes() -> No
         here.close()
         assert worker.stop(60.0)
         there.close()
-
-
-def test_the_odds_of_a_mask_add_up_over_a_flight() -> None:
-    """A frame that can't show it is in doubt until others have shown it, and again when it has fallen out."""
-    unseen, flight = finding(Code.MASK_UNSEEN, FRAME, nats=-3.0), FlightMask()
-
-    def one(index: int, nats: float | None) -> DecodedFrame:
-        doubts = (unseen,) if nats is not None and nats < 0 else ()
-        with mmap.mmap(-1, 1) as body:
-            frame = DecodedFrame(
-                body, "", [], [], "calibrated", 0, 24, "geometric", [], b"", (1, 1), doubts=doubts, mask_nats=nats
-            )
-        return flight.judged(index, frame)
-
-    assert one(0, -3.0).doubts == (unseen,)
-    assert one(1, 120.0).doubts == ()
-    (told,) = one(2, -3.0).about_flight
-    assert (told.level, told.facts["seen"], told.facts["frames"], told.facts["unseen"]) == (Level.NOTE, 1, 3, 2)
-    assert one(2, -3.0).doubts == ()
-    for index in range(3, 7):
-        fallen = one(index, -3.4)
-    assert fallen.doubts == (unseen,)
-    assert (fallen.about_flight[0].level, fallen.about_flight[0].facts["frames"]) == (Level.CAUTION, 7)
-    assert f"not above {SEEN_NATS}," in str(remedy(fallen.about_flight[0]))
-    assert one(7, None).about_flight == ()

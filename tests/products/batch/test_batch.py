@@ -243,6 +243,26 @@ def test_what_one_form_refuses_the_others_keep(
     assert [row["doubts"] for row in rows] == [[codec.plain(CLIPPED)]] * 4
 
 
+@pytest.mark.parametrize("last", [-3.4, -16.0], ids=["there", "fallen out"])
+@pytest.mark.usefixtures("listed")
+def test_frames_that_cant_show_their_mask_are_judged_by_the_flight(
+    flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, last: float
+) -> None:
+    """The first of two frames shows it."""
+    there = last > -10
+    nats = {"000000": 120.0, "000001": last}
+    unseen = finding(Code.MASK_UNSEEN, FRAME, nats=last)
+    monkeypatch.setattr(FlightFrame, "mask_nats", property(lambda one: nats[one.path.stem]))
+    monkeypatch.setattr(FlightFrame, "doubts", property(lambda one: (unseen,) if nats[one.path.stem] < 0 else ()))
+    output = tmp_path / "out"
+    assert main(words(flight, output, "--as", "colmap")) == (0 if there else 1)
+    said = capsys.readouterr().err
+    assert "the mask is seen in 1 of 2 frames, and can't be seen in 1" in said
+    assert (f"frame {flight.folder.name}/000001: {told(unseen, FRAME)}" in said) is not there
+    assert main(words(flight, output, "--as", "colmap")) == (0 if there else 1)  # by the manifest alone
+    assert capsys.readouterr().err == said
+
+
 def test_files_of_other_positions_are_made_again(
     flight: Flown, tmp_path: Path, listed: dict[str, list[str]], capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,

@@ -92,12 +92,7 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
     yield f"  {counted(found.wishes, 'shot', 6)}: {found.safe} safe, {found.failed} failed, {found.open} open"
     frames = counted(found.frames, "frame", 6)
     yield f"  {frames}, {found.size / 1e6:.1f} MB: {found.tagged} tagged, {found.decoded} decoded"
-    if found.judged:
-        yield f"  {'judged':>13}: {', '.join(f'{count} {state}' for state, count in found.judged.items())}"
-        for state, why in (("bad", found.bad), ("unknown", found.unknown)):
-            yield from (f"  {state:>13}: {findings.told(one)}" for one in why[:_SHOWN])
-            if len(why) > _SHOWN:
-                yield f"  {'':13}  and {len(why) - _SHOWN} more {state} ones (--json names all)"
+    yield from _of_verdicts(found)
     if found.following:
         yield f"  {found.following:6d} of the failed still have their files in the camera: dappled flight pickup"
     if found.companions:
@@ -121,6 +116,18 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield "what is recorded adds up; what came last is not known"
         return
     yield "the counts agree" if found.balanced else "THE COUNTS DO NOT AGREE: run `dappled flight check`"
+
+
+def _of_verdicts(found: Balance) -> Iterator[str]:
+    """How the frames were judged in flight, and in how many of them the mask is seen."""
+    if found.judged:
+        yield f"  {'judged':>13}: {', '.join(f'{count} {state}' for state, count in found.judged.items())}"
+        for state, why in (("bad", found.bad), ("unknown", found.unknown)):
+            yield from (f"  {state:>13}: {findings.told(one)}" for one in why[:_SHOWN])
+            if len(why) > _SHOWN:
+                yield f"  {'':13}  and {len(why) - _SHOWN} more {state} ones (--json names all)"
+    if found.mask:
+        yield f"  {'mask':>13}: {findings.told(found.mask)}"
 
 
 def _span(one: StoodFinding) -> str:

@@ -19,7 +19,6 @@ from typing import Any, Protocol
 from dappled import codec
 from dappled.clock import Clock, SystemClock
 from dappled.daemon.pipeline.verdicts import PictureFacts
-from dappled.decode.mask_odds import SEEN_NATS
 from dappled.drivers.child_process import (
     DECODER_GOES,
     ChannelError,
@@ -33,14 +32,14 @@ from dappled.drivers.child_process import (
 )
 from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.findings import Finding
 from dappled.flight import Result
+from dappled.flight.flight_mask import FlightMask
 from dappled.workers import Loop
 
 log = logging.getLogger(__name__)
 NICENESS = 10
 _LOOK_S = 0.1
-_MOST_NATS = 20.0  # a mask that falls out is in doubt after five frames with texture: each tells 3.4 nats at most
 _SEND_S = 5.0
 
 
@@ -91,6 +90,8 @@ class DecodedFrame:
             details["fingerprint"] = dict(self.fingerprint)
         if judged is not None:
             details["verdict"] = dict(judged)
+        if self.mask_nats is not None:
+            details["mask_nats"] = self.mask_nats
         return Result(
             index,
             self.sha256,
@@ -118,38 +119,6 @@ class FrameDepth:
     law: str
     nearest_m: tuple[float, float] | None = None
     doubts: tuple[Finding, ...] = ()
-
-
-class FlightMask:
-    """Adds up what the frames of a flight, each counted once, tell of their mask."""
-
-    def __init__(self) -> None:
-        self._nats = 0.0
-        self._shown: dict[int, bool] = {}
-
-    def judged(self, index: int, decoded: DecodedFrame) -> DecodedFrame:
-        """A frame that can't show the mask is not in doubt where the flight's odds are that the mask is there."""
-        if decoded.mask_nats is None:
-            return decoded
-        if index not in self._shown:
-            self._shown[index] = decoded.mask_nats > SEEN_NATS
-            self._nats = min(max(self._nats + decoded.mask_nats, -_MOST_NATS), _MOST_NATS)
-        seen, frames = sum(self._shown.values()), len(self._shown)
-        if seen == frames:
-            return decoded
-        there = self._nats > SEEN_NATS
-        told = finding(
-            Code.MASK_OVER_FLIGHT,
-            Subject("mask"),
-            Level.NOTE if there else None,
-            seen=seen,
-            frames=frames,
-            unseen=frames - seen,
-            nats=self._nats,
-            needed=SEEN_NATS,
-        )
-        doubts = tuple(one for one in decoded.doubts if not (there and one.code is Code.MASK_UNSEEN))
-        return replace(decoded, doubts=doubts, about_flight=(told,))
 
 
 class FrameDecoder(Protocol):
@@ -211,10 +180,13 @@ class DecodeProcess:
         with self._turn:
             look = look and self._may_look
             try:
-                decoded = self._mask.judged(index, _decoded(self._ask({"do": "decode", "look": look, **frame})))
+                decoded = _decoded(self._ask({"do": "decode", "look": look, **frame}))
             except DecodeProcessError:
                 self._may_look = self._may_look and not (look and self._process is None)  # it may have died of a search
                 raise
+            self._mask.add(index, decoded.mask_nats)
+            doubts = self._mask.relieved(decoded.doubts)
+            decoded = replace(decoded, doubts=doubts, about_flight=self._mask.unseen)
             if decoded.decision in (None, self._recipe.decided):
                 return replace(decoded, decision=None)
             self._recipe = replace(self._recipe, decided=decoded.decision)  # a worker that takes over goes on by it

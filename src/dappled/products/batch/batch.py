@@ -76,7 +76,7 @@ class BatchOutput:
 class Done:
     """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'.
     `refused` says why a kind was not made where others were or could have been; `doubts` are those of the frame's
-    picture and light field, whichever were made."""
+    picture and light field, whichever were made, `mask_nats` the log odds that the light field shows its mask."""
 
     key: str
     flight: str
@@ -88,6 +88,7 @@ class Done:
     peak_mb: float
     refused: Mapping[str, str] = field(default_factory=dict)
     doubts: tuple[Finding, ...] = ()
+    mask_nats: float | None = None
 
     def lacks(self, kind: str) -> bool:
         """Whether this kind was not made."""
@@ -178,7 +179,8 @@ def make(job: Job) -> Done:
         error = _why(job, caught)
     seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
     name, doubts = Path(job.flight).name, () if making is None else making.frame.doubts
-    return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused, doubts)
+    nats = None if making is None else making.frame.mask_nats
+    return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused, doubts, nats)
 
 
 def _why(job: Job, error: Exception) -> str:

@@ -72,6 +72,11 @@ class FlightFrame:
         """All that is in doubt about what was made so far, each once."""
         return tuple({one.kind: one for found in self._found.values() for one in found}.values())
 
+    @property
+    def mask_nats(self) -> float | None:
+        """The log odds that the mask is where it was calibrated; None where no light field was made, or none tells."""
+        return self.decoded.report.mask_nats if "decoded" in self._found else None
+
     def photograph(self, station: Station, projection: Projection, *, view: str, focus_m: float) -> Photograph:
         """The frame on the map: its picture for `view` "mean", else views, see `photographs.photograph`. Raises
         DappledError."""

@@ -74,6 +74,9 @@ def of_flight(flight: Path) -> FlightQuality:
         parts.append(QualityPart("Ground", (("not known", str(error)),)))
     verdicts = [line.result.verdict for line in contents.lines if line.result and line.result.verdict]
     blur = [px for one in verdicts if (px := one.facts.get("blur_view_px")) is not None]
+    if found.mask:
+        frames = counted(found.mask.number("frames"), "frame")
+        parts.append(QualityPart("Mask", (("seen in", f"{found.mask.number('seen')} of {frames}"),)))
     judged = tuple((f"judged {state}", str(count)) for state, count in found.judged.items())
     parts.append(QualityPart("Sharpness", (*judged, ("motion blur", _spread(blur, "view pixels")))))
     sigmas = [sigma for tag in tags if (sigma := tag.pose.position_sigma_m) is not None]
