@@ -27,6 +27,16 @@ def offered(script: str, *words: str) -> set[str]:
     return set(done.stdout.split())
 
 
+def test_a_camera_s_profile_has_one_name_in_all_verbs(capsys: pytest.CaptureFixture[str]) -> None:
+    made = scripts("fish", capsys).splitlines()
+    assert not [line for line in made if line.endswith("-l body")]
+    masked = {line.removesuffix("-l mask") for line in made if line.endswith(" -l mask")}
+    assert len(masked) > 10
+    assert masked <= {line.removesuffix("-l camera") for line in made if line.endswith(" -l camera")} | {
+        "complete -c dappled -n '__fish_seen_subcommand_from mask; and __fish_seen_subcommand_from diffraction' "
+    }
+
+
 def test_bash_offers_verbs_actions_options_and_choices(capsys: pytest.CaptureFixture[str]) -> None:
     if not BASH:
         without("no bash on this machine")

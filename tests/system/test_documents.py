@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,26 @@ from tests.system.documents import ROOT, Stage, commands, stage
 
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
 LONG = ("README.md", "decoding.md", "maps.md", "products.md")  # their commands cost a core half a minute or more
+
+
+def test_the_readme_s_first_screen_says_what_one_gains_and_what_it_costs() -> None:
+    """Before the first command: what a person gains, one picture of it, and the ground in a pixel."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    first = readme.split("\n## ")[0]
+    gain = first.split("**")[1]
+    for words in (
+        "One press of the shutter",
+        "many views",
+        "refocus after landing",
+        "depth from one camera",
+        "resolution",
+    ):
+        assert words in " ".join(gain.split()), words
+    (picture,) = re.findall(r"!\[[^]]{40,}\]\((docs/pictures/\S+)\)", first)
+    assert (ROOT / picture).stat().st_size > 50_000
+    assert "```" not in first
+    assert first.index(picture) < first.index("cm per pixel")
+    assert len(readme.split()) <= 900
 
 
 @pytest.fixture(scope="module")

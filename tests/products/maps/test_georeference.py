@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dappled import findings
 from dappled.cli import main
+from dappled.cli.rendering import TerminalOutput
 from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
 from dappled.decode.geometry import camera_pose, from_euler
@@ -75,12 +76,20 @@ def test_maps_of_pictures_in_doubt_say_so(
     assert capsys.readouterr().err.splitlines().count(told) == 1
 
 
-def test_a_flight_becomes_maps(short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_flight_becomes_maps(
+    short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[tuple[str, int, int]] = []
+    monkeypatch.setattr(TerminalOutput, "show", lambda _, *step: steps.append(step))
     before = sorted(path for path in short_flight.folder.rglob("*"))
     more = ["--each", "--as", "kmz", "cog", "footprints", "--refine", "neighbours", "--gsd", "0.05"]
     assert main(words(short_flight, tmp_path, *more)) == 0
     said = capsys.readouterr().out
     assert "2 frames on EPSG:32615" in said
+    stretches = "develop", "find features", "match neighbours", "draw maps"
+    assert tuple(dict.fromkeys(what for what, _, _ in steps)) == stretches  # no stretch of the work is silent
+    assert {(what, 0, total) for what, _, total in steps} <= set(steps)
+    assert [done for what, done, _ in steps if what == "develop"] == [0, 1, 2]
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")) == [
         "footprints.geojson",
         "frames/000000.kmz",
