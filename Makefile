@@ -30,7 +30,8 @@ demo: setup ## fly eight simulated frames through the whole daemon, and draw the
 LINT = $(BIN)/ruff check -q . && $(BIN)/ruff format -q --check . && $(BIN)/lint-imports
 # Types of the tests take as long again as those of the source: `make check` and test-slow look at both.
 CHECKS = $(LINT) && $(BIN)/mypy src
-TESTS = $(BIN)/pytest -q --no-header $(BESIDE) -m "not slow" --durations=25
+# Slow tests keep their files on a disk: what a file system does is theirs.
+TESTS = $(BIN)/python tools/in_memory.py $(BIN)/pytest -q --no-header $(BESIDE) -m "not slow" --durations=25
 # Prints what was taken of so many seconds and CPU-seconds (docs/tests.md).
 BUDGET = $(BIN)/python tools/budget.py
 
