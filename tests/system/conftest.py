@@ -17,7 +17,7 @@ import pytest
 from tests import shared
 from tests.waiting import eventually
 
-FRAMES = 3
+FRAMES = 2
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def sockets() -> Iterator[Path]:
 
 @pytest.fixture(scope="session")
 def flown(tmp_path_factory: pytest.TempPathFactory, sockets: Path) -> Flown:
-    """Three frames through the whole street, with `dappled watch` as the subscriber. Not to be written to."""
+    """Two frames through the whole street, with `dappled watch` as the subscriber. Not to be written to."""
     folder = shared.folder_of_run(tmp_path_factory)
     return shared.once(folder, "flown", lambda: _fly(folder / "flown", sockets))
 
