@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import sys
+import tempfile
 import threading
 from collections.abc import Generator, Iterator
 from pathlib import Path
@@ -92,6 +93,18 @@ def nothing_left_behind(request: pytest.FixtureRequest) -> Iterator[None]:
     yield
     if left := _watch.left(before):
         pytest.fail(f"left behind: {left_behind.named(left)}")
+
+
+@pytest.fixture
+def tmp_path(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Path]:
+    """A test that asks which disk a folder is on has one on a disk (tools/in_memory.py)."""
+    memory = Path("/dev/shm")
+    asks = request.node.get_closest_marker("disk") and memory.is_dir()
+    if not asks or memory.stat().st_dev != tmp_path.stat().st_dev:
+        yield tmp_path
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        yield Path(folder)
 
 
 @pytest.fixture(scope="session")

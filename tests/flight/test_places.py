@@ -9,8 +9,6 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,16 +26,7 @@ from tests.flight.test_disk_faults import Image, ext4
 
 __all__ = ["ext4"]
 MEMORY = Path("/dev/shm")
-
-
-@pytest.fixture
-def tmp_path(tmp_path: Path) -> Iterator[Path]:
-    """On a disk, also where the files of other tests lie in memory."""
-    if not MEMORY.is_dir() or tmp_path.stat().st_dev != MEMORY.stat().st_dev:
-        yield tmp_path
-        return
-    with tempfile.TemporaryDirectory() as folder:
-        yield Path(folder)
+pytestmark = pytest.mark.disk
 
 
 @pytest.fixture

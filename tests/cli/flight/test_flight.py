@@ -184,6 +184,7 @@ def test_counts_that_do_not_balance_are_a_failure(closed: Path, capsys: pytest.C
     assert said[-1].startswith("THE COUNTS DO NOT AGREE")
 
 
+@pytest.mark.disk
 def test_no_file_of_a_copied_flight_is_for_every_user_of_the_machine(closed: Path, tmp_path: Path) -> None:
     before = os.umask(0)
     try:
@@ -196,6 +197,7 @@ def test_no_file_of_a_copied_flight_is_for_every_user_of_the_machine(closed: Pat
     assert {one for one in copied if one.stat().st_mode & 0o007} == set()
 
 
+@pytest.mark.disk
 def test_offload_says_what_it_did(closed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     disk = tmp_path / "disk"
     said = lines(["offload", str(disk), str(closed), "--same-device"], capsys)
