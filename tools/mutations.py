@@ -100,8 +100,8 @@ MUTATIONS = (
     Mutation(
         "a doubt is dropped on its way to the exit code",
         "cli/decode.py",
-        "return made.doubts",
-        "return ()",
+        "FrameMade(tuple(made.doubts), ",
+        "FrameMade((), ",
         ("cli/test_wrong_input.py",),
     ),
     Mutation(

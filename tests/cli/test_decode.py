@@ -185,3 +185,31 @@ def test_bands_fall_off_softly_where_that_is_asked_for(
     code, _, err = _told(capsys, stopped.parent, str(stopped), *words, mask="lenslet")
     assert code == 1
     assert "printed mask" in err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("verb", "suffix"), [pytest.param("decode", "zarr", marks=pytest.mark.long), ("picture", "dng")]
+)
+def test_two_workers_make_what_one_makes(
+    verb: str, suffix: str, stopped: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same bytes, the same lines in the same order; a torn frame among them is told."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for name in ("a", "d", "e"):
+        (folder / f"{name}.dng").write_bytes(stopped.read_bytes())
+    (folder / "b.dng").write_bytes(stopped.with_name("open.dng").read_bytes())
+    (folder / "c.dng").write_bytes(stopped.read_bytes()[:5000])
+    made, said = [], []
+    for workers in ("1", "2"):
+        output = tmp_path / workers
+        given = ["--camera", str(stopped.parent / "quarter.toml"), "--mask", MASK, "-o", str(output)]
+        assert main([verb, str(folder), *given, "--workers", workers]) == 1
+        files = sorted(one for one in output.rglob("*") if one.is_file())
+        made.append({str(one.relative_to(output)): one.read_bytes() for one in files})
+        said.append([text.replace(str(output), "OUT") for text in capsys.readouterr()])
+    assert {Path(name).parts[0] for name in made[0]} == {f"{name}.{suffix}" for name in "abde"}
+    assert made[0] == made[1]
+    assert said[0] == said[1]
+    assert "c.dng" in said[1][1]

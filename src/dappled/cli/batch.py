@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 from dappled import codec
+from dappled.cli.frame_arguments import Several
 from dappled.cli.geotag import MarkArguments, geoid_or_none
 from dappled.cli.placing import Placing
 from dappled.cli.table import words_only
@@ -29,7 +29,7 @@ if not words_only:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
+class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
     """Process whole flights."""
 
     examples = (
@@ -48,7 +48,6 @@ class ProcessFlights(Doubtable, MarkArguments, Placing, Verb):
         "(stac), or a recording for Foxglove and ROS 2 (mcap)", ("npz",),
         choices=tuple(KINDS),
     )  # fmt: skip
-    workers: int = option("--workers", "number of processes", os.cpu_count() or 1, low=1, otherwise="one per core")
     scheduler: str | None = option(
         "--scheduler", "use this Dask scheduler instead, such as tcp://10.0.0.5:8786", None, metavar="URL",
     )  # fmt: skip

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from dappled import codec
 from dappled.cli.field_arguments import views_words
-from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
+from dappled.cli.frame_arguments import (
+    FrameMade,
+    FramesArguments,
+    Several,
+    each_frame,
+    frames,
+    recorded,
+    refuse_same_names,
+)
 from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, flag, option
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Finding, told
+from dappled.findings import FRAME, told
 
 if not words_only:
-    from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
+    from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+    from dappled.products import processes
     from dappled.products.exports import light_files
 
 
 @dataclass(frozen=True, kw_only=True)
-class DecodeFrames(Overwriting, Doubtable, FramesArguments, Verb):
+class DecodeFrames(Overwriting, Doubtable, Several, FramesArguments, Verb):
     """Decode frames to light fields."""
 
     examples = (
@@ -52,22 +61,39 @@ class DecodeFrames(Overwriting, Doubtable, FramesArguments, Verb):
 
     def run(self, output: Output) -> Report:
         """Decode frames to light fields."""
-        darkroom, found = self._darkroom(), frames(self.frames)
+        recipe, found = self._darkroom().recipe, frames(self.frames)
         single = len(found) == 1 and bool(self.output.suffix)
         if not single:
             refuse_same_names(found, self.output, ".zarr")
             self.output.mkdir(parents=True, exist_ok=True)
 
-        def decoded(frame: Path) -> Sequence[Finding]:
-            target = self.output if single else self.output / f"{frame.stem}.zarr"
-            made = darkroom.decode(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
-            if not self.anyway:
-                _refuse_contradicted(frame, made)
-            light_files.save(target, made.light_field, overwrite=self.overwrite)
-            output.row(_facts(target, made), f"{target}: {summary(made)}")
-            return made.doubts
+        workers = processes.worth(self.workers, len(found))
+        make = _Decoding(self, recipe if workers == 1 else replace(recipe, workers=1), single)
+        return each_frame(found, output, make, workers=workers, into_folder=not single, failure="could not be decoded")
 
-        return each_frame(found, output, decoded, into_folder=not single, failure="could not be decoded")
+
+@dataclass(frozen=True)
+class _Decoding:
+    """Decodes one frame after the other, in any process."""
+
+    asked: DecodeFrames
+    recipe: Recipe
+    single: bool
+
+    @cached_property
+    def darkroom(self) -> Darkroom:
+        """Its decoders, which are made once."""
+        return Darkroom(self.recipe)
+
+    def __call__(self, frame: Path) -> FrameMade:
+        """Decode a frame and write its light field. Raises DappledError."""
+        asked = self.asked
+        target = asked.output if self.single else asked.output / f"{frame.stem}.zarr"
+        made = self.darkroom.decode(frame, focal_length_mm=asked.focal_length, f_number=asked.f_number)
+        if not asked.anyway:
+            _refuse_contradicted(frame, made)
+        light_files.save(target, made.light_field, overwrite=asked.overwrite)
+        return FrameMade(tuple(made.doubts), _facts(target, made), (f"{target}: {summary(made)}",))
 
 
 CLASSES = {"decode": DecodeFrames}

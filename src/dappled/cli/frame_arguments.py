@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from dappled import picture_order
 from dappled.cli.table import words_only
@@ -17,6 +21,7 @@ if not words_only:
     from dappled.drivers.raw.darkroom import Recipe
     from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
     from dappled.flight import layout
+    from dappled.products import processes
 
 # No JPEG: beside a raw file it is the same picture again. One that is named is taken.
 FRAME_SUFFIXES = (".arw", ".cr2", ".dng", ".lfp", ".lfr", ".nef", ".npy", ".png", ".raf", ".tif", ".tiff")
@@ -138,30 +143,47 @@ def _is_frame(path: Path) -> bool:
     return path.suffix.lower() in FRAME_SUFFIXES and not path.name.startswith(".") and path.is_file()
 
 
+@dataclass(frozen=True, slots=True)
+class FrameMade:
+    """What is told of a frame of which something was made: what was found, its row as values and as lines."""
+
+    findings: tuple[Finding, ...]
+    values: Mapping[str, Any]
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Several:
+    """Work on several frames at a time."""
+
+    workers: int = option("--workers", "number of processes", os.cpu_count() or 1, low=1, otherwise="one per core")
+
+
 def each_frame(
     frames: Sequence[Path],
     output: Output,
-    make: Callable[[Path], Sequence[Finding]],
+    make: Callable[[Path], FrameMade],
     *,
+    workers: int,
     into_folder: bool,
     failure: str,
 ) -> Report:
-    """Make something of each frame: one that fails is told, and the others go on.
+    """Make something of each frame, in so many processes: one that fails is told, and the others go on.
 
-    `make` says what it found; `failure` says what became of the frames that failed. Raises the
-    DappledError of a frame that goes to no folder.
+    `failure` says what became of the frames that failed. Raises the DappledError of a frame that goes to no folder.
     """
     bad = 0
     found: dict[Path, Sequence[Finding]] = {}
-    for frame in output.each(frames):
-        try:
-            found[frame] = make(frame)
-        except DappledError as error:
-            if not into_folder:
-                raise
+    answers = processes.in_order(frames, partial(_tried, make) if into_folder else make, workers, lost=_lost)
+    with closing(answers):
+        for frame, made in zip(output.each(frames), answers, strict=True):
+            if isinstance(made, FrameMade):
+                found[frame] = made.findings
+                output.row(made.values, *made.lines)
+                continue
             bad += 1
-            output.warn(str(error))
-            output.row({"frame": str(frame), "error": str(error)})
+            output.warn(str(made))
+            output.row({"frame": str(frame), "error": str(made)})
     of_all = counted(len(frames), "frame")
     if bad:
         output.remark(f"{bad} of {of_all} {failure}")
@@ -170,3 +192,14 @@ def each_frame(
     doubted = sum(worst(each) > Level.NOTE for each in found.values())
     told = first_by_name((frame.stem, each) for frame, each in found.items())
     return Report(findings=told, extent=f"{doubted} of {of_all}", failed=bool(bad))
+
+
+def _tried(make: Callable[[Path], FrameMade], frame: Path) -> FrameMade | DappledError:
+    try:
+        return make(frame)
+    except DappledError as error:
+        return DappledError(str(error))  # it may come from another process
+
+
+def _lost(frame: Path, why: str) -> DappledError:
+    return DappledError(f"{frame} {why}")

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli.field_arguments import FIELD_HELP, RangingArguments
+from dappled.cli.frame_arguments import Several
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, argument, flag, of_setting, option
 from dappled.config.settings import PoseSettings
@@ -162,7 +163,7 @@ class Placing(Mounted):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Refining(Placing):
+class Refining(Several, Placing):
     """How frames are placed, and their poses refined."""
 
     refine: tuple[str, ...] = option(
@@ -215,7 +216,9 @@ class Refining(Placing):
             foresee(planned)
 
         recipe, options = self.recipe(flight, facts), self.options(facts)
-        made = georeference.survey(flight, recipe, options, output.show, stack, watch=watch, foresee=foreseen)
+        made = georeference.survey(
+            flight, recipe, options, output.show, stack, watch=watch, foresee=foreseen, workers=self.workers
+        )
         if self.solve_lens is not None:
             made = georeference.with_own_lens(made, control=self.gcp, sigmas=self._sigmas, progress=output.show)
         for base in self._base_maps:

@@ -317,6 +317,21 @@ def test_heights_are_refused_before_the_frames_are_made_for_other_maps(
 
 
 @pytest.mark.long
+def test_two_workers_map_as_one_does(tmp_path: Path) -> None:
+    """The same bytes; a frame that is no picture is left out and named."""
+    flight = flown.fly(tmp_path, times_s=(1.0, 1.4, 1.8, 2.2))
+    (flight.folder / "frames" / "000002.dng").chmod(0o644)
+    (flight.folder / "frames" / "000002.dng").write_bytes(b"no picture")
+    made = []
+    for workers in ("1", "2"):
+        output = tmp_path / workers
+        main(words(flight, output, "--as", "cog", "--gsd", "0.1", "--workers", workers))
+        made.append({one.name: one.read_bytes() for one in output.iterdir()})
+    assert made[0] == made[1]
+    assert [one["name"] for one in json.loads(made[1]["report.json"])["frames"]] == ["000000", "000001", "000003"]
+
+
+@pytest.mark.long
 def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     short_flight: Flown, later_flight: Path, tmp_path: Path
 ) -> None:

@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from dappled import codec, durable, findings
-from dappled.cli.frame_arguments import FramesArguments, each_frame, frames, recorded, refuse_same_names
+from dappled.cli.frame_arguments import (
+    FrameMade,
+    FramesArguments,
+    Several,
+    each_frame,
+    frames,
+    recorded,
+    refuse_same_names,
+)
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, flag, option
 from dappled.errors import counted
-from dappled.findings import Finding
 
 if not words_only:
     from dappled.cli.picture import places
+    from dappled.drivers.raw.darkroom import Recipe
     from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
+    from dappled.products import processes
     from dappled.products.handover import picture_files, reflectance
     from dappled.products.handover.reflectance import ReflectancePanel, ReflectancePicture
 
@@ -32,7 +41,7 @@ def _rectangle(text: str) -> tuple[int, int, int, int]:
 
 
 @dataclass(frozen=True, kw_only=True)
-class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
+class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
     """Make photographs without the mask's shadow."""
 
     examples = (
@@ -60,16 +69,13 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
     )
     json: bool = flag("--json", "print one JSON object per frame")
 
-    def _maker(self) -> PictureMaker:
-        return PictureMaker(recorded(self.frames, self.recipe()))
-
     def check(self) -> None:
         """Refuse a call that is wrong by itself."""
         if (self.panel is None) != (self.reflectance is None):
             raise CallError("--panel and --reflectance belong together")
         if self.panel_file is not None and self._suffix() not in (".tif", ".tiff"):
             raise CallError("reflectances are written as TIFF: name a .tif, or a folder and --as tif")
-        self._maker().check()
+        PictureMaker(recorded(self.frames, self.recipe())).check()
 
     def _suffix(self) -> str:
         """The kind of the pictures, as a file's ending."""
@@ -78,7 +84,7 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
 
     def run(self, output: Output) -> Report:
         """Make photographs without the mask's shadow."""
-        maker, found = self._maker(), frames(self.frames)
+        recipe, found = recorded(self.frames, self.recipe()), frames(self.frames)
         panel = None if self.panel_file is None else reflectance.read(self.panel_file)
         if self.panel is not None and len(found) > 1:
             raise CallError(f"{counted(len(found), 'frame')} don't show one panel at one place: name its frame")
@@ -90,16 +96,12 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
             refuse_same_names(found, self.output, f".{self.kind}")
             durable.make_folder(self.output)
 
-        def pictured(frame: Path) -> Sequence[Finding]:
-            target = self.output if single else self.output / f"{frame.stem}.{self.kind}"
-            return self._made(maker, frame, target, output, panel)
+        workers = processes.worth(self.workers, len(found))
+        make = _Picturing(self, recipe if workers == 1 else replace(recipe, workers=1), single, panel)
+        return each_frame(found, output, make, workers=workers, into_folder=not single, failure="gave no picture")
 
-        return each_frame(found, output, pictured, into_folder=not single, failure="gave no picture")
-
-    def _made(
-        self, maker: PictureMaker, frame: Path, target: Path, output: Output, panel: ReflectancePanel | None
-    ) -> Sequence[Finding]:
-        """Make and write one picture; what was found of it. Raises DappledError."""
+    def made(self, maker: PictureMaker, frame: Path, target: Path, panel: ReflectancePanel | None) -> FrameMade:
+        """Make and write one picture. Raises DappledError."""
         beside, factors = target.with_suffix(".sigma.tif"), target.with_suffix(".panel.toml")
         self.refuse_existing(target, beside if self.sigma else None, None if self.panel is None else factors)
         made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
@@ -118,8 +120,29 @@ class MakePictures(Overwriting, Doubtable, FramesArguments, Verb):
         if measured is not None:
             reflectance.write(measured, factors)
         values = _facts(target, made) | _panel_facts(measured, reflected)
-        output.row(values, f"{target}: {summary(made)}", *_panel_lines(measured, reflected))
-        return made.findings
+        lines = f"{target}: {summary(made)}", *_panel_lines(measured, reflected)
+        return FrameMade(tuple(made.findings), values, lines)
+
+
+@dataclass(frozen=True)
+class _Picturing:
+    """Makes one picture after the other, in any process."""
+
+    asked: MakePictures
+    recipe: Recipe
+    single: bool
+    panel: ReflectancePanel | None
+
+    @cached_property
+    def maker(self) -> PictureMaker:
+        """Its decoders, which are made once."""
+        return PictureMaker(self.recipe)
+
+    def __call__(self, frame: Path) -> FrameMade:
+        """Make and write a frame's picture. Raises DappledError."""
+        asked = self.asked
+        target = asked.output if self.single else asked.output / f"{frame.stem}.{asked.kind}"
+        return asked.made(self.maker, frame, target, self.panel)
 
 
 CLASSES = {"picture": MakePictures}

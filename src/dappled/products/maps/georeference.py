@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -18,6 +19,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Finding, first_by_name, text
 from dappled.flight import FlightFolder
+from dappled.products import processes
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
@@ -120,9 +122,11 @@ def survey(
     *,
     watch: Watch | None = None,
     foresee: Callable[[Survey], None] = lambda _: None,
+    workers: int = 1,
 ) -> Survey:
     """Decode and place a flight's frames. Those that can't be decoded or placed are left out and named; `stack` owns
-    the pictures' scratch folder; `watch` gets each frame. `foresee` gets the survey without pictures before the first
+    the pictures' scratch folder; `watch` gets each frame, in this process; without one the frames are made in so many
+    `workers`. `foresee` gets the survey without pictures before the first
     one is made, where poses and optics tell it, and raises what needs no picture to be known. Raises DappledError where
     no frame is left, or the options are wrong."""
     stations, left = photographs.stations(flight, options.mounting)
@@ -142,22 +146,62 @@ def survey(
         check_ground(options.terrain)
     if (planned := _foreseen(flight, laboratory, stations, projection, options)) is not None:
         foresee(planned)
+    workers = 1 if watch is not None else processes.worth(workers, len(stations))
+    develop = _Developing(
+        flight, recipe if workers == 1 else replace(recipe, workers=1), options, projection.name, scratch, watch
+    )
     taken: list[Photograph] = []
-    for number, station in enumerate(stations):
-        progress("develop", number, len(stations))
-        try:
-            frame = laboratory.frame(
-                flight, station.frame, station.tag, focal_length_mm=options.focal_length_mm, f_number=options.f_number
-            )
-            one = frame.photograph(station, projection, view=options.view, focus_m=options.focus_m)
-            if watch is not None:
-                watch.measure(one, frame.decoded.light_field)
-        except DappledError as error:
-            left.append((station.frame.name, str(error)))
-            continue
-        taken.append(_shelved(one, scratch))
+    with closing(processes.in_order(stations, develop, workers, lost=_lost)) as made:
+        for number, station in enumerate(stations):
+            progress("develop", number, len(stations))
+            one = next(made)
+            if isinstance(one, DappledError):
+                left.append((station.frame.name, str(one)))
+            else:
+                taken.append(_from_shelf(one, scratch))
     progress("develop", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
+
+
+@dataclass(frozen=True)
+class _Developing:
+    """Makes one photograph after the other, in any process; their pictures lie in files of `scratch`."""
+
+    flight: Path
+    recipe: Recipe
+    options: Options
+    projection_name: str
+    scratch: Path
+    watch: Watch | None
+
+    @cached_property
+    def laboratory(self) -> Laboratory:
+        """Its decoders, which are made once."""
+        return Laboratory(self.recipe)
+
+    @cached_property
+    def projection(self) -> Projection:
+        """The map's."""
+        return Projection(self.projection_name)
+
+    def __call__(self, station: Station) -> Photograph | DappledError:
+        """A photograph without its picture, which lies on the shelf; or why there is none."""
+        options = self.options
+        try:
+            frame = self.laboratory.frame(
+                self.flight, station.frame, station.tag,
+                focal_length_mm=options.focal_length_mm, f_number=options.f_number,
+            )  # fmt: skip
+            one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
+            if self.watch is not None:
+                self.watch.measure(one, frame.decoded.light_field)
+        except DappledError as error:
+            return DappledError(str(error))  # it may come from another process
+        return _shelved(one, self.scratch)
+
+
+def _lost(station: Station, why: str) -> DappledError:
+    return DappledError(f"{station.frame.name} {why}")
 
 
 def _foreseen(
@@ -279,13 +323,19 @@ def with_own_lens(
 
 
 def _shelved(one: Photograph, scratch: Path) -> Photograph:
-    """The photograph with its pictures in memory-mapped files: a flight's frames need not fit into memory."""
+    """The photograph with its pictures in files instead: a flight's frames need not fit into memory."""
+    nothing = np.empty((0, 0), np.float32)
     np.save(scratch / f"{one.name}.npy", one.image)
-    kept = replace(one, image=np.load(scratch / f"{one.name}.npy", mmap_mode="r"))
-    if one.views is None:
-        return kept
-    np.save(scratch / f"{one.name}-views.npy", one.views)
-    return replace(kept, views=np.load(scratch / f"{one.name}-views.npy", mmap_mode="r"))
+    if one.views is not None:
+        np.save(scratch / f"{one.name}-views.npy", one.views)
+    return replace(one, image=nothing, views=None if one.views is None else nothing)
+
+
+def _from_shelf(one: Photograph, scratch: Path) -> Photograph:
+    """The photograph with its pictures mapped from their files."""
+    image = np.load(scratch / f"{one.name}.npy", mmap_mode="r")
+    views = None if one.views is None else np.load(scratch / f"{one.name}-views.npy", mmap_mode="r")
+    return replace(one, image=image, views=views)
 
 
 def level_of(stations: Sequence[Station], options: Options) -> float:
