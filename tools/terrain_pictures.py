@@ -43,6 +43,7 @@ PIT = (-24.4, -5.2, 1.6, -0.6)
 STABLE = ((-26.0, -2.6, -23.2, -1.6), (-26.0, -9.2, -23.0, -7.4))  # south, west, north, east of home
 AREA = (-26.8, -7.2, -22.2, 2.9)
 INTERVAL_M, SMOOTH_M = 0.25, 0.3
+LABELLED_M, LABELS_TO_M = 1.5, 17.5  # shorter lines, and those of the roof farther east, have no room for a height
 
 
 def earthwork(shape: tuple[int, int]) -> Singles:
@@ -176,13 +177,23 @@ def contours(folder: Path, flight: Path, picture: Path) -> None:
     with rasterio.open(flight / "maps" / "mosaic.tif") as read:
         box, bands = read.bounds, read.read()
     picture_bands = np.where(bands[3] > 0, bands[:3], 255).transpose(1, 2, 0).astype(np.uint8)
-    figure, axes = plt.subplots(figsize=(7.6, 4.6), layout="constrained")
+    figure, axes = plt.subplots(figsize=(7.6, 4.0), layout="constrained")
     axes.imshow(picture_bands, extent=(0, box.right - box.left, 0, box.top - box.bottom))
+    labels: list[tuple[float, float]] = []  # each stands where its line is farthest from the others
     for feature in json.loads(lines.read_text())["features"]:
         longitude, latitude = np.array(feature["geometry"]["coordinates"]).T
         east, north = raster.projection.to_map(latitude, longitude)
         major = feature["properties"]["major"]
-        axes.plot(east - box.left, north - box.bottom, color="#7a1f00", lw=1.8 if major else 0.8)
+        x, y = east - box.left, north - box.bottom
+        axes.plot(x, y, color="#7a1f00", lw=1.8 if major else 0.8)
+        if np.hypot(np.diff(x), np.diff(y)).sum() > LABELLED_M and x.mean() < LABELS_TO_M:
+            apart = [min((math.dist(one, at) for at in labels), default=0.0) for one in zip(x, y, strict=True)]
+            labels.append(at := (x[best := int(np.argmax(apart))], y[best]))
+            axes.text(
+                *at, f"{feature['properties']['height_m']:.2f}", color="#7a1f00", fontsize=7, ha="center",
+                va="center", bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6, "alpha": 0.85},
+                weight="bold" if major else "normal",
+            )  # fmt: skip
     axes.set_xlabel("m to the east")
     figure.savefig(picture, dpi=100)
     Image.open(picture).convert("RGB").quantize(96).save(picture, optimize=True)

@@ -23,6 +23,7 @@ from dappled.findings import Finding, named, remedy, told
 from tests.daemon.console.test_app import Rig, frame, rig
 from tests.daemon.health.test_faults import BODY, FAULTS
 from tests.daemon.health.test_record import HERE, S, record
+from tests.daemon.pipeline.test_overlap import at, watch
 from tests.system.test_console import SCREENSHOTS, chromium, leave, until
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.alone]
 def told_of(rig: Rig, folder: Path, *faults: str, **more: Any) -> list[Finding]:
     """Give the console the health record of a flight with these faults, and a photograph of 4 s ago."""
     changes = {name: value for fault in faults for name, value in FAULTS[fault][1].items()}
+    changes |= {name: more.pop(name) for name in ("found", "overlap") if name in more}
     made = record(folder, **{**FLYING, **changes})
     rows = [{**one, "age_s": 21.0} for one in made["findings"]]
     rig.feed.health = {**made, "flight": "20261121T101503Z-1a2b3c4d", "interval": None, "findings": rows, **more}
@@ -141,6 +143,25 @@ def test_until_the_views_are_made_the_mean_picture_is_shown(
     assert held
     held[-1].fulfill(json={"error": "this frame has no views"}, status=422)
     until(page, "document.querySelector('#caption').textContent === 'The mean picture. this frame has no views'")
+
+
+def test_too_fast_for_the_overlap_is_on_the_phone_s_first_screen_with_the_speed_that_would_do(
+    chromium: Browser, rig: Rig, picture: bytes, tmp_path: Path
+) -> None:
+    flying = watch(0.7)
+    flying.take(at(0, 0.0, 10.0))
+    flying.take(at(1, 4.0, 11.0))
+    fast = flying.trouble(11 * S)
+    assert fast is not None
+    (found,) = told_of(rig, tmp_path, found=[fast], overlap=flying.last(11 * S))
+    page = opened(chromium, rig, picture, *SIZES[0])
+    until(page, "document.querySelector('#verdict').dataset.state === 'caution'")
+    assert page.inner_text("#verdict-text") == str(named(found))
+    assert page.inner_text("#verdict-todo") == "fly at 2.4 m/s or slower"
+    cell = page.locator("#instruments", has_text="overlap").first
+    assert "50 %, 4.0 m apart" in " ".join(cell.inner_text().split())
+    on_screen(page, "verdict", "verdict-text", "verdict-todo", "shoot", "interval-stop", "instruments")
+    page.screenshot(path=SCREENSHOTS / "too-fast-390.png")
 
 
 @pytest.mark.parametrize("size", SIZES)
