@@ -31,6 +31,7 @@ systemctl stop dappled
 systemctl reset-failed
 for port in 0 1 2 3; do usbip detach -p $port 2>/dev/null; done
 until ! grep -qE '^[hs]s +[0-9]+ +00[56]' /sys/devices/platform/vhci_hcd.0/status 2>/dev/null; do sleep 0.1; done
+until ! ls /sys/bus/usb/devices 2>/dev/null | grep -qx '1-[1-9]'; do sleep 0.1; done
 rm -rf /var/lib/dappled/* && systemd-tmpfiles --create dappled.conf && test -d {FLIGHTS} || exit 1
 journalctl -q --rotate
 journalctl -q --vacuum-size=1

@@ -54,7 +54,7 @@ def test_a_network_that_comes_late_is_found(scene: Make) -> None:
     flown.begin()
     flown.photograph()
     assert flown.shown("NRestarts") == "0"
-    assert flown.kept() == len(flown.station.captured) == 1
+    assert flown.kept() >= len(flown.station.captured) >= 1
 
 
 # What gpsd tells chrony of a fix: the system's time, how far it is behind, no pulse, no leap second, a magic number.
@@ -172,6 +172,6 @@ def test_an_upgrade_starts_the_service_anew_and_the_flights_and_the_settings_sta
     assert flown.frames() == before
     flown.photograph()
     flown.machine.run("apt-get purge -y -q dappled 2>&1", timeout_s=300)
-    assert flown.kept() >= len(flown.station.captured) == 2
+    assert flown.kept() >= len(flown.station.captured) >= 2
     left = flown.machine.run("ls /usr/lib/systemd/system /usr/lib/udev/rules.d /etc | grep dappled || true")
     assert "dappled" not in left

@@ -26,6 +26,7 @@ OLD = 130
 BODY = BodyOptions(picture=f"pattern:{SMALL}:cr2", bind=HERE, usbip=True)
 CGROUP = "/sys/fs/cgroup/system.slice/dappled.service/cgroup.procs"
 ACM, USB_SERIAL = 166, 188
+PLACE = "/sys/bus/usb/devices/1-1/devnum"
 
 
 @pytest.fixture(scope="session")
@@ -42,7 +43,9 @@ def on_usb(usb_kernel: Path, scene: Callable[..., Scene], request: pytest.Fixtur
 
 
 def plug_in(scene: Scene) -> None:
-    scene.machine.run(f"usbip --tcp-port {scene.body.tcp_ports[0]} attach -r {HERE} -b 1-1")
+    """Return when the kernel knows it."""
+    attach = f"usbip --tcp-port {scene.body.tcp_ports[0]} attach -r {HERE} -b 1-1"
+    scene.machine.run(f"{attach} && until test -e {PLACE}; do sleep 0.1; done")
 
 
 def pictures(*numbers: int) -> list[str]:
@@ -150,16 +153,17 @@ def test_of_two_bodies_without_a_serial_number_one_stays_the_camera_when_the_bus
         flown.begin()
         flown.machine.run(attach.format(other.tcp_ports[0]))
         flown.station.shoot()
-        numbers = "cat /sys/bus/usb/devices/1-[12]/devnum"
+        numbers = f"for one in {PLACE} {PLACE.replace('1-1', '1-2')}; do until cat $one 2>&-; do sleep 0.1; done; done"
         first, second = map(int, flown.machine.run(numbers).split())
         assert first < second
         flown.machine.run(
             "systemctl kill -s STOP dappled && usbip detach -p 0 && "  # it sees both bodies, before and after
-            f"{attach.format(flown.body.tcp_ports[0])} && systemctl kill -s CONT dappled"
+            f"until ! test -e {PLACE}; do sleep 0.1; done && {attach.format(flown.body.tcp_ports[0])} && "
+            f"until test -e {PLACE}; do sleep 0.1; done && udevadm settle && systemctl kill -s CONT dappled"
         )
         first, second = map(int, flown.machine.run(numbers).split())
         assert first > second
-        flown.machine.run("until journalctl -u dappled | grep -c 'camera ready' | grep -q 2; do sleep 0.2; done")
+        flown.machine.run("until test $(journalctl -u dappled | grep -c 'camera ready') -ge 2; do sleep 0.2; done")
         flown.station.shoot()
         assert (flown.body.releases, other.releases) == (2, 0)
 
@@ -177,7 +181,7 @@ def test_a_shutter_line_is_closed_from_inside_the_service(on_usb: Scene) -> None
         "/etc/dappled/dappled.toml",
         (
             f'[camera]\ndriver = "fujifilm"\nprofile = "fujifilm-s5200"\nshutter = "gpio:/dev/{chip}:3"\n'
-            f'pickup = "later"\n[camera.options]\nhold_ms = 1000\n[mavlink]\nurl = "udpout:{HERE}:14550"\n'
+            f'pickup = "later"\n[camera.options]\nhold_ms = 5000\n[mavlink]\nurl = "udpout:{HERE}:14550"\n'
             f'[record]\ndirectory = "{FLIGHTS}"\n'
         ).encode(),
     )
