@@ -42,7 +42,7 @@ import contextlib, io, json, sys
 from dappled.cli import main
 from dappled.cli.table import GROUPS, VERBS
 said = {}
-for path in [*VERBS, *GROUPS]:
+for path in [*VERBS, *GROUPS, "calibrate lens --mask m"]:
     sys.argv = ["dappled", *path.split(), "--help"]
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
         main()
@@ -57,6 +57,7 @@ def test_help_loads_nothing_of_what_the_work_needs() -> None:
     said, loaded = json.loads(done.stdout)
     for path in [*VERBS, *GROUPS]:
         assert f"dappled {path}" in said[path].partition("example")[2], path
+    assert said["calibrate lens --mask m"] == said["calibrate"]
     assert not WORK & set(loaded)
     ours = {".".join(name.split(".")[1:3]) for name in loaded if name.startswith("dappled.daemon.")}
     assert ours <= {"daemon.health"}

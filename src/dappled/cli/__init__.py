@@ -24,9 +24,19 @@ def main(arguments: Sequence[str] | None = None, *, loaded: Callable[[], object]
         say(f"dappled {dappled.__version__}")
         return 0
     if arguments is None:
-        *named, last = words or [""]
-        asked = last in ("--help", "-h") and " ".join(named) in {**VERBS, **GROUPS}
-        table.words_only = asked or words[:1] == ["completion"]
+        words, helped = _asked_for_help(words)
+        table.words_only = helped or words[:1] == ["completion"]
     from dappled.cli import calling  # noqa: PLC0415  # --version waits for nothing
 
     return calling.run(words, loaded)
+
+
+def _asked_for_help(words: list[str]) -> tuple[list[str], bool]:
+    """The words, of a call that ends in --help without what stands between it and its verb; and whether it is one."""
+    *named, last = words or [""]
+    if last not in ("--help", "-h") or "--" in named:
+        return words, False
+    verb = next((named[:n] for n in range(len(named), 0, -1) if " ".join(named[:n]) in VERBS), None)
+    if verb is None:
+        return words, " ".join(named) in GROUPS
+    return [*verb, last], True
