@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patch_model import (
@@ -191,10 +192,10 @@ class MaskWitness:
         frame, spectra = seen.frame, seen.spectra
         kinds = [kind for kind in KINDS if kind.range == USUAL]
         rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
-        few = slice(None, None, _TRIED)
-        wholes = wholes_of(frame, rests, range(len(kinds)), few)
+        few, detail = slice(None, None, _TRIED), detail_of(frame.ranges[USUAL].seen, seen.own)
+        wholes = [rests.whole(number, detail[few], few) for number in range(len(kinds))]
         found = likelihoods(wholes, spectra[few], frame.weights[few], workers).sum(axis=1)
-        whole = rests.whole(int(found.argmax()), detail_of(frame.ranges[USUAL].seen, seen.own))
+        whole = rests.whole(int(found.argmax()), detail)
         differences, terms = _terms(frame.model.orders, whole, frame.weights, spectra, workers)
         return _Likelihood(differences, terms, np.zeros((len(terms), 2))).nats(np.zeros(3))
 
@@ -233,21 +234,24 @@ class _Textured:
 def _terms(
     orders: NDArray[np.int64], whole: Complexes, weights: Singles, spectra: Complexes, workers: int
 ) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
-    """The differences m (M, 2) of `orders` (A, 2), and the terms c (N, M) of each patch (F, A, N) whose covariance is
-    the `whole` (F, A, A), by frequencies' `weights` (F,)."""
-    inverse = np.linalg.inv(whole.astype(np.complex128)) * weights[:, None, None]
+    """The differences m (M, 2) of `orders` (A, 2) in a half plane, without 0, which tells nothing, and the terms c
+    (N, M), twice as large for it, of each patch (F, A, N) whose covariance is the `whole` (F, A, A), by frequencies'
+    `weights` (F,)."""
+    inverse = (np.linalg.inv(whole.astype(np.complex128)) * (-2 * weights[:, None, None])).astype(np.complex64)
     apart = orders[:, None] - orders[None, :]
-    differences, place = np.unique(apart.reshape(-1, 2), axis=0, return_inverse=True)
-    place = place.reshape(apart.shape[:2])
+    ahead = (apart[..., 0] > 0) | ((apart[..., 0] == 0) & (apart[..., 1] > 0))
+    differences, found = np.unique(apart[ahead], axis=0, return_inverse=True)
+    place = np.zeros(ahead.shape, dtype=np.intp)
+    place[ahead] = found.ravel()
     terms = np.zeros((spectra.shape[2], len(differences)), dtype=np.complex128)
 
     def add(some: slice) -> None:
-        here = spectra[:, :, some]
+        here = np.ascontiguousarray(spectra[:, :, some].transpose(1, 0, 2))
         conjugate = here.conj()
-        for b in range(len(orders)):
-            column = inverse[:, :, b].astype(np.complex64)[:, :, None] * conjugate
-            products = np.einsum("fan,fn->na", column, here[:, b])
-            terms[some, place[:, b]] -= products  # for one b every a has a difference of its own
+        for b, with_b in enumerate(ahead.T):
+            column = inverse[:, with_b, b].T[:, None]
+            products = (column @ (conjugate[with_b] * here[b]))[:, 0]
+            terms[some, place[with_b, b]] += products.T  # for one b every a has a difference of its own
 
     each(add, spans(len(terms), _AT_A_TIME), workers)
     return differences, terms
@@ -298,14 +302,12 @@ class _Likelihood:
 
     def nats(self, move: Floats) -> float:
         """The log odds of a mask there, against a place for each patch."""
-        with_place = np.any(self.differences != 0, axis=1)
-        terms, differences = self.terms[:, with_place], self.differences[with_place]
-        waves = np.exp(2j * np.pi * differences @ _tried().T).astype(np.complex64)
-        anywhere = (terms.astype(np.complex64) @ waves).real
+        waves = np.zeros((len(self.terms), _STEPS, _STEPS), dtype=np.complex64)
+        waves[:, *(self.differences.T % _STEPS)] = self.terms
+        anywhere = (fft.ifft2(waves, norm="forward").real).reshape(len(waves), -1)
         most = anywhere.max(axis=1)
         mean = most + np.log(np.exp(anywhere - most[:, None]).mean(axis=1))
-        at = move[:2] + move[2] * self.turned
-        here = (terms * np.exp(2j * np.pi * at @ differences.T)).real.sum(axis=1)
+        here = self.patches(move)
         placed, astray = np.log1p(-_ASTRAY)[:, None], np.log(_ASTRAY)[:, None]
         shares = np.logaddexp(placed + here - mean, astray).sum(axis=1) / _OVERLAP
         return float(np.logaddexp.reduce(shares) - np.log(len(shares)))

@@ -90,7 +90,8 @@ class SliceModel:
             out = frequencies + np.array(step) @ lattice
             through = self._through(self.angular[source], out, disparities)
             waves = self.transfers[source] * through / np.sqrt(len(disparities))
-            found.append(Fold(to, out, waves.astype(np.complex64).transpose(1, 2, 0)))
+            each = waves.astype(np.complex64).transpose(1, 2, 0)
+            found.append(Fold(to, out, each @ each.conj().transpose(0, 2, 1)))
         return found
 
 
@@ -110,18 +111,17 @@ def _viewed(aperture: Aperture, frequencies: bytes, disparities: bytes) -> Compl
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fold:
-    """Detail at `beyond` (F, 2), in cycles per sensor column, that folds into the slices `into` (n,): `waves`
-    (F, n, D) of unit spectrum."""
+    """Detail at `beyond` (F, 2), in cycles per sensor column, that folds into the slices `into` (n,):
+    `covariance` (F, n, n) of unit spectrum."""
 
     into: NDArray[np.int64]
     beyond: Floats
-    waves: Complexes
+    covariance: Complexes
 
 
 def folded(folds: Sequence[Fold], powers: Sequence[Floats], slices: int) -> Complexes:
     """(F, A, A) covariance of folded detail of these powers (F,) in A slices."""
     total = np.zeros((len(powers[0]), slices, slices), dtype=np.complex64)
     for fold, power in zip(folds, powers, strict=True):
-        one = (fold.waves @ fold.waves.conj().transpose(0, 2, 1)) * power.astype(np.float32)[:, None, None]
-        total[:, fold.into[:, None], fold.into[None, :]] += one
+        total[:, fold.into[:, None], fold.into[None, :]] += fold.covariance * power.astype(np.float32)[:, None, None]
     return total
