@@ -171,7 +171,7 @@ class _Shared:
     def machine(self, memory_mb: int, disks: Sequence[Path], usb: Path | None) -> Machine:
         """The one that is on, as if it had been started now, or another one."""
         kind = memory_mb, usb
-        if self._on is None or disks or kind != self._kind:
+        if self._on is None or disks or kind != self._kind or not self._is_as_new(self._on):
             self.cut()
             folder = self._folder()
             root = f"{folder / 'written'},{self._disk}"
@@ -194,9 +194,14 @@ class _Shared:
             if usb is not None:
                 self._on.put("/root/modules.tar", (usb / "modules.tar").read_bytes())
                 self._on.run("tar -C /usr --no-same-owner -xf /root/modules.tar && depmod")
-        else:
-            self._on.run(f"now={time.time():.0f}{ANEW}", timeout_s=300)
         return self._on
+
+    def _is_as_new(self, machine: Machine) -> bool:
+        try:
+            machine.run(f"now={time.time():.0f}{ANEW}", timeout_s=60)
+        except subprocess.SubprocessError:
+            return False  # as a USB bus that does not let go of a body
+        return True
 
     def cut(self) -> None:
         """Nobody wants it any more."""

@@ -144,30 +144,6 @@ def test_a_body_as_mass_storage_is_told_how_it_has_to_be_set(on_usb: Scene) -> N
     assert "set the camera's USB mode to PTP" in said
 
 
-@pytest.mark.parametrize("on_usb", [{"serial": ""}], indirect=True)
-def test_of_two_bodies_without_a_serial_number_one_stays_the_camera_when_the_bus_counts_anew(on_usb: Scene) -> None:
-    flown = on_usb
-    with SimulatedBody.start(replace(BODY, serial="")) as other:
-        attach = f"usbip --tcp-port {{}} attach -r {HERE} -b 1-1"
-        plug_in(flown)
-        flown.begin()
-        flown.machine.run(attach.format(other.tcp_ports[0]))
-        flown.station.shoot()
-        numbers = f"for one in {PLACE} {PLACE.replace('1-1', '1-2')}; do until cat $one 2>&-; do sleep 0.1; done; done"
-        first, second = map(int, flown.machine.run(numbers).split())
-        assert first < second
-        flown.machine.run(
-            "systemctl kill -s STOP dappled && usbip detach -p 0 && "  # it sees both bodies, before and after
-            f"until ! test -e {PLACE}; do sleep 0.1; done && {attach.format(flown.body.tcp_ports[0])} && "
-            f"until test -e {PLACE}; do sleep 0.1; done && udevadm settle && systemctl kill -s CONT dappled"
-        )
-        first, second = map(int, flown.machine.run(numbers).split())
-        assert first > second
-        flown.machine.run("until test $(journalctl -u dappled | grep -c 'camera ready') -ge 2; do sleep 0.2; done")
-        flown.station.shoot()
-        assert (flown.body.releases, other.releases) == (2, 0)
-
-
 def test_a_shutter_line_is_closed_from_inside_the_service(on_usb: Scene) -> None:
     flown = on_usb
     chip = flown.machine.run(
@@ -192,3 +168,27 @@ def test_a_shutter_line_is_closed_from_inside_the_service(on_usb: Scene) -> None
     flown.machine.run(f"systemd-run -q --unit=seen --remain-after-exit sh -c '{seen}'")
     flown.station.request()
     flown.machine.run("until systemctl show -P SubState seen | grep -q exited; do sleep 0.2; done")
+
+
+@pytest.mark.parametrize("on_usb", [{"serial": ""}], indirect=True)
+def test_of_two_bodies_without_a_serial_number_one_stays_the_camera_when_the_bus_counts_anew(on_usb: Scene) -> None:
+    flown = on_usb
+    with SimulatedBody.start(replace(BODY, serial="")) as other:
+        attach = f"usbip --tcp-port {{}} attach -r {HERE} -b 1-1"
+        plug_in(flown)
+        flown.begin()
+        flown.machine.run(attach.format(other.tcp_ports[0]))
+        flown.station.shoot()
+        numbers = f"for one in {PLACE} {PLACE.replace('1-1', '1-2')}; do until cat $one 2>&-; do sleep 0.1; done; done"
+        first, second = map(int, flown.machine.run(numbers).split())
+        assert first < second
+        flown.machine.run(
+            "systemctl kill -s STOP dappled && usbip detach -p 0 && "  # it sees both bodies, before and after
+            f"until ! test -e {PLACE}; do sleep 0.1; done && {attach.format(flown.body.tcp_ports[0])} && "
+            f"until test -e {PLACE}; do sleep 0.1; done && udevadm settle && systemctl kill -s CONT dappled"
+        )
+        first, second = map(int, flown.machine.run(numbers).split())
+        assert first > second
+        flown.machine.run("until test $(journalctl -u dappled | grep -c 'camera ready') -ge 2; do sleep 0.2; done")
+        flown.station.shoot()
+        assert (flown.body.releases, other.releases) == (2, 0)
