@@ -42,7 +42,7 @@ import contextlib, io, json, sys
 from dappled.cli import main
 from dappled.cli.table import GROUPS, VERBS
 said = {}
-for path in [*VERBS, *GROUPS, "calibrate lens --mask m"]:
+for path in ["calibrate lens --mask m", *VERBS, *GROUPS]:
     sys.argv = ["dappled", *path.split(), "--help"]
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
         main()
