@@ -17,6 +17,7 @@ import ast
 import itertools
 import json
 import os
+import shutil
 import statistics
 import subprocess
 import sys
@@ -28,6 +29,7 @@ from typing import Any
 
 from limits import Limit, flat, read_limits
 
+import dappled
 from dappled.daemon.pipeline.recipes import versions
 
 Machine = dict[str, str | int | float]
@@ -191,9 +193,22 @@ def machine() -> Machine:
         "model": known["processor"] or known["machine"],
         "cores": os.cpu_count() or 0,
         "python": known["python"],
+        "version": dappled.__version__,
+        "commit": commit(),
         "date": time.strftime("%Y-%m-%d", time.gmtime()),
         "load_before": round(os.getloadavg()[0], 2),
     }
+
+
+def commit() -> str:
+    """The code's commit, with a plus where files differ from it; empty where there is no repository."""
+    git = [shutil.which("git") or "git", "-C", str(FOLDER)]
+    asked = [["rev-parse", "--short=8", "HEAD"], ["status", "--porcelain", "--untracked-files=no"]]
+    said = [subprocess.run([*git, *one], capture_output=True, text=True, check=False) for one in asked]
+    if any(one.returncode for one in said):
+        return ""
+    named, changed = (one.stdout.strip() for one in said)
+    return named + "+" * bool(changed)
 
 
 def table(rows: Sequence[Row]) -> str:
@@ -220,10 +235,11 @@ def page(rows: Sequence[Row], on: Machine, repeats: int, apart: Mapping[str, Mac
 
 
 def measured_on(on: Machine, repeats: int) -> str:
-    """The machine, the day and the load in a sentence."""
+    """The code, the machine, the day and the load in a sentence."""
+    code = f"dappled {on['version']} at commit {on['commit']}; " if on.get("commit") else ""
     after = f", after it {on['load_after']}" if "load_after" in on else ""
     return (
-        f"{on['model']}, {on['cores']} cores, Python {on['python']}, {on['date']}; load before the run "
+        f"{code}{on['model']}, {on['cores']} cores, Python {on['python']}, {on['date']}; load before the run "
         f"{on['load_before']}{after}; median of {repeats}."
     )
 
@@ -241,6 +257,21 @@ def baseline(path: Path) -> dict[str, float]:
     if not path.exists():
         return {}
     return {name: float(value) for name, value in json.loads(path.read_text(encoding="utf-8"))["figures"].items()}
+
+
+def run_all(benchmarks: Sequence[str], repeats: int) -> tuple[dict[str, list[dict[str, float]]], list[str]]:
+    """The figures of each run of the benchmarks, in turns, and what failed."""
+    runs, failed, started = dict[str, list[dict[str, float]]](), list[str](), time.monotonic()
+    for turn in range(repeats):
+        for name in benchmarks:
+            began = time.monotonic()
+            try:
+                runs.setdefault(name, []).append(run(name))
+            except RuntimeError as error:
+                failed.append(f"{name}: {error}")
+            print(f"{name} {turn + 1} of {repeats}: {time.monotonic() - began:.0f} s", file=sys.stderr)
+    print(f"{time.monotonic() - started:.0f} s in all", file=sys.stderr)
+    return runs, failed
 
 
 def main() -> int:
@@ -267,15 +298,8 @@ def main() -> int:
     if unknown:
         parser.error(f"no benchmark is called {', '.join(unknown)}; there are {', '.join(names)}")
     chosen = arguments.names or names
-    on, runs, failed = machine(), dict[str, list[dict[str, float]]](), list[str]()
-    for turn in range(arguments.repeats):
-        for name in chosen:
-            began = time.monotonic()
-            try:
-                runs.setdefault(name, []).append(run(name))
-            except RuntimeError as error:
-                failed.append(f"{name}: {error}")
-            print(f"{name} {turn + 1} of {arguments.repeats}: {time.monotonic() - began:.0f} s", file=sys.stderr)
+    on = machine()
+    runs, failed = run_all(chosen, arguments.repeats)
     asked = [limit for limit in limits if limit.benchmark in chosen]
     rows, missing = measured(asked, runs, baseline(arguments.baseline))
     arguments.out.parent.mkdir(parents=True, exist_ok=True)

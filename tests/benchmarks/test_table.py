@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from dappled import __version__
 from tests.benchmarks import FOLDER
 
 sys.path.insert(0, str(FOLDER))
@@ -108,6 +110,17 @@ def test_figures_of_a_run_apart_are_added_and_named(tmp_path: Path) -> None:
     assert (
         "Measured apart: m, 2 cores, Python 3, another day; load before the run 0, after it 0.2; median of 3." in after
     )
+
+
+def test_the_page_is_of_this_release_or_of_the_one_before() -> None:
+    """Figures of older code are no figures of this one: run `make bench`."""
+    said = (FOLDER.parent / "docs" / "performance.md").read_text(encoding="utf-8")
+    named = re.findall(r"^(?:Measured apart: )?dappled (\S+) at commit [0-9a-f]{8}\+?;", said, re.MULTILINE)
+    released = re.findall(r"^## (\d+\.\S+)", (FOLDER.parent / "CHANGELOG.md").read_text(encoding="utf-8"), re.MULTILINE)
+    recent = {__version__, *[one for one in released if one != __version__][:1]}
+    assert named
+    assert len(named) == said.count("load before the run")
+    assert set(named) <= recent
 
 
 def test_the_page_says_what_no_pi_told() -> None:
