@@ -106,7 +106,7 @@ def test_nothing_is_asked_for_a_file_that_can_t_be_written_or_beside_a_wrong_fla
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     left = at_a_terminal(monkeypatch, "auto")
-    assert main(["init", str(tmp_path / "missing" / "x.toml")]) == 1
+    assert main(["init", str(tmp_path / "missing" / "x.toml")]) == 2
     assert main(["init", str(tmp_path / "x.toml"), "--mask", "mask2"]) == 2
     assert left == ["auto"]
     said = capsys.readouterr().err

@@ -31,7 +31,7 @@ def test_a_token_is_made_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert len(path.read_text().strip()) == 32
     assert path.read_text().strip() not in capsys.readouterr().out
     assert main(["keys", "token", str(path)]) == 1
-    assert main(["keys", "token", str(tmp_path / "no" / "folder")]) == 1
+    assert main(["keys", "token", str(tmp_path / "no" / "folder")]) == 2
     assert "can't be written" in capsys.readouterr().err
 
 

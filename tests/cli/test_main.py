@@ -113,7 +113,22 @@ def test_a_wrong_call_ends_with_2(words: list[str], capsys: pytest.CaptureFixtur
         (["mask", "design", *_HIGH, "--views", "4"], 2, "views = 4 must be odd"),
         (["trigger", "--url", "nonsense"], 2, "not a connection string"),
         (["flight", "show", "nowhere"], 2, "nowhere: no such file or folder"),
-        (["flight", "show", "."], 1, "is not a flight folder"),
+        (["flight", "show", "."], 2, "is not a flight folder"),
+        (["flight", "list", "there.dng"], 2, "is no folder"),
+        (["flight", "check", ".", "--key", "."], 2, "is not a flight folder"),
+        (["batch", ".", "-o", "out", "--as", "npz"], 2, "is not a flight folder"),
+        (["geotag", "."], 2, "is not a flight folder"),
+        (["georeference", "there.dng"], 2, "is not a flight folder (it is a file)"),
+        (["export", ".", "--as", "npz", "-o", "x.npz"], 2, "holds 0 pictures"),
+        (["views", "there.dng", "-o", "x.png"], 2, "is not a light field"),
+        (["decode", "empty", "--mask", "mask-2", "-o", "x.npz"], 2, "holds no frame"),
+        (["carriers", ".", "--mask", "mask-2"], 2, "is a folder"),
+        (["init", "none/dir/x.toml", "--mask", "none"], 2, "is no folder; make it first"),
+        (["keys", "make", "a/b"], 2, "can't be the name of a key"),
+        (["keys", "show", "."], 2, "is a folder"),
+        (["keys", "token", "none/token"], 2, "is no folder; make it first"),
+        (["keys", "seal", "none/key"], 2, "is no folder; make it first"),
+        (["mavlink", "key", "none/key"], 2, "is no folder; make it first"),
         (["replay", "there.dng"], 2, "neither a flight nor a folder of frames"),
         (["decode", "nowhere.dng", "--mask", "mask-2", "-o", "x.npz"], 2, "nowhere.dng"),
         (["decode", "there.dng", "--mask", "mask-22", "-o", "x.npz"], 2, "did you mean mask-2"),
@@ -132,6 +147,7 @@ def test_a_failure_is_one_sentence_and_has_its_exit_code(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.dng").touch()
+    (tmp_path / "empty").mkdir()
     assert main(words) == code
     err = capsys.readouterr().err
     assert said in err

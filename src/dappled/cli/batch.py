@@ -56,6 +56,9 @@ class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
     def check(self) -> None:
         """Refuse a call that is wrong by itself."""
         self.check_profiles()
+        wrong = [layout.not_a_flight(one) for one in self._folders()]
+        if all(wrong):
+            raise CallError(wrong[0])
         if self.pos and len(self._folders()) > 1:
             raise CallError(f"--pos {self.pos} holds the marks of one flight: give one FLIGHT")
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from dappled import codec, durable
+from dappled.cli import paths
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
@@ -81,7 +82,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
         "dappled carriers lytro.png --mask lenslet",
     )
 
-    frame: Path | None = argument("FRAME", FRAME_HELP, default=None, there=True)
+    frame: Path | None = argument("FRAME", FRAME_HELP, default=None, there=paths.file)
     mask: str = option("--mask", "mask profile or TOML file, or lenslet")
     crossed: bool = flag(
         "--crossed", "also list the orders between harmonics, which the pattern is not designed to make"

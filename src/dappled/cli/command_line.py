@@ -6,7 +6,8 @@ import argparse
 import difflib
 import importlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, fields
 from pathlib import Path
 from types import NoneType, UnionType
@@ -91,20 +92,30 @@ def read(words: Sequence[str]) -> Call:
 
 
 def check(verb: Verb) -> None:
-    """Refuse what is wrong by itself: files that are not there, then what the verb refuses. Raises DappledError."""
+    """Refuse what is wrong by itself: files that are not there, what the verb refuses, files of another kind.
+
+    Raises DappledError.
+    """
+    named = list(_named(verb))
+    for path, _ in named:
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            raise CallError(f"{path}: no such file or folder; check the path") from None
+    verb.check()
+    for path, there in named:
+        with suppress(PermissionError):  # the work says what can't be read
+            if not isinstance(there, bool) and (wrong := there(path)):
+                raise CallError(wrong)
+
+
+def _named(verb: Verb) -> Iterator[tuple[Path, Callable[[Path], str] | bool]]:
+    """The files and folders that must be there, each with what tells its kind."""
     for spec in fields(verb):
-        if spec.metadata["argument"].there:
+        if there := spec.metadata["argument"].there:
             value = getattr(verb, spec.name)
             for path in value if isinstance(value, tuple) else () if value in (None, "") else (value,):
-                _must_be_there(Path(path))
-    verb.check()
-
-
-def _must_be_there(path: Path) -> None:
-    try:
-        path.stat()
-    except (FileNotFoundError, NotADirectoryError):
-        raise CallError(f"{path}: no such file or folder; check the path") from None
+                yield Path(path), there
 
 
 def _plain(spec: Field[Any], value: Any) -> Any:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled import codec
+from dappled.cli import paths
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.table import words_only
@@ -68,7 +69,8 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
     )  # fmt: skip
     flight: Path | None = option(
         "--flight", "with --frame: place the points on the map, using the pose of that frame; without LIGHTFIELD: "
-        "heights of the ground from its frames, each by itself, fused (a GeoTIFF)", None, metavar="FLIGHT", there=True,
+        "heights of the ground from its frames, each by itself, fused (a GeoTIFF)", None, metavar="FLIGHT",
+        there=paths.flight,
     )  # fmt: skip
     frame: int | None = option(
         "--frame", "number of this frame in the flight; without LIGHTFIELD: use only this one", None, low=0,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.cli import paths
 from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, argument, option
 from dappled.findings import Finding, Subject, of_subject, text
@@ -23,7 +24,7 @@ FIELD_HELP = "decoded light field (.zarr, .npz, .h5), or a folder of n × n pict
 class FieldArguments(Doubtable):
     """The light field."""
 
-    field: Path = argument("LIGHTFIELD", FIELD_HELP, there=True)
+    field: Path = argument("LIGHTFIELD", FIELD_HELP, there=paths.light_field)
 
 
 @dataclass(frozen=True, kw_only=True)

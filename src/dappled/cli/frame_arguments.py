@@ -79,7 +79,7 @@ class FramesArguments(RecipeArguments):
 def frames(given: Sequence[Path]) -> list[Path]:
     """The frames that were named, and those in the folders that were: of a flight, those in its folder of frames.
 
-    Raises DappledError for a folder without frames.
+    Raises CallError for a folder without frames.
     """
     found: list[Path] = []
     for path in given:
@@ -93,7 +93,7 @@ def frames(given: Sequence[Path]) -> list[Path]:
         )
         if not inside:
             kinds = ", ".join(FRAME_SUFFIXES)
-            raise DappledError(f"{folder} holds no frame ({kinds}): name frames, a folder of frames, or a flight")
+            raise CallError(f"{folder} holds no frame ({kinds}): name frames, a folder of frames, or a flight")
         found += inside
     return found
 

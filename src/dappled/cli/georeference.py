@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from dappled.cli import paths
 from dappled.cli.calibrate import lens
 from dappled.cli.placing import Refining
 from dappled.cli.table import words_only
@@ -50,14 +51,14 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
     )
     notes = "Writes into FLIGHT/maps, whose maps it replaces, unless -o says otherwise. The recording is not changed."
 
-    flight: Path = argument("FLIGHT", "flight folder", there=True)
+    flight: Path = argument("FLIGHT", "flight folder", there=paths.flight)
     output: Path | None = option("-o --output", "folder for the maps", None, metavar="DIR", otherwise="FLIGHT/maps")
     kinds: tuple[str, ...] = option("--as", "what to make", ("kmz", "cog", "footprints"), choices=KINDS)
     each: bool = flag("--each", "also make a kmz or cog of each frame, in frames/")
     quad: bool = flag("--quad", "write each frame's kmz as a LatLonQuad: the view itself")
     against: tuple[Path, ...] = option(
         "--against", "for difference: the later flight to compare with, or several; all of their frames are used", (),
-        metavar="FLIGHT", there=True,
+        metavar="FLIGHT", there=paths.flight,
     )  # fmt: skip
     between: tuple[float, float] | None = option(
         "--between", "for terrain: heights to search, metres above sea level", None, metavar=("LOW", "HIGH"),
@@ -85,8 +86,6 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
             if self.solve_lens.suffix != ".toml":
                 raise CallError(f"{self.solve_lens}: the name of a camera profile must end in .toml")
             self.refuse_existing(self.solve_lens)
-        for flight in (self.flight, *self.against):
-            layout.open_folder(flight)
         if len({flight.resolve().name for flight in self.against}) < len(self.against):
             raise CallError("--against names a flight twice")
         if self.output is not None:  # a folder that the user named: its report is of the last call

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dappled import codec
-from dappled.cli import sealing
+from dappled.cli import paths, sealing
 from dappled.cli.placing import Mounted, check_geoid
 from dappled.cli.table import words_only
 from dappled.cli.verb import (
@@ -81,7 +81,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         "The frames themselves are not changed."
     )
 
-    flight: Path = argument("FLIGHT", "flight folder", there=True)
+    flight: Path = argument("FLIGHT", "flight folder", there=paths.flight)
     output: Path | None = option("-o --output", "write everything into this folder instead", None, metavar="DIR")
     lightroom: bool = flag("--lightroom", "name sidecars name.xmp instead of name.ext.xmp")
     force: bool = flag("--force", "replace sidecars that another program wrote")

@@ -11,7 +11,7 @@ from typing import Any
 
 from dappled import durable
 from dappled.cli.table import words_only
-from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, of_setting, option
+from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, of_setting, option, refuse_no_folder
 from dappled.config import settings
 from dappled.config.schema import TomlSource
 from dappled.config.settings import CameraSettings, RecordSettings, SettingsFile
@@ -67,6 +67,7 @@ class InitSettings(Overwriting, Verb):
     def check(self) -> None:
         """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.file)
+        refuse_no_folder(self.file)
 
     def run(self, output: Output) -> Report:
         """Write a settings file."""
@@ -87,8 +88,12 @@ class InitSettings(Overwriting, Verb):
             if not answer:
                 raise DappledError(f"nobody is there to ask: give {question.flag} ({question.words})")
             answers[question.flag] = answer
+        refuse_wrong(answers, self.file)
         text = settings_text(answers)
-        write(self.file, text)
+        try:
+            durable.write_file(self.file, text.encode())
+        except OSError as error:
+            raise DappledError(f"{self.file} can't be written: {error.strerror}") from error
         if not self.json:
             output.remark(f"{self.file}: good; next: dappled doctor --config {self.file}")
         return Report({"file": str(self.file), "settings": tables(answers)}, text.splitlines())
@@ -170,22 +175,6 @@ def tables(answers: dict[str, str]) -> dict[str, dict[str, Any]]:
 def settings_text(answers: dict[str, str]) -> str:
     """The settings file."""
     return f"# Written by dappled init; all settings: dappled config show\n{tomli_w.dumps(tables(answers))}"
-
-
-def write(file: Path, text: str) -> None:
-    """Write the file if `config check` finds it good. Raises ConfigError, and writes nothing, if not."""
-    part = file.with_name(f".{file.name}.part")
-    try:
-        part.write_text(text, encoding="utf-8")
-        try:
-            settings_check.checked(settings.examine_file(part), by_this_user=False)
-        except DappledError as error:
-            raise type(error)(str(error).replace(str(part), str(file))) from None
-        durable.write_file(file, text.encode())
-    except OSError as error:
-        raise DappledError(f"{file} can't be written: {error.strerror}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def bodies() -> list[UsbBody]:

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import key_files
+from dappled.cli import paths
 from dappled.cli.table import words_only
-from dappled.cli.verb import Output, Report, Verb, argument, flag, option
+from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option, refuse_no_folder
 from dappled.errors import DappledError
 
 if not words_only:
@@ -36,6 +37,11 @@ class MakeKeys(Verb):
     name: str = argument("NAME", "name of the owner: letters, digits, dot, dash, underscore")
     folder: Path = option("-o --folder", "folder to write to", _HOME, metavar="DIR")
 
+    def check(self) -> None:
+        """Refuse a call that is wrong by itself."""
+        if wrong := curve.not_a_name(self.name):
+            raise CallError(wrong)
+
     def run(self, output: Output) -> Report:
         """Make a pair of keys."""
         public, secret = curve.make(self.folder.expanduser(), self.name)
@@ -49,7 +55,7 @@ class ShowKey(Verb):
 
     examples = ("dappled keys show laptop.key",)
 
-    file: Path = argument("FILE", "NAME.key or NAME.key_secret", there=True)
+    file: Path = argument("FILE", "NAME.key or NAME.key_secret", there=paths.file)
 
     def run(self, output: Output) -> Report:
         """Show a public key."""
@@ -60,6 +66,10 @@ class ShowKey(Verb):
 @dataclass(frozen=True, kw_only=True)
 class _NewFile(Verb):
     file: Path = argument("FILE", "file to write; must not exist yet")
+
+    def check(self) -> None:
+        """Refuse a call that is wrong by itself."""
+        refuse_no_folder(self.file.expanduser())
 
 
 class MakeToken(_NewFile):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dappled.cli import paths
 from dappled.cli.field_arguments import FIELD_HELP, RangingArguments
 from dappled.cli.frame_arguments import Several
 from dappled.cli.table import words_only
@@ -268,8 +269,8 @@ _OF_FLIGHT = "of a flight (--flight without LIGHTFIELD)"
 class FieldOrFlight(RangingArguments, Doubtable):
     """A light field, or a flight and how its frames are decoded and placed."""
 
-    field: Path | None = argument("LIGHTFIELD", FIELD_HELP, default=None, there=True)
-    flight: Path | None = option("--flight", "a flight", None, metavar="FLIGHT", there=True)
+    field: Path | None = argument("LIGHTFIELD", FIELD_HELP, default=None, there=paths.light_field)
+    flight: Path | None = option("--flight", "a flight", None, metavar="FLIGHT", there=paths.flight)
     terrain: Path | None = option("--terrain", "given terrain: DTED, GeoTIFF …", None, group=_OF_FLIGHT, there=True)
     ground: float | None = option(
         "--ground", "height of flat ground, metres above sea level", None, metavar="M", group=_OF_FLIGHT,

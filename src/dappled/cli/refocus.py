@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from dappled import codec, durable
+from dappled.cli import paths
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.table import words_only
@@ -99,7 +100,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
     fourier: bool = flag("--fourier", "refocus by a slice of the 4D spectrum (Ng), and compare with shift and add")
     flight: Path | None = option(
         "--flight", "without LIGHTFIELD: refocus a flight, its frames as views of one wide aperture; .tif is then a "
-        "GeoTIFF", None, metavar="FLIGHT", there=True,
+        "GeoTIFF", None, metavar="FLIGHT", there=paths.flight,
     )  # fmt: skip
     height: tuple[float, ...] = option(
         "--height", "of a flight: heights to focus on, metres above the ground", (), metavar="M", otherwise="0",

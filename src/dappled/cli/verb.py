@@ -32,8 +32,8 @@ class Argument:
     """How a field is given on the command line: its rule (meaning, unit, range, choices; as of a setting) and its form.
 
     A positional one has no `names`. `above` is an exclusive lower limit. `parse` reads one word, and raises ValueError
-    with a sentence. `const` is the value of an option without one. `there`: a file or folder that must exist.
-    `first`: it stands before inherited ones.
+    with a sentence. `const` is the value of an option without one. `there`: a file or folder that must exist, and
+    be what the function says (see `paths`). `first`: it stands before inherited ones.
     """
 
     rule: Rule
@@ -44,7 +44,7 @@ class Argument:
     parse: Callable[[str], Any] | None = None
     const: Any = None
     append: bool = False
-    there: bool = False
+    there: Callable[[Path], str] | bool = False
     group: str = ""
     otherwise: str = ""
     alone: str = ""
@@ -151,6 +151,12 @@ class Overwriting:
         for path in () if self.overwrite else outputs:
             if path is not None and (path.is_symlink() or path.exists()):
                 raise DappledError(f"{path} exists already: choose another name, or --overwrite replaces it")
+
+
+def refuse_no_folder(path: Path) -> None:
+    """Refuse to write where there is no folder. Raises CallError."""
+    if not path.absolute().parent.is_dir():
+        raise CallError(f"{path} can't be written: {path.absolute().parent} is no folder; make it first")
 
 
 @dataclass(frozen=True, kw_only=True)

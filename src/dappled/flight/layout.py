@@ -161,16 +161,24 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
 
 def open_folder(path: Path) -> FlightFolder:
     """Open a recorded flight. Raises FlightError when `path` is not one, OutsideError when a part of it is a link."""
-    folder = FlightFolder(path)
     try:
-        found = path.is_dir() and (folder.ledger.is_file() or folder.settings.is_file())
+        wrong = not_a_flight(path)
     except OSError as error:
         raise disk_error("open the flight", path, error) from error
-    if not found:
-        what = "does not exist" if not path.exists() else "is a file" if path.is_file() else "holds no flight.sqlite"
-        raise FlightError(f"{path} is not a flight folder (it {what}); give the folder that holds flight.sqlite")
+    if wrong:
+        raise FlightError(wrong)
+    folder = FlightFolder(path)
     folder.refuse_links()
     return folder
+
+
+def not_a_flight(path: Path) -> str:
+    """Why `path` is not a recorded flight; "" where it is. Raises OSError."""
+    folder = FlightFolder(path)
+    if path.is_dir() and (folder.ledger.is_file() or folder.settings.is_file()):
+        return ""
+    what = "does not exist" if not path.exists() else "is a file" if path.is_file() else "holds no flight.sqlite"
+    return f"{path} is not a flight folder (it {what}); give the folder that holds flight.sqlite"
 
 
 def unmade(root: Path) -> list[Path]:

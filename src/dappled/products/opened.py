@@ -452,11 +452,18 @@ _TEXTS = (".toml", ".json", ".txt", ".csv", ".md", ".py", ".sqlite", ".tlog", ".
 def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLightField:
     """Open a light field only. Raises DappledError."""
     here = Path(path).expanduser()
-    raw = here.is_file() and here.suffix not in _LIGHT_FIELDS
-    found = None if raw else open(here, focus_m=focus_m)
-    if not isinstance(found, OpenedLightField):
-        raise OpenError(f"{path} is not a light field: decode it first (dappled decode), or name a .zarr, .npz or .h5")
-    return found
+    if here.exists() and (wrong := not_a_light_field(here)):
+        raise OpenError(wrong)
+    return open(here, kind="light field", focus_m=focus_m)
+
+
+def not_a_light_field(path: Path) -> str:
+    """Why a file or folder that is there can't be a light field, by its name and what it holds; "" where it may be."""
+    if path.suffix in _LIGHT_FIELDS:
+        return ""
+    if path.is_dir() and not layout.FlightFolder(path).ledger.exists():
+        return view_folders.not_square(path)
+    return f"{path} is not a light field: decode it first (dappled decode), or name a .zarr, .npz or .h5"
 
 
 def lens_ranging(field: LightField, focus_m: float) -> Ranging | None:

@@ -144,7 +144,7 @@ def test_a_bad_flight_is_said_and_the_others_are_made(
     lines = said.err.strip().splitlines()
     assert len(lines) == 2
     assert all("is not a flight folder" in line for line in lines)
-    assert main([asked[0], str(tmp_path), *asked[2:]]) == 1  # and where none is left
+    assert main([asked[0], str(tmp_path), *asked[2:]]) == 2  # and where none is left
     assert capsys.readouterr().err.count("is not a flight folder") == 1
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import codec
-from dappled.cli import sealing
+from dappled.cli import paths, sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
 from dappled.cli.table import words_only
 from dappled.cli.verb import (
@@ -36,7 +36,9 @@ class ListFlights(SettingsArgument, Verb):
 
     examples = ("dappled flight list ~/flights",)
 
-    folder: Path | None = argument("FOLDER", "flights folder (default: record.directory)", default=None)
+    folder: Path | None = argument(
+        "FOLDER", "flights folder (default: record.directory)", default=None, there=paths.folder
+    )
 
     def run(self, output: Output) -> Report:
         """List all flights in a folder."""
@@ -67,7 +69,7 @@ class CheckFlight(FlightArgument, Verb):
     examples = (f"dappled flight check {EXAMPLE}",)
 
     key: Path | None = option(
-        "--key", "insist that this key signed the seals", None, there=True, otherwise="record.seal_key, if any",
+        "--key", "insist that this key signed the seals", None, there=paths.file, otherwise="record.seal_key, if any",
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
@@ -83,7 +85,7 @@ class SealFlight(FlightArgument, Verb):
     examples = (f"dappled flight seal {EXAMPLE} --key ~/seal.key",)
 
     key: Path | None = option(
-        "--key", "the key that signs; see dappled keys seal", None, there=True, otherwise="record.seal_key",
+        "--key", "the key that signs; see dappled keys seal", None, there=paths.file, otherwise="record.seal_key",
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:

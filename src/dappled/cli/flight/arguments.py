@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.cli import paths
 from dappled.cli.table import words_only
 from dappled.cli.verb import Output, SettingsArgument, argument
 from dappled.config import settings
@@ -20,7 +21,9 @@ EXAMPLE = "~/flights/20261121T101503Z-0a1b2c3d"
 class FlightArgument(SettingsArgument):
     """The flight."""
 
-    flight: Path | None = argument("FLIGHT", "flight folder (default: the last with shots)", default=None, there=True)
+    flight: Path | None = argument(
+        "FLIGHT", "flight folder (default: the last with shots)", default=None, there=paths.flight
+    )
 
     def chosen(self, output: Output) -> Path:
         """The flight that was named, or the last with shots; says which. Raises FlightError if there is none."""

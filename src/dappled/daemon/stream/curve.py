@@ -52,10 +52,8 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
 
     Raises DappledError.
     """
-    if not _NAME.fullmatch(name):
-        raise DappledError(
-            f"{name!r} can't be the name of a key: use letters, digits, dot, dash and underscore, 64 at most"
-        )
+    if wrong := not_a_name(name):
+        raise DappledError(wrong)
     public, secret = zmq.curve_keypair()
     public_file, secret_file = folder / f"{name}.key", folder / f"{name}.key_secret"
     head = "# A ZeroMQ CURVE key made by dappled; {}\nmetadata\ncurve\n"
@@ -76,6 +74,13 @@ def make(folder: Path, name: str) -> tuple[Path, Path]:
     except OSError as error:
         raise DappledError(f"{error.filename or folder} can't be written: {error.strerror}") from None
     return public_file, secret_file
+
+
+def not_a_name(name: str) -> str:
+    """Why a pair can't have this name; "" where it can."""
+    if _NAME.fullmatch(name):
+        return ""
+    return f"{name!r} can't be the name of a key: use letters, digits, dot, dash and underscore, 64 at most"
 
 
 def read_private(path: Path, what: str) -> str:

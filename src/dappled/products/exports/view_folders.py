@@ -28,11 +28,10 @@ def read(folder: Path) -> LightField:
     The light field has no slices, and `cameras` among its attributes. If the folder contains HCI's `input_Cam….png`,
     other pictures are ignored. Raises DappledError.
     """
-    files = picture_order.by_name((p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS), Path.as_posix)
-    files = [p for p in files if p.name.startswith("input_Cam")] or files
+    if wrong := not_square(folder):
+        raise DappledError(wrong)
+    files = _pictures(folder)
     side = math.isqrt(len(files))
-    if side == 0 or side * side != len(files):
-        raise DappledError(f"{folder} holds {len(files)} pictures: a light field needs n × n, one per view")
     try:
         # Each value is a float32 of a picture, and another of all views.
         claims.check_size(sum(map(_values, files)) * 8, sum(path.stat().st_size for path in files), "views")
@@ -52,6 +51,18 @@ def read(folder: Path) -> LightField:
         grid=np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]),
         attributes={CAMERAS: True, "source": folder.name, "shape": list(shape[:2])},
     )
+
+
+def not_square(folder: Path) -> str:
+    """Why the pictures of a folder are no light field; "" where they can be one."""
+    count = len(_pictures(folder))
+    square = count > 0 and math.isqrt(count) ** 2 == count
+    return "" if square else f"{folder} holds {count} pictures: a light field needs n × n, one per view"
+
+
+def _pictures(folder: Path) -> list[Path]:
+    files = picture_order.by_name((p for p in folder.iterdir() if p.suffix.lower() in _ENDINGS), Path.as_posix)
+    return [p for p in files if p.name.startswith("input_Cam")] or files
 
 
 @contextmanager
