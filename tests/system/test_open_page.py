@@ -85,6 +85,18 @@ def test_a_recording_is_looked_at_and_nothing_on_its_page_waits_for_a_daemon(
     for tab in ("views", "slices", "spectrum"):
         page.click(f"#tab-{tab}")
         page.wait_for_selector(f'#tab-{tab}[aria-selected="true"]')
+    page.click("#tab-full")
+    page.wait_for_selector('#frame-box[data-full] #picture[data-kind="full"]')
+    sides = page.evaluate(
+        "(({ naturalWidth, naturalHeight, clientWidth, clientHeight }) =>"
+        " [naturalWidth, naturalHeight, clientWidth, clientHeight])(document.querySelector('#picture'))"
+    )
+    assert sides == [922, 694, 922, 694], "a pixel of the sensor is one of the page"
+    until(page, "/^922 × 694 px without the mask's shadow/.test(document.querySelector('#caption').textContent)")
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.screenshot(path=SCREENSHOTS / f"recording-{width}x{height}-full.png")
+    page.click("#tab-views")
+    page.wait_for_selector("#frame-box:not([data-full]) #picture[data-kind='views']")
     assert "verdict" in page.inner_text("#facts").lower()
     assert watched.wrong == []
 

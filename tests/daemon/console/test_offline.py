@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import io
 import json
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import numpy as np
 import pytest
+from PIL import Image
 
 from dappled import codec
 from dappled.clock import RecordedClock
@@ -23,6 +26,8 @@ from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFiel
 from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.lightfield import LightField
+from dappled.decode.picture.picture import UnmaskedPicture
+from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Finding, finding, text
 from dappled.flight import Result, flight_report, layout, recording
@@ -256,6 +261,46 @@ def test_the_frame_that_is_asked_for_is_decoded_before_those_that_nobody_waits_f
     asyncio.run(looked_at())
     served.asked()
     assert decoder.order == [7, 0, 2, 1, 6, 5, 4, 3]
+
+
+class PlainMaker(PictureMaker):
+    """Makes a grey picture in doubt, and notes what it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[str, float | None, float | None]] = []
+
+    def picture(
+        self, path: Path | str, *, focal_length_mm: float | None = None, f_number: float | None = None
+    ) -> MadePicture:
+        self.asked.append((Path(path).name, focal_length_mm, f_number))
+        plane = np.full((40, 60), 0.25, np.float32)
+        facts: Any = {
+            "plane": plane,
+            "pattern": np.zeros((1, 1), np.intp),
+            "shadow": None,
+            "sigma": plane,
+            "valid": None,
+        }
+        picture = UnmaskedPicture(trusted=plane > 0, dark_share=0.0, soft_share=0.0, **facts)
+        clipped = finding(Code.PICTURE_CLIPPED, FRAME, share=0.03)
+        rest: Any = {"raw": SimpleNamespace(colour_names=("G",)), "sensor": None}
+        return MadePicture(picture, focal_length_mm=50.0, f_number=8.0, colour_matrix=None, findings=(clipped,), **rest)
+
+
+def test_a_frame_is_looked_at_pixel_by_pixel_with_the_doubts_of_its_picture(flight: Path) -> None:
+    maker = PlainMaker()
+    source = FlightFrames(layout.open_folder(flight), flight_report.show(flight), FakeDecoder(), maker)
+    picture, facts, missing = Served(source).asked(
+        "/api/frames/0/full.jpg", "/api/frames/0/full.json", "/api/frames/2/full.jpg"
+    )
+    with Image.open(io.BytesIO(picture.content)) as image:
+        assert image.size == (60, 40)  # the sensor's, not a view's 32 × 24
+    (doubt,) = facts.json()["doubts"]
+    assert doubt.startswith("3.0% of its pixels are clipped")
+    assert len(maker.asked) == 1, "made once for both"
+    assert missing.status_code == 404
+    field = Served(LightFieldFrames("a.npz", 9, light_field())).asked("/api/frames/0/full.jpg")[0]
+    assert "`dappled picture` makes" in field.json()["error"]
 
 
 def test_a_flight_without_a_mask_says_so(flight: Path) -> None:

@@ -21,6 +21,7 @@ if not words_only:
     from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFieldFrames
     from dappled.daemon.pipeline.decode_process import DecodeProcess
     from dappled.drivers.raw.darkroom import Recipe
+    from dappled.drivers.raw.picture_maker import PictureMaker
     from dappled.flight import layout
     from dappled.products import opened
     from dappled.products.mounting import Mounting
@@ -95,11 +96,11 @@ def _source(
     if isinstance(found, opened.OpenedFlight):
         folder = layout.open_folder(found.path)
         recipe = None if found.darkroom is None else found.darkroom.recipe
-        decoder = None
+        decoder = maker = None
         if recipe is not None:
-            decoder = DecodeProcess(recipe)
+            decoder, maker = DecodeProcess(recipe), PictureMaker(recipe)
             stack.callback(decoder.close)
-        source = FlightFrames(folder, found.record, decoder)
+        source = FlightFrames(folder, found.record, decoder, maker)
         if not source.frames():
             raise DappledError(f"{path} holds no tagged frames: `dappled flight show` says what became of its shots")
         return source, recipe, Mounting.of(layout.read_facts(folder)).mount

@@ -27,10 +27,11 @@ from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import metrics
 from dappled.decode.geometry.footprint import RectifiedFrame
 from dappled.errors import DappledError
+from dappled.findings import FRAME, told
 
 _PICTURES = (
-    "thumb.jpg, mean.jpg, slices.jpg, spectrum.jpg, views.jpg, views.json, refocus.jpg, depth.png, "
-    "and map.png, which is north up"
+    "thumb.jpg, mean.jpg, slices.jpg, spectrum.jpg, views.jpg, views.json, refocus.jpg, depth.png, full.jpg, "
+    "full.json and map.png, which is north up"
 )
 _DISPARITY_PX = 8.0
 _FRAME_DIGITS = 10
@@ -206,6 +207,10 @@ class ConsoleApp:
             if known.depth is None:
                 raise FeedError(f"frame {frame} has no depth map, or no longer has one")
             return _file(await self._make(self._studio.depth, known.depth), name)
+        if name in ("full.jpg", "full.json"):
+            full = await self._make(self._feed.full_size, frame, on=self._views)
+            doubts = [str(told(one, FRAME)) for one in full.doubts]
+            return _file(full.jpeg if name == "full.jpg" else json.dumps({"doubts": doubts}).encode(), name)
         message = await self._feed.slices(frame)
         studio = self._studio
         if name == "refocus.jpg":

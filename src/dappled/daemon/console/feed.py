@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import codec
+from dappled.daemon.console.pictures import FullSizePicture
 from dappled.daemon.console.requests import token
 from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
@@ -178,6 +179,10 @@ class Feed:
                         self._take(message)
                     except (KeyError, TypeError, ValueError, DappledError) as error:  # against the schema
                         report(log, f"a {message.topic} message was ignored", error)
+
+    def full_size(self, frame: int) -> FullSizePicture:
+        """A frame's picture at the sensor's own resolution. Raises DappledError: it is not made in flight."""
+        raise FeedError(f"frame {frame} is shown at full size on the ground: dappled open")
 
     async def slices(self, frame: int) -> Message:
         """The slices of a frame: as kept, or asked for again. Raises FeedError."""

@@ -18,6 +18,7 @@ from dappled.daemon.console.__main__ import configuration
 from dappled.daemon.console.access import Access
 from dappled.daemon.console.app import ConsoleApp
 from dappled.daemon.console.feed import Event, Feed, FeedError, Hub
+from dappled.daemon.console.pictures import FullSizePicture
 from dappled.daemon.console.recorded import FrameSource
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.stream.wire import Message
@@ -90,6 +91,10 @@ class RecordedFeed(Feed):
     async def slices(self, frame: int) -> Message:
         """The slices of a frame: as kept, or asked for again."""
         return await self._decoded(frame, soon=True)
+
+    def full_size(self, frame: int) -> FullSizePicture:
+        """A frame's picture at the sensor's own resolution."""
+        return self._source.full_size(frame)
 
     async def _decoded(self, frame: int, *, soon: bool) -> Message:
         if (kept := self._stacks.get(frame)) is not None:

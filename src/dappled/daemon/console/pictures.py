@@ -14,6 +14,7 @@ from scipy import fft
 from dappled.decode import srgb
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
+from dappled.findings import Finding
 
 Grey = NDArray[np.uint8]
 MOSAIC_PX = 2560  # of the mosaic of views; every WebGL2 supports 2048, phones of the last ten years 4096
@@ -35,6 +36,14 @@ class Mosaic:
     row_steps: NDArray[np.float64]
     column_steps: NDArray[np.float64]
     sensor_px_per_disparity: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class FullSizePicture:
+    """A frame's picture at the sensor's own resolution, and what speaks against it."""
+
+    jpeg: bytes
+    doubts: tuple[Finding, ...]
 
 
 def small(image: NDArray[np.floating], longest_side: int) -> NDArray[np.float32]:

@@ -8,13 +8,17 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dappled.daemon.console import pictures
+from dappled.daemon.console.pictures import FullSizePicture
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import SlicesDecoder
 from dappled.daemon.stream.wire import Message
 from dappled.decode.lightfield import LightField
+from dappled.drivers.raw import developing
+from dappled.drivers.raw.picture_maker import PictureMaker
 from dappled.errors import DappledError
-from dappled.findings import FRAME, told
-from dappled.flight import FlightFolder
+from dappled.findings import FRAME, Level, told
+from dappled.flight import FlightFolder, Tag
 from dappled.flight.flight_report import FlightContents
 
 _NO_POSE = (
@@ -22,6 +26,7 @@ _NO_POSE = (
     "velocity_ned_m_s", "attitude", "roll_deg", "pitch_deg", "yaw_deg", "position_sigma_m", "attitude_sigma_deg",
     "age_ms",
 )  # fmt: skip
+_NO_MASK = "this flight was recorded without a mask: name one with --mask"
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +57,23 @@ class FrameSource(Protocol):
     def light_field(self, index: int) -> LightField | None:
         """The frame's light field where it was decoded before; None where views are made of its slices."""
 
+    def full_size(self, index: int) -> FullSizePicture:
+        """A frame's picture at the sensor's own resolution. Takes seconds; for one thread. Raises DappledError."""
+
 
 class FlightFrames:
-    """The frames of a recorded flight, decoded again by `decoder` (None: the flight has no mask)."""
+    """The frames of a recorded flight, decoded again by `decoder` and with full-size pictures by `maker` (None: the
+    flight has no mask)."""
 
-    def __init__(self, folder: FlightFolder, contents: FlightContents, decoder: SlicesDecoder | None) -> None:
-        self._folder, self._contents, self._decoder = folder, contents, decoder
+    def __init__(
+        self,
+        folder: FlightFolder,
+        contents: FlightContents,
+        decoder: SlicesDecoder | None,
+        maker: PictureMaker | None = None,
+    ) -> None:
+        self._folder, self._contents, self._decoder, self._maker = folder, contents, decoder, maker
+        self._last: tuple[int, FullSizePicture] | None = None
         self._lines = {line.frame.index: line for line in contents.lines if line.frame is not None}
 
     @property
@@ -85,14 +101,29 @@ class FlightFrames:
 
     def slices(self, index: int) -> Message:
         """A frame's `slices` message."""
+        path, tag = self._file(index)
+        if self._decoder is None:
+            raise DappledError(_NO_MASK)
+        decoded = self._decoder.decode(path, tag.focal_length_mm, tag.f_number, index=index)
+        return Message("slices", self._named(wire.slices_header(tag, decoded)), decoded.body)
+
+    def full_size(self, index: int) -> FullSizePicture:
+        """A frame's picture at the sensor's own resolution; the last one is kept."""
+        if self._last is None or self._last[0] != index:
+            path, tag = self._file(index)
+            if self._maker is None:
+                raise DappledError(_NO_MASK)
+            made = self._maker.picture(path, focal_length_mm=tag.focal_length_mm, f_number=tag.f_number)
+            jpeg = pictures.jpeg((developing.developed(made) >> 8).astype(np.uint8), 90)
+            doubts = tuple(one for one in made.findings if one.level > Level.NOTE)
+            self._last = index, FullSizePicture(jpeg, doubts)
+        return self._last[1]
+
+    def _file(self, index: int) -> tuple[str, Tag]:
         line = self._lines.get(index)
         if line is None or line.frame is None or line.tag is None:
             raise DappledError(f"there is no frame {index} in this flight")
-        if self._decoder is None:
-            raise DappledError("this flight was recorded without a mask: name one with --mask")
-        path = str(self._folder.file(line.frame.name))
-        decoded = self._decoder.decode(path, line.tag.focal_length_mm, line.tag.f_number, index=index)
-        return Message("slices", self._named(wire.slices_header(line.tag, decoded)), decoded.body)
+        return str(self._folder.file(line.frame.name)), line.tag
 
     def light_field(self, _index: int) -> LightField | None:
         """The frame's light field where it was decoded before; None where views are made of its slices."""
@@ -150,6 +181,10 @@ class LightFieldFrames:
     def light_field(self, _index: int) -> LightField | None:
         """The frame's light field where it was decoded before; None where views are made of its slices."""
         return self._field
+
+    def full_size(self, _index: int) -> FullSizePicture:
+        """A frame's picture at the sensor's own resolution: a light field has none."""
+        raise DappledError("a light field has views alone: `dappled picture` makes the frame's full-size picture")
 
     def _said(self, name: str) -> Any:
         return self._field.attributes.get(name)

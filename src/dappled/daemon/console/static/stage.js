@@ -4,7 +4,7 @@ import { Live } from "./live.js";
 import { ask, place } from "./pictures.js";
 import { Refocus, sharpest } from "./refocus.js";
 
-const TABS = ["refocus", "views", "slices", "spectrum", "live", "depth"];
+const TABS = ["refocus", "views", "slices", "spectrum", "full", "live", "depth"];
 const EARLY_MS = 250;   // views that were made before come sooner, and no other picture flashes before them
 const $ = (id) => document.getElementById(id);
 
@@ -79,12 +79,14 @@ export class Stage {
     const turn = ++this.turn, { frame, tab } = this;
     if (tab === "live") { this.watch(); return; }
     if ($("live").hasAttribute("data-on")) this.leave();
+    $("frame-box").toggleAttribute("data-full", false);
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
     $("which").textContent = `frame ${index} …`;   // loading: the frame before is still shown
     $("empty").textContent = `Waiting for the picture of frame ${index}.`;
     try {
       if (tab === "refocus") await this.loadViews(base, turn);
+      else if (tab === "full") await this.loadFull(base, turn);
       else await this.loadPicture(`${base}${{ views: "views.jpg", slices: "slices.jpg", spectrum: "spectrum.jpg", depth: "depth.png" }[tab]}`, tab, turn);
     } catch (error) {
       if (turn === this.turn) await this.fall(base, turn, error.message);
@@ -159,6 +161,18 @@ export class Stage {
       clearTimeout(early);
       isMade = true;
     }
+  }
+
+  // One pixel of the sensor on one of the page; the middle first, the rest by scrolling.
+  async loadFull(base, turn) {
+    if (!await this.loadPicture(`${base}full.jpg`, "full", turn)) return;
+    const box = $("frame-box"), picture = $("picture");
+    box.toggleAttribute("data-full", true);
+    box.scrollTo((picture.naturalWidth - box.clientWidth) / 2, (picture.naturalHeight - box.clientHeight) / 2);
+    const facts = await ask(`${base}full.json`, { read: (answer) => answer.json(), wanted: () => turn === this.turn, first: true });
+    if (!facts || turn !== this.turn) return;
+    const words = `${picture.naturalWidth} × ${picture.naturalHeight} px without the mask's shadow, one for one: scroll.`;
+    $("caption").textContent = [words, ...facts.doubts.map((one) => `In doubt: ${one}.`)].join(" ");
   }
 
   async showMean(base, turn, wanted) {
