@@ -100,7 +100,7 @@ def test_the_file_holds_the_frame_and_the_shot(flying: MaskedCamera) -> None:
 def test_a_shot_belongs_to_its_seed_its_number_and_its_time(flying: MaskedCamera) -> None:
     shot = flying.expose(4.0, 7)
     assert flying.expose(4.0, 7).file == shot.file
-    assert flying.expose(4.0, 8).latency_s != shot.latency_s
+    assert flying.latency_s(8) != flying.latency_s(7) == shot.latency_s
     assert not np.array_equal(flying.expose(9.0, 7).raw, shot.raw)
     other = reference_camera(4, scale=0.2)
     assert other.installed != flying.installed

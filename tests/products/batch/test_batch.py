@@ -179,6 +179,7 @@ def test_frames_with_the_same_bytes_are_jobs_of_their_own(
     assert len({one.key for one in jobs}) == 2
 
 
+@pytest.mark.slow
 def test_a_frame_without_a_place_still_becomes_a_light_field(flight: Flown, tmp_path: Path) -> None:
     (first, _) = batch.plan(flight.folder, flight.recipe, Options(), ["npz", "cog"], tmp_path)
     lost = replace(first, station=DappledError("no position is known for frames/000000.dng"))

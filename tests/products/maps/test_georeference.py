@@ -76,35 +76,41 @@ def test_maps_of_pictures_in_doubt_say_so(
     assert capsys.readouterr().err.splitlines().count(told) == 1
 
 
+@pytest.mark.parametrize("names", [("000000",), pytest.param(("000000", "000001"), marks=pytest.mark.slow)])
 def test_a_flight_becomes_maps(
-    short_flight: Flown, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    names: tuple[str, ...],
+    short_flight: Flown,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    several = len(names) > 1
     steps: list[tuple[str, int, int]] = []
     monkeypatch.setattr(TerminalOutput, "show", lambda _, *step: steps.append(step))
     before = sorted(path for path in short_flight.folder.rglob("*"))
-    more = ["--each", "--as", "kmz", "cog", "footprints", "--refine", "neighbours", "--gsd", "0.05"]
+    more = ["--each", "--as", "kmz", "cog", "footprints", "--gsd", "0.05"]
+    more += ["--refine", "neighbours"] if several else ["--frames", "0"]
     assert main(words(short_flight, tmp_path, *more)) == 0
     said = capsys.readouterr().out
-    assert "2 frames on EPSG:32615" in said
-    stretches = "develop", "find features", "match neighbours", "draw maps"
+    assert f"{len(names)} frame{'s' if several else ''} on EPSG:32615" in said
+    stretches = "develop", *(("find features", "match neighbours") if several else ()), "draw maps"
     assert tuple(dict.fromkeys(what for what, _, _ in steps)) == stretches  # no stretch of the work is silent
     assert {(what, 0, total) for what, _, total in steps} <= set(steps)
-    assert [done for what, done, _ in steps if what == "develop"] == [0, 1, 2]
+    assert [done for what, done, _ in steps if what == "develop"] == list(range(len(names) + 1))
     assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")) == [
         "footprints.geojson",
-        "frames/000000.kmz",
-        "frames/000000.tif",
-        "frames/000001.kmz",
-        "frames/000001.tif",
+        *(f"frames/{name}.{form}" for name in names for form in ("kmz", "tif")),
         "mosaic.kmz",
         "mosaic.tif",
         "report.json",
     ]
-    for kmz in ("mosaic.kmz", "frames/000000.kmz", "frames/000001.kmz"):
+    for kmz in ("mosaic.kmz", *(f"frames/{name}.kmz" for name in names)):
         globe.check_archive(tmp_path / kmz)
     report = json.loads((tmp_path / "report.json").read_text())
-    assert [frame["refined"] for frame in report["frames"]] == [True, True]
-    assert all(frame["shift_m"] < 0.1 for frame in report["frames"])
+    assert [frame["name"] for frame in report["frames"]] == list(names)
+    if several:
+        assert [frame["refined"] for frame in report["frames"]] == [True, True]
+        assert all(frame["shift_m"] < 0.1 for frame in report["frames"])
     with rasterio.open(tmp_path / "mosaic.tif") as read:
         truth = short_flight.truths[0].pose
         assert truth is not None
