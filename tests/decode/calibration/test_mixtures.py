@@ -1,0 +1,51 @@
+"""Random cameras and scenes, decoded as in flight: no mask goes without a doubt, and few right frames are doubted."""
+
+from __future__ import annotations
+
+import os
+from functools import cache
+
+import pytest
+from scipy import stats
+
+from dappled.decode.calibration.fit import CalibrationFrame, calibrate
+from dappled.decode.decoder import MaskDecoder
+from dappled.decode.errors import DecodeError
+from dappled.decode.optics import Mask, MaskedOptics, Sensor
+from tests.decode.calibration.mixtures import DISTANCE_MM, FOCAL_MM, FREQUENCY_PER_MM, SHAPE, Mixture
+
+_SHARE = 0.02  # of the right frames that may be doubted
+_LONG = int(os.environ.get("DAPPLED_MIXTURES", "60"))  # 500 take a quarter of an hour of one core
+
+
+@cache
+def _decoder() -> MaskDecoder:
+    optics = MaskedOptics(Sensor(SHAPE, (0.01, 0.0), (0.0, 0.01)), Mask(FREQUENCY_PER_MM, 2), "geometric", DISTANCE_MM)
+    white = Mixture(99, f_number=62.0, boards=(0.0,), rms=0.0, snr=300.0).plane()
+    return MaskDecoder(optics, calibrate([CalibrationFrame(white, FOCAL_MM, 62.0)], optics))
+
+
+def _doubted(one: Mixture) -> bool:
+    """A refused frame is doubted, too."""
+    try:
+        _, report = _decoder().decode_reported(
+            one.plane(), focal_length_mm=FOCAL_MM, f_number=one.f_number, views=False
+        )
+    except DecodeError:
+        return True
+    return bool(report.doubts)
+
+
+@pytest.mark.parametrize(
+    "count", [pytest.param(5, marks=pytest.mark.slow), pytest.param(_LONG, marks=pytest.mark.long)]
+)
+def test_no_mask_is_always_in_doubt_and_right_frames_hardly_ever(count: int) -> None:
+    mixtures = [Mixture.drawn(seed) for seed in range(count)]
+    doubted = {one.seed: _doubted(one) for one in mixtures}
+    without = [one.seed for one in mixtures if not one.present]
+    right = [one.seed for one in mixtures if one.present]
+    unsaid = [seed for seed in without if not doubted[seed]]
+    wrongly = [seed for seed in right if doubted[seed]]
+    assert unsaid == [], f"without a doubt, of {len(without)} without a mask"
+    most = int(stats.binom.ppf(0.99, len(right), _SHARE))
+    assert len(wrongly) <= most, f"seeds {wrongly} are doubted, of {len(right)} with their mask"
