@@ -156,6 +156,21 @@ def test_a_failure_is_one_sentence_and_has_its_exit_code(
     assert all(line.startswith(f"usage: dappled {words[0]}") for line in usage)
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["georeference", "f", "--ground", "high"], "--ground: 'high' is not a number in m"),
+        (["georeference", "f", "--gsd", "0"], "--gsd: '0' is not a number above 0 m"),
+        (["replay", "f", "--interval", "-1"], "--interval: '-1' is not a number from 0 to 86400 s"),
+    ],
+)
+def test_a_refused_number_tells_its_unit(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
 def test_an_unforeseen_error_has_no_traceback_without_debug(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -280,6 +280,8 @@ def _number(text: str, kind: type, form: Argument) -> float | int:
         limit = f" above {form.above:g}{unit}"
     elif math.isfinite(rule.low) and math.isfinite(rule.high):
         limit = f" from {rule.low:g} to {rule.high:g}{unit}"
+    elif math.isfinite(rule.low):
+        limit = f" from {rule.low:g}{unit}"
     else:
-        limit = f" from {rule.low:g}{unit}" if math.isfinite(rule.low) else ""
+        limit = f" in{unit}" if unit else ""
     raise ValueError(f"{text!r} is not {what}{limit}{', or inf' if form.infinite else ''}")

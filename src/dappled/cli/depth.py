@@ -61,7 +61,7 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         "--between", "range of disparities to search, px/view", None, metavar=("LOW", "HIGH"), otherwise="the scene's",
     )  # fmt: skip
     window: int | None = option(
-        "--window", "side of the window around a pixel, odd", None, metavar="PX", low=1,
+        "--window", "side of the window around a pixel, odd", None, unit="px", low=1,
         otherwise="the method's own, 3 to 13",
     )  # fmt: skip
     most_sigma: float = option(

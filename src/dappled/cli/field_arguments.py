@@ -32,7 +32,7 @@ class RangingArguments:
     """What gives distances in metres."""
 
     focus: float | None = option(
-        "--focus", "distance at which the lens was focused, in metres, or inf", None, metavar="M", above=0.0,
+        "--focus", "distance at which the lens was focused, or inf", None, unit="m", above=0.0,
         infinite=True,
     )  # fmt: skip
     calibration: Path | None = option(

@@ -42,7 +42,7 @@ class RecipeArguments:
     black: float | None = option("--black", "black level, if the file doesn't say", None)
     white_level: float | None = option("--white-level", "level of a full pixel (a 12-bit PNG: 4095)", None, above=0.0)
     focal_length: float | None = option(
-        "--focal-length", "focal length, if the file doesn't say", None, metavar="MM", above=0.0,
+        "--focal-length", "focal length, if the file doesn't say", None, unit="mm", above=0.0,
     )  # fmt: skip
     f_number: float | None = option("--f-number", "f-number of the exposure, if the file doesn't say", None, above=0.0)
 

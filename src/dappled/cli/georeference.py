@@ -65,7 +65,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         otherwise="from 3 m below to 12 m above the ground given",
     )  # fmt: skip
     cell: float | None = option(
-        "--cell", "for frame-terrain: side of a cell", None, metavar="M", above=0.0,
+        "--cell", "for frame-terrain: side of a cell", None, unit="m", above=0.0,
         otherwise="half a depth map's window",
     )  # fmt: skip
 

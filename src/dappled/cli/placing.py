@@ -87,7 +87,7 @@ class Placing(Mounted):
     """How frames are decoded and placed."""
 
     ground: float | None = option(
-        "--ground", "height of flat ground, metres above sea level", None, metavar="M", group="ground",
+        "--ground", "height of flat ground above sea level", None, unit="m", group="ground",
         otherwise="home's",
     )  # fmt: skip
     terrain: Path | None = option("--terrain", "terrain raster: DTED, GeoTIFF …", None, group="ground", there=True)
@@ -105,7 +105,7 @@ class Placing(Mounted):
         "--calibration", "mask calibration", None, metavar="FILE", group="camera", there=True, otherwise="the flight's",
     )  # fmt: skip
     focal_length: float | None = option(
-        "--focal-length", "focal length, if the frames don't say", None, metavar="MM", above=0.0, group="camera",
+        "--focal-length", "focal length, if the frames don't say", None, unit="mm", above=0.0, group="camera",
     )  # fmt: skip
     f_number: float | None = option("--f-number", "f-number, if the frames don't say", None, above=0.0, group="camera")
     view: str = option(
@@ -115,14 +115,14 @@ class Placing(Mounted):
     )  # fmt: skip
     grey: bool = flag("--grey", "make grey maps (default: in colour if the frames have colour)", group="camera")
     focus: float = option(
-        "--focus", "distance at which the lens was focused", math.inf, metavar="M", above=0.0, infinite=True,
+        "--focus", "distance at which the lens was focused", math.inf, unit="m", above=0.0, infinite=True,
         group="camera", otherwise="infinity",
     )  # fmt: skip
     crs: str | None = option(
         "--crs", "projection in metres", None, metavar="EPSG:N", group="map", otherwise="the UTM zone",
     )  # fmt: skip
     gsd: float | None = option(
-        "--gsd", "side of a map cell", None, metavar="M", above=0.0, group="map",
+        "--gsd", "side of a map cell", None, unit="m", above=0.0, group="map",
         otherwise="the ground sample distance of the frames",
     )  # fmt: skip
     frames: frozenset[int] | None = option(
@@ -273,13 +273,13 @@ class FieldOrFlight(RangingArguments, Doubtable):
     flight: Path | None = option("--flight", "a flight", None, metavar="FLIGHT", there=paths.flight)
     terrain: Path | None = option("--terrain", "given terrain: DTED, GeoTIFF …", None, group=_OF_FLIGHT, there=True)
     ground: float | None = option(
-        "--ground", "height of flat ground, metres above sea level", None, metavar="M", group=_OF_FLIGHT,
+        "--ground", "height of flat ground above sea level", None, unit="m", group=_OF_FLIGHT,
         otherwise="home's",
     )  # fmt: skip
     camera: str | None = option("--camera", "camera profile", None, group=_OF_FLIGHT, otherwise="the flight's")
     mask: str | None = option("--mask", "mask profile", None, group=_OF_FLIGHT, otherwise="the flight's")
     refine: bool = flag("--refine", "fit the frames' poses to each other first", group=_OF_FLIGHT)
-    cell: float | None = option("--cell", "side of a cell of the map", None, metavar="M", above=0.0, group=_OF_FLIGHT)
+    cell: float | None = option("--cell", "side of a cell of the map", None, unit="m", above=0.0, group=_OF_FLIGHT)
     crs: str = option("--crs", "projection in metres", "", metavar="EPSG:N", group=_OF_FLIGHT, otherwise="the UTM zone")
 
     def check_source(self, *more: str) -> None:

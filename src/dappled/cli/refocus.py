@@ -74,7 +74,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         "--disparity", "disparities in px from view to view", (), metavar="D", group=_FOCUS, alone="focus",
     )  # fmt: skip
     distance: tuple[float, ...] = option(
-        "--distance", "distances in metres; needs --focus or a calibration with targets", (), metavar="M", above=0.0,
+        "--distance", "distances (with --focus or a calibration with targets)", (), unit="m", above=0.0,
         infinite=True, group=_FOCUS, alone="focus",
     )  # fmt: skip
     stack: tuple[float, float, float] | None = option(
@@ -103,7 +103,7 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         "GeoTIFF", None, metavar="FLIGHT", there=paths.flight,
     )  # fmt: skip
     height: tuple[float, ...] = option(
-        "--height", "of a flight: heights to focus on, metres above the ground", (), metavar="M", otherwise="0",
+        "--height", "of a flight: heights to focus on, metres above the ground", (), unit="m", otherwise="0",
     )  # fmt: skip
     combine: str | None = option(
         "--combine", "of a flight: mean, or median, which drops what hides the ground in fewer than half of the frames",

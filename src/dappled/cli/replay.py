@@ -106,7 +106,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         otherwise="the telemetry's first position",
     )  # fmt: skip
     interval: float | None = option(
-        "--interval", "time between the frames of a folder", None, metavar="S", low=0, high=86400, otherwise="1",
+        "--interval", "time between the frames of a folder", None, unit="s", low=0, high=86400, otherwise="1",
     )  # fmt: skip
     json: bool = flag("--json", "print one JSON object per frame, and one with what was found, if anything was")
 

@@ -452,8 +452,8 @@ def test_a_wrong_call_is_a_sentence(
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--focus", "0", "--view", "ground"], "'0' is not a number above 0, or inf"),
-        (["--focus", "nan"], "'nan' is not a number above 0, or inf"),
+        (["--focus", "0", "--view", "ground"], "'0' is not a number above 0 m, or inf"),
+        (["--focus", "nan"], "'nan' is not a number above 0 m, or inf"),
         (["--frames", "zero"], "write numbers as 0,3-5"),
     ],
 )

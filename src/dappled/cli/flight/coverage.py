@@ -43,9 +43,9 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         "-o --output", "write coverage.tif, .geojson and .png into this folder", None, metavar="DIR",
     )  # fmt: skip
     cell: float | None = option(
-        "--cell", "side of a map cell", None, metavar="M", above=0.0, otherwise="1/500 of the map",
+        "--cell", "side of a map cell", None, unit="m", above=0.0, otherwise="1/500 of the map",
     )  # fmt: skip
-    ground: float | None = option("--ground", "height of flat ground", None, metavar="M", otherwise="home's")
+    ground: float | None = option("--ground", "height of flat ground", None, unit="m", otherwise="home's")
     terrain: Path | None = option("--terrain", "terrain raster: DTED, GeoTIFF …", None, there=True)
     count_bad: bool = flag("--count-bad", "also count frames that were judged bad in flight")
     count_doubtful: bool = flag("--count-doubtful", "also count frames whose place or time is in doubt")

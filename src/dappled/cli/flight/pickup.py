@@ -38,7 +38,7 @@ class PickUpFiles(Doubtable, FlightArgument, Verb):
     )
 
     source: str = option("--from", "folder, storage, usb: or a libgphoto2 port", metavar="SOURCE")
-    offset: float | None = option("--offset", "the camera's clock minus UTC, if you know it", None, metavar="S")
+    offset: float | None = option("--offset", "the camera's clock minus UTC, if you know it", None, unit="s")
     any_clock: bool = flag("--any-clock", "the camera's clock may be off by more than a day")
     by_order: bool = flag("--by-order", "pair files and shots in order, if there are as many of both")
     pair: tuple[tuple[int, str], ...] = option(

@@ -38,7 +38,7 @@ class InstallationArguments(SensorArguments):
 
     law: str = option("--law", "carrier law", "", choices=LAW_NAMES, otherwise="the camera's")
     mask_distance: float | None = option(
-        "--mask-distance", "distance from mask to sensor", None, metavar="MM", otherwise="the camera's",
+        "--mask-distance", "distance from mask to sensor", None, unit="mm", otherwise="the camera's",
     )  # fmt: skip
 
     def installed(self, mask: str) -> tuple[CameraProfile, MaskedOptics]:
@@ -54,7 +54,7 @@ class AltitudeArguments(SensorArguments):
 
     altitude: float = option("--altitude", "height above ground", unit="m", low=1e-3, high=1e6)
     focal_length: float | None = option(
-        "--focal-length", "focal length of the lens", None, metavar="MM", otherwise="the camera's, if it has only one",
+        "--focal-length", "focal length of the lens", None, unit="mm", otherwise="the camera's, if it has only one",
     )  # fmt: skip
 
     def camera_set(self) -> tuple[CameraProfile, Sensor, float]:

@@ -36,11 +36,11 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
     views: int = option("--views", "views per axis, odd", 5, low=1)
     film: str = option("--film", "film to print it on", "4k", choices=FILM_NAMES)
     mask_distance: float | None = option(
-        "--mask-distance", "distance from mask to sensor", None, metavar="MM",
+        "--mask-distance", "distance from mask to sensor", None, unit="mm",
         otherwise="free; with --mask the camera's",
     )  # fmt: skip
     room: float | None = option(
-        "--room", "largest distance of the mask from the sensor", None, metavar="MM", otherwise="10",
+        "--room", "largest distance of the mask from the sensor", None, unit="mm", otherwise="10",
     )  # fmt: skip
     wavelength: float = option("--wavelength", "wavelength of the light", 550.0, unit="nm")
     shift_error: float = option("--shift-error", "σ of a measured shift between views", 0.02, unit="px")

@@ -42,7 +42,7 @@ class WriteTestKit(Overwriting, Verb):
     camera: str = option("--camera", "camera profile or TOML file")
     film: str = option("--film", "film of the mask", "8k", choices=FILM_NAMES)
     frequency: float = option(
-        "--frequency", "fundamental frequency of both masks", 11.38, metavar="1/MM", above=0.0,
+        "--frequency", "fundamental frequency of both masks", 11.38, unit="1/mm", above=0.0,
         otherwise="Mask 2's 11.38",
     )  # fmt: skip
     negative: bool = flag("--negative", "write negatives (Eq 13), for negative film")

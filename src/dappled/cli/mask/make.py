@@ -37,10 +37,10 @@ class MakeMask(Overwriting, Verb):
         otherwise="the whole film",
     )  # fmt: skip
     period: float | None = option(
-        "--period", "longest period, in pixels of the film", None, metavar="PX", low=1e-2, high=1e6,
+        "--period", "longest period, of the film", None, unit="px", low=1e-2, high=1e6,
     )  # fmt: skip
     frequency: float | None = option(
-        "--frequency", "fundamental frequency, instead of --period", None, metavar="1/MM", low=1e-3, high=1e5,
+        "--frequency", "fundamental frequency, instead of --period", None, unit="1/mm", low=1e-3, high=1e5,
     )  # fmt: skip
     p: int | None = option("--p", "number of harmonics", None, low=1, high=20, otherwise="the profile's, else 2")
     pattern: Literal["full", "diagonal"] | None = option(

@@ -27,7 +27,7 @@ class TabulateCarriers(InstallationArguments, Verb):
 
     mask: str = option("--mask", "mask profile or TOML file")
     focal_length: tuple[float, ...] = option(
-        "--focal-length", "focal lengths of the lens", (), metavar="MM", otherwise="those of Table 11",
+        "--focal-length", "focal lengths of the lens", (), unit="mm", otherwise="those of Table 11",
     )  # fmt: skip
     rotation: float = option("--rotation", "rotation of the mask", 0.0, metavar="DEGREES")
     carriers: bool = flag("--carriers", "list every carrier with its row and column, including crossed ones")

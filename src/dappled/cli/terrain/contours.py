@@ -27,9 +27,9 @@ class DrawContours(Overwriting, Verb):
     raster: Path = argument("HEIGHTS", "flight with maps/terrain.tif, or a raster of heights", there=True)
     output: Path = option("-o --output", "file to write (.geojson)", metavar="OUT")
     interval: float | None = option(
-        "--interval", "between lines", None, metavar="M", above=0.0, otherwise="about 20 lines, 2 σ apart or more",
+        "--interval", "between lines", None, unit="m", above=0.0, otherwise="about 20 lines, 2 σ apart or more",
     )  # fmt: skip
-    smooth: float = option("--smooth", "smooth the heights by a Gaussian of this σ first", 0.0, metavar="M", low=0.0)
+    smooth: float = option("--smooth", "smooth the heights by a Gaussian of this σ first", 0.0, unit="m", low=0.0)
 
     def check(self) -> None:
         """Refuse a call that is wrong by itself."""

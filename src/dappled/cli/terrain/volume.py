@@ -36,9 +36,9 @@ class MeasureVolume(Verb):
         "--stable", "ground that has not changed: the median of its changes is taken off all", None, metavar="AREA",
         there=True,
     )  # fmt: skip
-    sigma: float | None = option("--sigma", "σ of a height, where a raster has none", None, metavar="M", above=0.0)
+    sigma: float | None = option("--sigma", "σ of a height, where a raster has none", None, unit="m", above=0.0)
     correlated: float | None = option(
-        "--correlated", "heights within this distance err alike", None, metavar="M", low=0.0,
+        "--correlated", "heights within this distance err alike", None, unit="m", low=0.0,
         otherwise="what the raster says, or a cell",
     )  # fmt: skip
 
