@@ -123,7 +123,7 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
                 lambda found: found.depth(self.method, between=self.between, window=self.window),
                 placing.focus,
             )
-            made = placing.placed(self.flight, output, stack, watch=seen)
+            made = placing.placed(self.flight, output, stack, watch=seen.measure)
             for _, why in seen.left:
                 output.remark(why)
             found = frame_terrain.of(made, seen.found, output.show, cell_m=self.cell)

@@ -115,7 +115,8 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                 depths = FrameDepths(scratch, lambda found: found.depth(), self.focus)
             told: list[str] = []  # what is missing that poses alone told, before the first frame was decoded
             foresee = partial(self._foresee, told, output)
-            made = self.survey(flight, output, stack, missing, watch=depths, foresee=foresee)
+            watch = None if depths is None else depths.measure
+            made = self.survey(flight, output, stack, missing, watch=watch, foresee=foresee)
             missing += told
             files = self._draw(made, folder, output)
             if made.lens is not None and self.solve_lens is not None:

@@ -125,8 +125,6 @@ class FlightControl:
         self.lost_triggers += triggers.number("triggers")
         self._writer.later(LOST, triggers)
 
-    # DistanceReceiver
-
     def send_distance(self, nearest_m: tuple[float, float]) -> None:
         """Send the nearest distance and its standard error to the autopilot."""
         boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32

@@ -280,7 +280,7 @@ class Service:
                 method=settings.decode.depth,
                 interval_s=settings.decode.depth_interval_s,
                 clock=clock,
-                nearest=control if settings.decode.depth_to_autopilot else None,
+                nearest=control.send_distance if settings.decode.depth_to_autopilot else None,
             )
         events = ShotEvents(
             recording,
@@ -301,7 +301,7 @@ class Service:
             preview_interval_s=settings.publish.preview_interval_s,
         )
         pipeline = Pipeline(decoding, navigation, BodyLatency.of(settings.camera), names)
-        answers = Answers(writer, decoder, shots, clock=clock)
+        answers = Answers(writer, decoder, shots.wait_decoded, clock=clock)
         driver = tuple(part for part in (camera, gnss) if isinstance(part, HasThreads))
         return FlightParts(
             recording,

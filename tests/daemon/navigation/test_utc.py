@@ -79,7 +79,7 @@ def test_the_kernel_can_be_asked() -> None:
 
 def test_the_first_word_is_noted_and_then_only_much_better_ones() -> None:
     notes = Notes()
-    learner = UtcLearner(notes, known=False)
+    learner = UtcLearner(notes.learn_utc, known=False)
     assert learner.utc_ns(5) is None
     learner.look(None)
     assert not learner.known
@@ -92,7 +92,7 @@ def test_the_first_word_is_noted_and_then_only_much_better_ones() -> None:
 
 def test_what_could_not_be_noted_is_tried_again() -> None:
     notes = Notes(refusals=1)
-    learner = UtcLearner(notes, known=False)
+    learner = UtcLearner(notes.learn_utc, known=False)
     with pytest.raises(DappledError):
         learner.look(UtcCorrection(1, 1, "test"))
     assert learner.utc_ns(5) is None
@@ -103,7 +103,7 @@ def test_what_could_not_be_noted_is_tried_again() -> None:
 
 def test_a_machine_that_knows_learns_nothing() -> None:
     notes = Notes()
-    learner = UtcLearner(notes, known=True)
+    learner = UtcLearner(notes.learn_utc, known=True)
     learner.look(UtcCorrection(1, 1, "test"))
     assert learner.utc_ns(5) == 5
     assert notes.noted == []
@@ -124,7 +124,7 @@ S = 10**9
 )
 def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns: int, said: str | None) -> None:
     notes = Notes()
-    learner = UtcLearner(notes, known=True)
+    learner = UtcLearner(notes.learn_utc, known=True)
     assert learner.doubt() is None
     learner.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     learner.look(None)  # the autopilot was silent for a moment
@@ -132,7 +132,7 @@ def test_a_clock_that_is_believed_and_wrong_is_told(correction_ns: int, sigma_ns
     assert (told is None) if said is None else (told is not None and said in str(findings.told(told)))
     assert learner.utc_ns(5) == 5
     assert notes.noted == []
-    unsure = UtcLearner(notes, known=False)
+    unsure = UtcLearner(notes.learn_utc, known=False)
     unsure.look(UtcCorrection(correction_ns, sigma_ns, "test"))
     assert unsure.doubt() is None
 
@@ -171,7 +171,7 @@ TRUTH_NS = 1_790_000_000 * S
 def test_an_early_utc_is_given_up_when_later_messages_disagree() -> None:
     """A real-time clock is 37 s slow for 8 s, then the satellites' time is known."""
     notes = Notes()
-    learner = UtcLearner(notes, known=False)
+    learner = UtcLearner(notes.learn_utc, known=False)
     for upto_s in (5.0, 7.5, 12.0, 14.0):
         learner.look(heard(lambda t_s: -37.0 if t_s < 8 else 0.0, upto_s=upto_s).utc_correction())
     assert [one.correction_ns / S for one in notes.noted] == pytest.approx(
@@ -186,7 +186,7 @@ def test_one_wrong_message_moves_no_utc() -> None:
 
 
 def test_a_time_without_a_fix_does_not_replace_the_satellites() -> None:
-    learner = UtcLearner(notes := Notes(), known=False)
+    learner = UtcLearner((notes := Notes()).learn_utc, known=False)
     learner.look(UtcCorrection(0, 100, "test", by_fix=True))
     learner.look(UtcCorrection(37 * S, 100, "test"))
     learner.look(UtcCorrection(-37 * S, 100, "test", by_fix=True))

@@ -83,7 +83,7 @@ class Bench:
             method="contrast",
             interval_s=interval_s,
             clock=self.clock,
-            nearest=self,
+            nearest=self.send_distance,
         )
 
     def send_distance(self, nearest_m: tuple[float, float]) -> None:

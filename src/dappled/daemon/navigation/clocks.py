@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Literal, Self
@@ -24,7 +24,7 @@ from typing import Literal, Self
 import numpy as np
 
 from dappled.config.settings import CameraSettings
-from dappled.daemon.navigation.samples import CAPTURED, MARK, Feedback, UtcCorrection, UtcNotes
+from dappled.daemon.navigation.samples import CAPTURED, MARK, Feedback, UtcCorrection
 from dappled.decode.array_types import Floats
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Shot, TimeSource
@@ -475,11 +475,12 @@ class UtcLearner:
     """Records the autopilot's UTC once it is known, and again when it is twice as precise, or contradicts what was
     recorded: an early value of a real-time clock is given up, but not one by satellites for one without.
 
-    Where the machine's own clock is believed nothing is recorded; `doubt` reports a difference.
+    Where the machine's own clock is believed nothing is recorded; `doubt` reports a difference. `record` takes the
+    correction and its sigma, ns, and the source.
     """
 
-    def __init__(self, notes: UtcNotes, *, known: bool) -> None:
-        self._known, self._notes = known, notes
+    def __init__(self, record: Callable[[int, int, str], None], *, known: bool) -> None:
+        self._known, self._record = known, record
         self.learnt: UtcCorrection | None = None
         self._last: UtcCorrection | None = None
 
@@ -495,7 +496,7 @@ class UtcLearner:
             return
         if self.learnt is None or found.replaces(self.learnt):
             log.info("UTC is %+.3f s from this machine's, by %s", found.correction_ns / 1e9, found.source)
-            self._notes.learn_utc(found.correction_ns, found.sigma_ns, found.source)
+            self._record(found.correction_ns, found.sigma_ns, found.source)
             self.learnt = found
 
     def doubt(self) -> Finding | None:

@@ -320,7 +320,7 @@ class Navigation:
             attitude_sigma_rad=math.radians(now.pose.attitude_sigma_deg),
             doubt=self._doubt_before(),
         )
-        self.utc = UtcLearner(recording, known=utc_known)
+        self.utc = UtcLearner(recording.learn_utc, known=utc_known)
         self._vehicles, self._vehicles_noted = list[tuple[int, int]](), 0
         self._doubt_noted: PositionDoubt | None = None
 

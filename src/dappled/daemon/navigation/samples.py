@@ -528,9 +528,3 @@ class UtcCorrection:
         if abs(self.correction_ns - older.correction_ns) > 3 * math.hypot(self.sigma_ns, older.sigma_ns) + _UTC_STEP_NS:
             return self.by_fix or not older.by_fix
         return self.sigma_ns * 2 <= older.sigma_ns
-
-
-class UtcNotes(Protocol):
-    """Where a correction is recorded; see `flight.recording.Recording`."""
-
-    def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None: ...

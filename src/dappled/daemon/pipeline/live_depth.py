@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from dappled import codec
@@ -24,18 +25,11 @@ class DepthMaker(Protocol):
         """End, also in the middle of a frame."""
 
 
-class DistanceReceiver(Protocol):
-    """What takes the nearest distance: `FlightControl`."""
-
-    def send_distance(self, nearest_m: tuple[float, float]) -> None:
-        """Take a distance and its standard error in m."""
-
-
 class LiveDepth:
     """Takes at most one finished frame in `interval_s`, the newest, and publishes its depth as topic `depth`.
 
     Owns `maker`: a decode process of its own, as depth takes longer than a frame may wait. `nearest` gets the
-    nearest distance, where it is known.
+    nearest distance and its standard error in m, where they are known.
     """
 
     def __init__(
@@ -48,7 +42,7 @@ class LiveDepth:
         method: str,
         interval_s: float,
         clock: Clock,
-        nearest: DistanceReceiver | None = None,
+        nearest: Callable[[tuple[float, float]], None] | None = None,
     ) -> None:
         self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
         self._method, self._interval_s, self._clock, self._nearest = method, interval_s, clock, nearest
@@ -92,4 +86,4 @@ class LiveDepth:
         }
         self._publisher.publish("depth", header, found.body)
         if found.nearest_m is not None and self._nearest is not None:
-            self._nearest.send_distance(found.nearest_m)
+            self._nearest(found.nearest_m)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from dappled.clock import Clock
@@ -45,13 +45,6 @@ class SlicesDecoder(Protocol):
         """Decode the raw file of frame `index` at `path`. Raises DappledError."""
 
 
-class FlightDecoding(Protocol):
-    """The decoding of a flight, which goes before answers."""
-
-    def wait_decoded(self) -> bool:
-        """Wait, up to a limit, while the flight itself has frames to decode. Whether none is left."""
-
-
 class Answers:
     """Answers questions one by one, behind a bounded queue; a question that finds it full is refused."""
 
@@ -59,12 +52,12 @@ class Answers:
         self,
         record: FrameRecord,
         decoder: SlicesDecoder | None,
-        flight: FlightDecoding | None = None,
+        wait_decoded: Callable[[], object] = lambda: None,
         *,
         clock: Clock | None = None,
     ) -> None:
-        """`flight`, where given, decodes its own frames before a frame is decoded for an answer."""
-        self._record, self._decoder, self._flight = record, decoder, flight
+        """`wait_decoded` waits, up to a limit, while the flight itself has frames to decode: they go before answers."""
+        self._record, self._decoder, self._wait_decoded = record, decoder, wait_decoded
         self._worker: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
             "answers", self._work, capacity=WAITING, on_failure=self._failed, clock=clock
         )
@@ -100,8 +93,7 @@ class Answers:
             return Message("frame", frame_header(tag, frame, None))
         if self._decoder is None:
             raise WireError("this flight is not decoded: no mask is configured")
-        if self._flight is not None:
-            self._flight.wait_decoded()
+        self._wait_decoded()
         decoded = self._decoder.decode(self._record.path(frame), tag.focal_length_mm, tag.f_number, index=index)
         return Message("slices", slices_header(tag, decoded), decoded.body)
 

@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -37,12 +37,7 @@ _SWEPT_PX = 60_000  # of a picture: heights come from windows of many pixels
 _CHOSEN = 1.5  # of the pictures' own ground sample: a map that is coarser was chosen to be
 
 Progress = Callable[[str, int, int], None]  # what, done, of
-
-
-class Watch(Protocol):
-    """Gets each decoded frame while its light field is in memory."""
-
-    def measure(self, one: Photograph, decoded: LightField) -> None: ...
+Watch = Callable[[Photograph, LightField], None]  # gets each decoded frame while its light field is in memory
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,7 +189,7 @@ class _Developing:
             )  # fmt: skip
             one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
             if self.watch is not None:
-                self.watch.measure(one, frame.decoded.light_field)
+                self.watch(one, frame.decoded.light_field)
         except DappledError as error:
             return DappledError(str(error))  # it may come from another process
         return _shelved(one, self.scratch)
