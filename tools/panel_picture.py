@@ -9,6 +9,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib as mpl
@@ -59,17 +60,17 @@ def board(px: tuple[int, int, int, int], colour: tuple[float, float, float], con
 
 def shoot(path: Path, boards: list[SharpBoard], exposure_s: float) -> None:
     """Write a frame of boards whose colours are reflectances."""
-    ground = SharpBoard(colour=GROUND, contrast=0.1)
-    mean = np.array(GROUND)
-    for one in boards:
-        assert one.extent is not None
-        top, bottom, left, right = one.extent
-        mean = mean + (np.array(one.colour) - GROUND) * (bottom - top) * (right - left)
+    wanted = OF_WHITE * exposure_s / EXPOSURE_S
     camera = RayCamera(
         profiles.mask("reference-5x5").mask, shape=SHAPE, seed=4, f_number=F_NUMBER, print_scale=1.003, turn_rad=0.012,
-        colour_filters=REAL_COLOURS, boards=(ground, *boards),
-        level=float(OF_WHITE * exposure_s / EXPOSURE_S * (np.array(REAL_COLOURS) @ mean).mean()),
+        colour_filters=REAL_COLOURS, boards=(SharpBoard(colour=GROUND, contrast=0.1), *boards), level=wanted / 4,
     )  # fmt: skip
+    views = camera.expose().truth.views  # without the mask: `level` is of the mean behind it, which varies by 1 %
+    top, bottom, left, right = boards[-1].extent or (-0.5, 0.5, -0.5, 0.5)
+    row, column = round((1 + top + bottom) / 2 * SHAPE[0]), round((1 + left + right) / 2 * SHAPE[1])
+    there = views[:, :, row - 20 : row + 20, column - 20 : column + 20, 1]
+    given = np.nanmean(there) / float(np.array(REAL_COLOURS[1]) @ boards[-1].colour)
+    camera = replace(camera, level=camera.level * wanted / float(given))
     exif = dng.Exif(MAKE, MODEL, "SIM00000004", camera.focal_length_mm, F_NUMBER, exposure_s, 100, 0)
     path.write_bytes(dng.encode(camera.expose().raw(), black=1024, white=15360, exif=exif))
 
