@@ -38,6 +38,7 @@ BASELINE = FOLDER / "baseline.json"
 PAGE = FOLDER.parent / "docs" / "performance.md"
 ARGUMENTS = {  # shorter than by default
     "batch": ["--frames", "8", "--repeats", "2"],
+    "growth": ["--pictures", "5", "25", "100"],
     "publish": ["--rounds", "10"],
     "sustained": ["--seconds", "60"],
 }
