@@ -75,6 +75,7 @@ ELSEWHERE = {
     "--scheduler tcp:": "tests/products/batch/test_batch.py",  # a Dask cluster
     "trigger --distance": "tests/system/test_distance_trigger.py",  # settings that have a series
     "flight gnss": "tests/system/test_gnss_receiver.py",  # a receiver on a serial port
+    "--panel": "tests/cli/test_panel.py",  # a frame with a panel of known reflectance
 }
 """Commands that need more than this stage has, and the tests that give it to them."""
 
