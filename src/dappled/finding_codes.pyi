@@ -289,6 +289,7 @@ class Code(StrEnum):
     PICTURE_PANEL_DIFFERS = "picture.panel_differs"
     PICTURE_PANEL_UNEVEN = "picture.panel_uneven"
     PICTURE_RIVAL_SHOTS = "picture.rival_shots"
+    PICTURE_SHADOW_DIFFERS = "picture.shadow_differs"
     PICTURE_SHADOW_UNCERTAIN = "picture.shadow_uncertain"
     PICTURE_SHADOW_UNSEEN = "picture.shadow_unseen"
     PICTURE_SOFT = "picture.soft"

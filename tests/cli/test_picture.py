@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from contextlib import redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -116,6 +117,25 @@ def test_a_jpeg_is_taken_with_a_doubt(frame: Path, tmp_path: Path, capsys: pytes
     with rawpy.imread(str(tmp_path / "a.dng")) as after:
         assert after.raw_image_visible.shape[:2] == (694, 922)
     assert _call(shot, tmp_path / "b.tif", *words, "--anyway") == 0
+
+
+@pytest.mark.slow
+def test_frames_of_one_lens_and_stop_have_one_shadow_and_another_s_is_told(frame: Path, tmp_path: Path) -> None:
+    camera, frames = reference_camera(6, scale=0.25, scene="terrain"), []
+    for number, f_number in enumerate((22.0, 22.0, 22.0, 14.0)):  # a stop that hung once
+        frames.append(frame.with_name(f"{number}.dng"))
+        frames[-1].write_bytes(camera.expose(20.0 * number, number, f_number=f_number).file)
+    words = ["--camera", str(frame.with_name("quarter.toml")), "--mask", "reference-5x5", "--f-number", "22", "--json"]
+    out = io.StringIO()
+    with redirect_stdout(out):
+        assert main(["picture", *map(str, frames), "-o", str(tmp_path / "made"), *words]) == 0
+    *sound, strange = map(json.loads, out.getvalue().splitlines()[:4])
+    assert [(one["shadow_from"], one["shadow_alike"]) for one in (*sound, strange)] == [("flight", 2)] * 3 + [
+        ("frame", 0)
+    ]
+    assert not any(one["findings"] for one in sound if "differs" in str(one["findings"]))
+    (found,) = (one for one in strange["findings"] if one["code"] == "picture.shadow_differs")
+    assert found["facts"] == {"unlike": 3, "others": 3}
 
 
 def test_lenslets_and_two_frames_into_one_file_are_refused(

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from dappled.decode.optics.carriers import Lattice, MaskedOptics, Sensor
+from dappled.decode.optics.carriers import Lattice, MaskedOptics, Order, Sensor
 from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import MosaicPlane
 from dappled.decode.picture.picture import picture_of
-from dappled.decode.picture.shadow import Shadow, period_of, shadow_of
+from dappled.decode.picture.shadow import Shadow, ShadowEvidence, ShadowFrom, period_of, shadow_of, told_by
 from tests.decode.picture.drawn import COUNT, FILMS, SHAPE, V_MM, Drawn, draw
 from tests.decode.ray_trials import mask_of
 
@@ -29,19 +30,29 @@ class Judged:
     shares: tuple[float, float]
 
 
-def shadow_in(shot: Drawn) -> tuple[MosaicPlane, Shadow, Lattice]:
-    """The frame, the shadow that is found in it, and the true lattice."""
+def _masked(shot: Drawn) -> tuple[MosaicPlane, Lattice, list[Order]]:
+    """The frame, the true lattice, and the orders that may be seen."""
     sensor = Sensor(SHAPE, (shot.pitch_mm[0], 0.0), (0.0, shot.pitch_mm[1]))
     optics = MaskedOptics(sensor, mask_of(shot.film), "geometric", shot.distance_mm)
     lattice = optics.lattice(V_MM)
     there = [one for one in order_strengths(optics, lattice, shot.f_number) if one.on_sensor]
     orders = [one.order for one in there if one.most > _SEEN] or [one.order for one in there]
-    mosaic = MosaicPlane(shot.frame(), shot.pattern)
-    return mosaic, shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02), lattice
+    return MosaicPlane(shot.frame(), shot.pattern), lattice, orders
 
 
-def judged(shot: Drawn) -> Judged:
-    mosaic, shadow, lattice = shadow_in(shot)
+def shadow_in(shot: Drawn, beside: Sequence[ShadowEvidence] = ()) -> tuple[MosaicPlane, Shadow, Lattice]:
+    """The frame, the shadow that is found in it, and in others beside it, and the true lattice."""
+    mosaic, lattice, orders = _masked(shot)
+    return mosaic, shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02, beside=beside), lattice
+
+
+def _told(shots: Sequence[Drawn]) -> list[ShadowEvidence]:
+    found = [told_by(*_masked(shot), turned=0.03, scaled=0.02) for shot in shots]
+    return [one for one in found if one is not None]
+
+
+def judged(shot: Drawn, beside: Sequence[ShadowEvidence] = ()) -> Judged:
+    mosaic, shadow, lattice = shadow_in(shot, beside)
     frame = mosaic.plane
     made = picture_of(mosaic, shadow, period_of(lattice))
     others = [shot.psnr(frame / np.maximum(shot.lights[2], 0.01)), shot.psnr(shot.band(frame))]
@@ -85,6 +96,24 @@ def test_what_the_lattice_is_off_is_a_part_of_the_shadow_s_error() -> None:
 def test_a_weak_shadow_s_lattice_is_turned_and_scaled_rather_than_sheared() -> None:
     _, shadow, true = shadow_in(draw()[110])
     assert np.abs((shadow.lattice.matrix() - true.matrix()) * SHAPE).max() < 0.05
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "most_short_db"), [(38, -0.9), (50, -0.8), (57, -1.0)])
+def test_four_other_scenes_behind_the_same_mask_tell_a_shadow_that_one_scene_hides(
+    number: int, most_short_db: float
+) -> None:
+    shot = draw()[number]
+    beside = _told([replace(shot, seed=1000 + at) for at in range(4)])
+    assert judged(shot, beside).short_db > most_short_db
+
+
+@pytest.mark.slow
+def test_a_frame_that_was_taken_at_another_stop_keeps_a_shadow_of_its_own() -> None:
+    shot = draw()[50]
+    beside = _told([replace(shot, seed=1000 + at, f_number=shot.f_number / 1.2) for at in range(2)])
+    shadow = shadow_in(shot, beside)[1]
+    assert (shadow.source, shadow.alike, shadow.unlike) == (ShadowFrom.FRAME, 0, 2)
 
 
 @pytest.mark.slow

@@ -24,7 +24,7 @@ from dappled.errors import counted
 if not words_only:
     from dappled.cli.picture import places
     from dappled.drivers.raw.darkroom import Recipe
-    from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
+    from dappled.drivers.raw.picture_maker import LensFrame, MadePicture, PictureMaker, beside
     from dappled.products import processes
     from dappled.products.handover import picture_files, reflectance
     from dappled.products.handover.reflectance import ReflectancePanel, ReflectancePicture
@@ -97,14 +97,23 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
             durable.make_folder(self.output)
 
         workers = processes.worth(self.workers, len(found))
-        make = _Picturing(self, recipe if workers == 1 else replace(recipe, workers=1), single, panel)
+        flight = tuple(LensFrame(one, self.focal_length, self.f_number) for one in found)
+        make = _Picturing(self, recipe if workers == 1 else replace(recipe, workers=1), single, panel, flight)
         return each_frame(found, output, make, workers=workers, into_folder=not single, failure="gave no picture")
 
-    def made(self, maker: PictureMaker, frame: Path, target: Path, panel: ReflectancePanel | None) -> FrameMade:
+    def made(
+        self,
+        maker: PictureMaker,
+        frame: Path,
+        target: Path,
+        panel: ReflectancePanel | None,
+        flight: tuple[LensFrame, ...],
+    ) -> FrameMade:
         """Make and write one picture. Raises DappledError."""
-        beside, factors = target.with_suffix(".sigma.tif"), target.with_suffix(".panel.toml")
-        self.refuse_existing(target, beside if self.sigma else None, None if self.panel is None else factors)
-        made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number)
+        errors, factors = target.with_suffix(".sigma.tif"), target.with_suffix(".panel.toml")
+        self.refuse_existing(target, errors if self.sigma else None, None if self.panel is None else factors)
+        others = beside(LensFrame(frame, self.focal_length, self.f_number), flight)
+        made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number, others=others)
         measured = reflected = None
         if self.panel is not None and self.reflectance is not None:
             measured, more = reflectance.measured(
@@ -116,7 +125,7 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
             made = replace(made, findings=(*made.findings, *more))
         durable.write_file(target, picture_files.encoded(made, target.suffix, places.place_of(frame), reflected))
         if self.sigma:
-            durable.write_file(beside, picture_files.sigma_file(made))
+            durable.write_file(errors, picture_files.sigma_file(made))
         if measured is not None:
             reflectance.write(measured, factors)
         values = _facts(target, made) | _panel_facts(measured, reflected)
@@ -132,6 +141,7 @@ class _Picturing:
     recipe: Recipe
     single: bool
     panel: ReflectancePanel | None
+    flight: tuple[LensFrame, ...]
 
     @cached_property
     def maker(self) -> PictureMaker:
@@ -142,7 +152,7 @@ class _Picturing:
         """Make and write a frame's picture. Raises DappledError."""
         asked = self.asked
         target = asked.output if self.single else asked.output / f"{frame.stem}.{asked.kind}"
-        return asked.made(self.maker, frame, target, self.panel)
+        return asked.made(self.maker, frame, target, self.panel, self.flight)
 
 
 CLASSES = {"picture": MakePictures}
@@ -156,6 +166,7 @@ def _facts(target: Path, made: MadePicture) -> dict[str, Any]:
         "shape": list(made.picture.plane.shape),
         "shadow_from": shadow.source.value,
         "shadow_depth": shadow.depth,
+        "shadow_alike": shadow.alike,
         "shadow_sigma": float(shadow.sigma.max()),
         "lattice": shadow.lattice.matrix().tolist(),
         "dark_share": made.picture.dark_share,
@@ -169,7 +180,13 @@ def summary(made: MadePicture) -> str:
     """Its size, and where its shadow is from."""
     rows, columns = made.picture.plane.shape
     shadow = made.picture.shadow
-    whose = {"frame": "found in the frame", "white": "the white frame's", "calibration": "the calibration's"}
+    flown = f"found in the frame and {shadow.alike} beside it"
+    whose = {
+        "frame": "found in the frame",
+        "flight": flown,
+        "white": "the white frame's",
+        "calibration": "the calibration's",
+    }
     if (told := whose.get(shadow.source.value)) is None:
         return f"{columns} × {rows} px; no shadow of the mask was seen"
     return (

@@ -5,6 +5,9 @@ carriers' lattice, 1 + Σ c_k e^{2πi k·F x}. The frame's own coefficients are 
 squares: with L the frame's local mean over a period, frame − L is regressed on L · e^{2πi k·F x}. Blocks weigh by what
 they leave unexplained, clipped and defective pixels by nothing, each colour has coefficients of its own, and these vary
 over the frame as polynomials where that explains blocks that were held out.
+
+In one scene, detail at a carrier's own frequency can't be told from the shadow. Frames behind the same mask, lens and
+stop have one shadow and several scenes: what each tells by itself, its `ShadowEvidence`, is averaged by how sure it is.
 """
 
 from __future__ import annotations
@@ -41,12 +44,15 @@ _ENOUGH = 0.1  # of the frame
 _SHEARED = 5e-4  # of a print on its way: longer along one axis, or at no right angle
 _STILL_BINS = 3e-3  # of a frame: a lattice so near is kept
 _LEAST = 1e-3  # of the frame's mean: darker local means tell nothing of the shadow
+_COMMON = 0.5  # of a frame's standard error: what the next one's scene doesn't cure
+_UNLIKE = 6.0  # times the mean square of their errors: what differs by more is not one shadow
 
 
 class ShadowFrom(StrEnum):
     """What a shadow's coefficients are from."""
 
     FRAME = "frame"
+    FLIGHT = "flight"
     WHITE = "white"
     CALIBRATION = "calibration"
     NONE = "none"
@@ -55,7 +61,8 @@ class ShadowFrom(StrEnum):
 @dataclass(frozen=True, slots=True, eq=False)
 class Shadow:
     """`coefficients` complex (colours, K, terms) of the half plane's `orders`, at the frame's centre, their terms those
-    of a polynomial of `degree` over the frame; `sigma` (colours,) the standard error of W, rms over the frame."""
+    of a polynomial of `degree` over the frame; `sigma` (colours,) the standard error of W, rms over the frame.
+    `alike` frames beside it had this shadow, `unlike` another."""
 
     shape: tuple[int, int]
     lattice: Lattice
@@ -64,6 +71,8 @@ class Shadow:
     degree: int
     source: ShadowFrom
     sigma: Floats
+    alike: int = 0
+    unlike: int = 0
 
     @property
     def depth(self) -> float:
@@ -91,6 +100,111 @@ class Shadow:
         return np.maximum(made, np.float32(0.01))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Fit:
+    """Coefficients complex (colours, K, terms) as least squares give them, with their variances; `held` is the log
+    likelihood that they gain on blocks that were held out."""
+
+    degree: int
+    found: Coefficients
+    variance: Floats
+    held: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ShadowEvidence:
+    """What one frame, or several together, tell of the shadow. `sure` (4, 4) is one over the covariance of the
+    lattice's error in bins (see `_Equations`)."""
+
+    shape: tuple[int, int]
+    lattice: Lattice
+    orders: tuple[Order, ...]
+    sure: Floats
+    fits: tuple[_Fit, ...]
+
+    @property
+    def held(self) -> float:
+        """The log likelihood that the shadow gains; 0 where none is seen."""
+        gain = 0.0
+        for fit in self.fits:
+            gain = fit.held if fit.held > gain + _SURE else gain
+        return gain
+
+    def unlike(self, other: ShadowEvidence) -> float:
+        """The mean square of what two frames' shadows differ by, over that of their errors: about 1 where they are
+        one."""
+        step = _bins(self.shape, other.lattice) - _bins(self.shape, self.lattice)
+        mine, its = self.fits[0], other.fits[0]
+        apart = (np.abs(mine.found - its.found) ** 2).sum() + _displaced(
+            self.orders, mine.found, np.outer(step, step)
+        ).sum()
+        both = sum(
+            one.fits[0].variance.sum() + _displaced(one.orders, one.fits[0].found, np.linalg.inv(one.sure)).sum()
+            for one in (self, other)
+        )
+        return float(apart / max(both, 1e-30))
+
+    def with_those(self, others: Sequence[ShadowEvidence]) -> ShadowEvidence:
+        """Together with frames that tell the same."""
+        every = [self, *others]
+        sure = np.sum([one.sure for one in every], axis=0)
+        first = _bins(self.shape, self.lattice)
+        steps = [one.sure @ (_bins(self.shape, one.lattice) - first) for one in every]
+        lattice = _of_bins(self.shape, first + np.linalg.solve(sure, np.sum(steps, axis=0)))
+        fits = tuple(map(_averaged, zip(*(one.fits for one in every), strict=True)))
+        return ShadowEvidence(self.shape, lattice, self.orders, sure, fits)
+
+    def shadow(self, source: ShadowFrom, degree: int | None = None) -> Shadow | None:
+        """Each coefficient is trusted as far as it stands above its error. None where no mask is seen; `degree`: that
+        one, in any case."""
+        told = self.held
+        best = next((one for one in self.fits if one.degree == degree or (degree is None and one.held == told)), None)
+        if best is None:
+            return None
+        own, variance = _alike(best.found, best.variance)
+        trust = np.clip(1 - variance / np.maximum(np.abs(own) ** 2, 1e-30), 0, 1)
+        # What is not trusted may be there all the same. Squares of terms are averaged over the frame.
+        squares = (_terms(_raster(self.shape), self.shape, best.degree) ** 2).mean(axis=0)
+        lost = 2 * ((np.maximum(trust, 0.5) * variance) @ squares).sum(axis=1)
+        lost += 2 * _displaced(self.orders, own * trust, np.linalg.inv(self.sure))
+        return Shadow(self.shape, self.lattice, self.orders, own * trust, best.degree, source, np.sqrt(lost))
+
+
+def _displaced(orders: Sequence[Order], coefficients: Coefficients, step: NDArray[np.floating]) -> Floats:
+    """(colours,) half of the mean square over the frame of what W changes by where the lattice lies off, by the mean
+    (4, 4) of the squares of that in bins."""
+    half = np.array(orders, dtype=np.float64)
+    turns = np.einsum("ki,ij,kj->k", half, step[:2, :2] + step[2:, 2:], half) * (2 * np.pi) ** 2 / 12
+    return np.asarray(np.abs(coefficients[:, :, 0]) ** 2 @ np.minimum(turns, 1))
+
+
+def _averaged(fits: Sequence[_Fit]) -> _Fit:
+    """By one over their variances. What they differ by more than these adds to what is left, and what errs alike in
+    each of them stays."""
+    weights = np.array([1 / np.maximum(one.variance, 1e-30) for one in fits])
+    found, whole = np.array([one.found for one in fits]), weights.sum(axis=0)
+    mean = (weights * found).sum(axis=0) / whole
+    apart = float((weights * np.abs(found - mean) ** 2).sum(axis=0).mean()) / max(len(fits) - 1, 1)
+    variance = (max(apart, 1.0) + _COMMON**2 * len(fits)) / whole
+    return _Fit(fits[0].degree, mean, variance, sum(one.held for one in fits))
+
+
+def _raster(shape: tuple[int, int]) -> Floats:
+    """(n, 2) places evenly over a frame, from its centre."""
+    y, x = (((np.arange(9) + 0.5) / 9 - 0.5) * side for side in shape)
+    return np.stack(np.meshgrid(y, x, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _bins(shape: tuple[int, int], lattice: Lattice) -> Floats:
+    """(4,) a lattice in bins: rows of ky and kx, columns of ky and kx."""
+    return np.asarray((lattice.matrix() * shape).T.ravel())
+
+
+def _of_bins(shape: tuple[int, int], bins: Floats) -> Lattice:
+    (a, b), (c, d) = (bins.reshape(2, 2) / np.array(shape)[:, None]).T
+    return Lattice((float(a), float(b)), (float(c), float(d)))
+
+
 def no_shadow(shape: tuple[int, int], lattice: Lattice, orders: Sequence[Order], colours: int) -> Shadow:
     """W = 1."""
     none = np.zeros((colours, len(orders), 1), dtype=np.complex128)
@@ -105,13 +219,50 @@ def shadow_of(
     turned: float = 0.0,
     scaled: float = 0.0,
     others: Sequence[Shadow] = (),
+    beside: Sequence[ShadowEvidence] = (),
 ) -> Shadow:
     """The shadow that explains a frame best: its own, one of `others` (a white frame's, a calibration's), or none.
+    What frames `beside` it tell, of the same mask, lens, stop and orders, is averaged with its own, those left out
+    whose shadow is another.
 
     `lattice` is where the carriers are expected, `orders` those of the half plane without the mean. The search for the
     lattice allows for a turn (radians) and for a print's scale to either side. What a shadow explains is counted on
     blocks that it was not fitted to.
     """
+    if beside:
+        lattice = _of_bins(mosaic.shape, np.median([_bins(mosaic.shape, one.lattice) for one in beside], axis=0))
+    equations, means = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
+    evidence = equations.evidence()
+    own = evidence.shadow(ShadowFrom.FRAME)
+    best, gain = own or no_shadow(mosaic.shape, equations.at, equations.orders, mosaic.colours), evidence.held
+    if own is None and beside:
+        evidence = beside[0]
+    same = [one for one in beside if one.unlike(evidence) < _UNLIKE]
+    others_tell = [one for one in same if one is not evidence]
+    if others_tell:
+        best = evidence.with_those(others_tell).shadow(ShadowFrom.FLIGHT) or best
+    best = replace(best, alike=len(same), unlike=len(beside) - len(same))
+    at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
+    for one in others:
+        if (where := (one.lattice, one.orders)) not in at:
+            at[where] = _Equations.of(means, *where)
+        if (told := at[where].explained(one, equations.weights) - equations.unexplained) > gain:
+            best, gain = one, told
+    return best
+
+
+def told_by(
+    mosaic: MosaicPlane, lattice: Lattice, orders: Sequence[Order], *, turned: float = 0.0, scaled: float = 0.0
+) -> ShadowEvidence | None:
+    """What one frame tells of the shadow, see `shadow_of`; None where it shows none."""
+    made = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)[0].evidence()
+    return made if made.shadow(ShadowFrom.FRAME) else None
+
+
+def _equations_of(
+    mosaic: MosaicPlane, lattice: Lattice, orders: Sequence[Order], *, turned: float, scaled: float
+) -> tuple[_Equations, _Means]:
+    """The equations of a frame's own shadow, at its own lattice; and the local means that they are of."""
     half = tuple(order for order in orders if order != (0, 0))
     mosaic = _unclipped(mosaic, period_of(lattice))
     means = _Means.of(mosaic, period_of(lattice))
@@ -122,7 +273,8 @@ def shadow_of(
             break
         # Where pixels are left out, a block's middle is not where its samples are.
         equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half, found)
-    first = equations.fitted(0)
+    first = equations.evidence((0,)).shadow(ShadowFrom.FRAME, degree=0)
+    assert first is not None
     kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
     lost = bool(np.any(np.abs(kept) > _KEPT))
     if lost:
@@ -135,18 +287,7 @@ def shadow_of(
         equations = _Equations.of(means, equations.at, half, found)
     if mosaic.valid is None and equations.at != found and (finer := equations.lattice()) is not None:
         equations = _Equations.of(means, finer, half, found)
-    best, gain = no_shadow(mosaic.shape, equations.at, half, mosaic.colours), 0.0
-    for degree in _DEGREES:
-        held = equations.held_out(degree)
-        if held > gain + _SURE:
-            best, gain = equations.fitted(degree), held
-    at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
-    for one in others:
-        if (where := (one.lattice, one.orders)) not in at:
-            at[where] = _Equations.of(means, *where)
-        if (told := at[where].explained(one, equations.weights) - equations.unexplained) > gain:
-            best, gain = one, told
-    return best
+    return equations, means
 
 
 def period_of(lattice: Lattice) -> float:
@@ -405,8 +546,13 @@ class _Equations:
             total += float((weights * self._gains(colour, local)).sum()) / 2
         return total
 
-    def fitted(self, degree: int) -> Shadow:
-        """The frame's own shadow; each term is trusted as far as it stands above its error between blocks."""
+    def evidence(self, degrees: Sequence[int] = _DEGREES) -> ShadowEvidence:
+        """What the frame tells, with polynomials of these degrees."""
+        sure = np.asarray(np.linalg.inv(self._lattice_step[1] + 1e-8 * np.eye(4)))
+        return ShadowEvidence(self.shape, self.at, self.orders, sure, tuple(map(self._fitted, degrees)))
+
+    def _fitted(self, degree: int) -> _Fit:
+        """Coefficients, and their errors by the scatter between blocks."""
         half = slice(1, len(self.orders) + 1)
         found, spread = [], []
         terms = self._terms(degree)
@@ -418,12 +564,7 @@ class _Equations:
             errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
             spread.append((np.abs(errors) ** 2).sum(axis=0)[half])
             found.append(c[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
-        own, variance = _alike(np.array(found), np.array(spread))
-        trust = np.clip(1 - variance / np.maximum(np.abs(own) ** 2, 1e-30), 0, 1)
-        # What is not trusted may be there all the same.
-        sigmas = np.sqrt(2 * ((np.maximum(trust, 0.5) * variance) @ (terms**2).mean(axis=0)).sum(axis=1))
-        made = Shadow(self.shape, self.at, self.orders, own * trust, degree, ShadowFrom.FRAME, sigmas)
-        return replace(made, sigma=np.sqrt(made.sigma**2 + self.displaced(made)))
+        return _Fit(degree, np.array(found), np.array(spread), self.held_out(degree))
 
     def lattice(self) -> Lattice | None:
         """The lattice that the phases of the blocks agree on best, by one Gauss–Newton step; None where it is so near
@@ -431,9 +572,7 @@ class _Equations:
         step, _ = self._lattice_step
         if float(np.abs(step).max()) < _STILL_BINS:
             return None
-        delta = (step.reshape(2, 2) / np.array(self.shape)[:, None]).T  # rows ky, kx
-        (a, b), (c2, d) = self.at.matrix() + delta
-        return Lattice((float(a), float(b)), (float(c2), float(d)))
+        return _of_bins(self.shape, _bins(self.shape, self.at) + step)
 
     @cached_property
     def _lattice_step(self) -> tuple[Floats, Floats]:
@@ -474,9 +613,3 @@ class _Equations:
         scores[:, 4:] -= explained
         errors = scores @ inverse[:, :4]
         return step[:4], np.asarray(errors.T @ errors)
-
-    def displaced(self, shadow: Shadow) -> Floats:
-        """(colours,) the variance over the frame that the lattice's error makes of a shadow's W."""
-        half, error = np.array(shadow.orders, dtype=np.float64), self._lattice_step[1]
-        turns = np.einsum("ki,ij,kj->k", half, error[:2, :2] + error[2:, 2:], half) * (2 * np.pi) ** 2 / 12
-        return np.asarray(2 * (np.abs(shadow.coefficients[:, :, 0]) ** 2 @ np.minimum(turns, 1)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from dappled.decode.optics import LAWS, Lattice, Order, Sensor
 from dappled.decode.optics.visibility import OrderStrength, order_strengths
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
-from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of, shadow_of
+from dappled.decode.picture.shadow import Shadow, ShadowEvidence, ShadowFrom, period_of, shadow_of, told_by
 from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
@@ -35,6 +36,32 @@ _DEEP = 0.03  # standard deviation of W: where as much is predicted at least, so
 _UNCERTAIN = 0.02  # standard error of W
 _TOLD_SIGMA = 0.02  # of a predicted W: f-number and stop
 _MANY_DARK = 0.01  # of the pixels
+_BESIDE = 8  # frames whose shadows are averaged
+
+Lens = tuple[float, float | None]
+"""Focal length in mm and f-number."""
+
+
+@dataclass(frozen=True, slots=True)
+class LensFrame:
+    """A frame's file, its focal length and its f-number; None: as the file has them."""
+
+    path: Path
+    focal_length_mm: float | None = None
+    f_number: float | None = None
+
+
+def beside(one: LensFrame | None, flight: Sequence[LensFrame]) -> tuple[LensFrame, ...]:
+    """The frames to take a frame's shadow from, too: of those in its folder with its lens and stop, a few from all over
+    the flight; the same ones for each of them, so that each is asked once."""
+    same = (
+        []
+        if one is None
+        else [
+            other for other in flight if replace(other, path=one.path) == one and other.path.parent == one.path.parent
+        ]
+    )
+    return tuple(same[int(at)] for at in np.unique(np.linspace(0, len(same) - 1, _BESIDE).round()) if same)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,12 +79,13 @@ class MadePicture:
 
 
 class PictureMaker:
-    """Makes pictures of frames by one recipe; keeps the shadow of its white frame."""
+    """Makes pictures of frames by one recipe; keeps the shadow of its white frame, and what frames tell of theirs."""
 
     def __init__(self, recipe: Recipe) -> None:
         self._darkroom = Darkroom(replace(recipe, white=""))
         self._recipe = recipe
         self._white: Shadow | None = None
+        self._told: dict[tuple[Path, Lens, str], ShadowEvidence | None] = {}
 
     def check(self) -> None:
         """Raise DappledError when the recipe names something that is missing or wrong, or lenslets."""
@@ -66,9 +94,15 @@ class PictureMaker:
         Darkroom(self._recipe).check()
 
     def picture(
-        self, path: Path | str, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self,
+        path: Path | str,
+        *,
+        focal_length_mm: float | None = None,
+        f_number: float | None = None,
+        others: Sequence[LensFrame] = (),
     ) -> MadePicture:
-        """The picture of a frame; arguments that are None are taken from its file. Raises DappledError."""
+        """The picture of a frame; arguments that are None are taken from its file. `others` are frames behind the same
+        mask (see `beside`), which tell more of its shadow than it does alone. Raises DappledError."""
         raw = self._darkroom.read(path)
         focal_length_mm, f_number = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
         if focal_length_mm is None:
@@ -76,9 +110,11 @@ class PictureMaker:
         with self._darkroom.naming(path):
             mosaic = self._mosaic(raw)
             decoder = self._darkroom.mask_decoder(mosaic.shape, raw.camera_model or "")
-            shadow = self._shadow(mosaic, decoder, focal_length_mm, f_number)
+            lens = focal_length_mm, f_number
+            told = [self._told_by(one, raw, decoder, lens) for one in others if one.path != Path(path)]
+            shadow = self._shadow(mosaic, decoder, lens, [one for one in told if one is not None])
             made = picture_of(mosaic, shadow, period_of(shadow.lattice))
-        found = self._findings(Subject("frame", str(path)), raw, made, decoder, (focal_length_mm, f_number))
+        found = self._findings(Subject("frame", str(path)), raw, made, decoder, lens)
         return MadePicture(
             made, raw, decoder.optics.sensor, focal_length_mm, f_number, _colour_matrix(path, raw), found
         )
@@ -98,16 +134,36 @@ class PictureMaker:
             plane, valid, pattern = _spread(plane), _spread(valid), _spread_pattern(pattern)
         return MosaicPlane(plane, pattern, None if valid.all() else valid)
 
-    def _shadow(
-        self, mosaic: MosaicPlane, decoder: MaskDecoder, focal_length_mm: float, f_number: float | None
-    ) -> Shadow:
+    def _told_by(self, one: LensFrame, like: RawFile, decoder: MaskDecoder, lens: Lens) -> ShadowEvidence | None:
+        """What a frame of the same camera, lens and stop tells; None where it is none or can't be read."""
+        key = one.path, lens, decoder.optics.law
+        if key not in self._told:
+            self._told[key] = None
+            try:
+                raw = self._darkroom.read(one.path)
+            except DappledError:  # told where its own picture is made
+                return None
+            own = one.focal_length_mm or raw.focal_length_mm, one.f_number or raw.f_number
+            if (raw.camera_model, raw.mosaic.shape, own) == (like.camera_model, like.mosaic.shape, lens):
+                turned, scaled = _reach(decoder)
+                self._told[key] = told_by(
+                    self._mosaic(raw),
+                    decoder.lattice_at(lens[0]),
+                    _orders(decoder, *lens),
+                    turned=turned,
+                    scaled=scaled,
+                )
+        return self._told[key]
+
+    def _shadow(self, mosaic: MosaicPlane, decoder: MaskDecoder, lens: Lens, told: Sequence[ShadowEvidence]) -> Shadow:
+        focal_length_mm, f_number = lens
         orders, lattice = _orders(decoder, focal_length_mm, f_number), decoder.lattice_at(focal_length_mm)
         known = decoder.calibration is not None
         others = [self._white_shadow(decoder, orders, lattice)] if self._recipe.white else []
         if known and f_number:
             others += _told(decoder, mosaic, orders, focal_length_mm=focal_length_mm, f_number=f_number)
-        turned, scaled = (_TURNED_SINCE, _SCALED_SINCE) if known else (_TURNED, _SCALED)
-        made = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others)
+        turned, scaled = _reach(decoder)
+        made = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others, beside=told)
         if made.source == ShadowFrom.NONE and self._recipe.try_laws and not known:
             for law in LAWS:
                 there = replace(decoder, optics=decoder.optics.by(law))
@@ -131,7 +187,7 @@ class PictureMaker:
         raw: RawFile,
         made: UnmaskedPicture,
         decoder: MaskDecoder,
-        lens: tuple[float, float | None],
+        lens: Lens,
     ) -> tuple[Finding, ...]:
         found, shadow = [], made.shadow
         if raw.developed:
@@ -145,11 +201,19 @@ class PictureMaker:
             found.append(finding(Code.PICTURE_SHADOW_UNSEEN, subject, level, least_depth=least))
         elif float(shadow.sigma.max()) > _UNCERTAIN:
             found.append(finding(Code.PICTURE_SHADOW_UNCERTAIN, subject, sigma=float(shadow.sigma.max())))
+        if shadow.unlike > max(shadow.alike, 1):
+            of_all = shadow.alike + shadow.unlike
+            found.append(finding(Code.PICTURE_SHADOW_DIFFERS, subject, unlike=shadow.unlike, others=of_all))
         if made.dark_share > _MANY_DARK:
             found.append(finding(Code.PICTURE_DARK, subject, share=made.dark_share, below=DARK))
         if made.soft_share > 0:
             found.append(finding(Code.PICTURE_SOFT, subject, share=made.soft_share))
         return tuple(found)
+
+
+def _reach(decoder: MaskDecoder) -> tuple[float, float]:
+    """How far the lattice is searched: a turn in radians, and a share of the period."""
+    return (_TURNED, _SCALED) if decoder.calibration is None else (_TURNED_SINCE, _SCALED_SINCE)
 
 
 def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[Order]:

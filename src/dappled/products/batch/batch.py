@@ -22,6 +22,7 @@ from typing import Self
 from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.picture_maker import LensFrame, beside
 from dappled.errors import DappledError, sentence
 from dappled.findings import Finding
 from dappled.flight import Frame, Tag
@@ -33,7 +34,7 @@ from dappled.products.handover.forms import HandedFrame
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
-from dappled.products.maps.laboratory import FlightFrame, Laboratory
+from dappled.products.maps.laboratory import FlightFrame, Laboratory, exposures
 from dappled.products.maps.photographs import Photograph, Station
 
 MAPS = ("cog", "kmz")
@@ -47,7 +48,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 class Job:
     """One frame and all that is to be made of it. `station` is the error where its position isn't known;
     `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on.
-    `utc_ns` is mid-exposure, corrected; None where UTC was never known."""
+    `utc_ns` is mid-exposure, corrected; None where UTC was never known. `others` are the frames that the mask's shadow
+    is taken from, too."""
 
     flight: str
     frame: Frame
@@ -60,6 +62,7 @@ class Job:
     output: str
     key: str
     utc_ns: int | None = None
+    others: tuple[LensFrame, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +120,9 @@ def plan(
         options = replace(options, terrain=options.terrain.absolute())
     frames, tags = photographs.recorded(flight)
     tags |= {index: one.tag for index, one in placed.items()}
+    given = {"focal_length_mm": options.focal_length_mm, "f_number": options.f_number}
+    files = exposures(flight.absolute(), [(one, tags.get(one.index)) for one in frames], **given)
+    hashes = {files[one.index].path: one.sha256 for one in frames if one.index in files}
     if options.frames is not None:
         frames = [frame for frame in frames if frame.index in options.frames]
     stations: dict[int, Station] = {}
@@ -146,15 +152,16 @@ def plan(
     for frame in frames:
         tag = tags.get(frame.index)
         utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
+        others = beside(files.get(frame.index), list(files.values())) if set(kinds) & set(PLACED) else ()
         said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
-                "tag": codec.plain(tag)}  # fmt: skip
+                "tag": codec.plain(tag), "others": [hashes[one.path] for one in others]}  # fmt: skip
         if frame.index in stations and stations[frame.index].camera.height_ellipsoid_m is not None:
             said["height_ellipsoid_m"] = stations[frame.index].camera.height_ellipsoid_m
         key = hashlib.sha256(codec.canonical(said)).hexdigest()
         jobs.append(
             Job(
                 str(flight.absolute()), frame, tag, stations.get(frame.index) or unplaced[frame.index], level, recipe,
-                options, tuple(kinds), str(output.absolute()), key, utc_ns,
+                options, tuple(kinds), str(output.absolute()), key, utc_ns, others,
             )
         )  # fmt: skip
     return jobs
@@ -249,7 +256,8 @@ def _making(job: Job) -> _Making:
     if isinstance(job.station, DappledError) and set(job.kinds) <= set(PLACED):
         raise job.station
     given = {"focal_length_mm": job.options.focal_length_mm, "f_number": job.options.f_number}
-    return _Making(job, _laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given))
+    frame = _laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given, others=job.others)
+    return _Making(job, frame)
 
 
 def _beside(job: Job, kind: str) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -16,6 +16,7 @@ import numpy as np
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.picture_maker import LensFrame, beside
 from dappled.errors import DappledError
 from dappled.findings import Finding, first_by_name, text
 from dappled.flight import FlightFolder
@@ -26,7 +27,7 @@ from dappled.products.maps.eye import EyeError
 from dappled.products.maps.ground import Flat, Ground, Raster
 from dappled.products.maps.ground import check as check_ground
 from dappled.products.maps.ground import load as load_ground
-from dappled.products.maps.laboratory import MEAN, Laboratory
+from dappled.products.maps.laboratory import MEAN, Laboratory, exposures
 from dappled.products.maps.map_grid import MapError
 from dappled.products.maps.photographs import Photograph, Station
 from dappled.products.maps.references import BaseMap
@@ -125,6 +126,8 @@ def survey(
     one is made, where poses and optics tell it, and raises what needs no picture to be known. Raises DappledError where
     no frame is left, or the options are wrong."""
     stations, left = photographs.stations(flight, options.mounting)
+    lens = {"focal_length_mm": options.focal_length_mm, "f_number": options.f_number}
+    files = exposures(flight, [(one.frame, one.tag) for one in stations], **lens)
     if options.frames is not None:
         stations = [one for one in stations if one.frame.index in options.frames]
         left = [pair for pair in left if int(Path(pair[0]).stem) in options.frames]
@@ -143,7 +146,7 @@ def survey(
         foresee(planned)
     workers = 1 if watch is not None else processes.worth(workers, len(stations))
     develop = _Developing(
-        flight, recipe if workers == 1 else replace(recipe, workers=1), options, projection.name, scratch, watch
+        flight, recipe if workers == 1 else replace(recipe, workers=1), options, projection.name, scratch, watch, files
     )
     taken: list[Photograph] = []
     with closing(processes.in_order(stations, develop, workers, lost=_lost)) as made:
@@ -168,6 +171,7 @@ class _Developing:
     projection_name: str
     scratch: Path
     watch: Watch | None
+    files: Mapping[int, LensFrame]
 
     @cached_property
     def laboratory(self) -> Laboratory:
@@ -186,6 +190,7 @@ class _Developing:
             frame = self.laboratory.frame(
                 self.flight, station.frame, station.tag,
                 focal_length_mm=options.focal_length_mm, f_number=options.f_number,
+                others=beside(self.files.get(station.frame.index), list(self.files.values())),
             )  # fmt: skip
             one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
             if self.watch is not None:

@@ -5,6 +5,8 @@ A picture costs a tenth of the views. What shows a frame as a whole is made of i
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +15,8 @@ import numpy as np
 
 from dappled.config import profiles
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.picture_maker import PictureMaker
+from dappled.drivers.raw.picture_maker import LensFrame, PictureMaker
+from dappled.errors import DappledError
 from dappled.findings import Finding
 from dappled.flight import FlightFolder, Frame, Tag
 from dappled.products.maps import photographs
@@ -39,14 +42,33 @@ class Laboratory:
         *,
         focal_length_mm: float | None = None,
         f_number: float | None = None,
+        others: Sequence[LensFrame] = (),
     ) -> FlightFrame:
-        """One frame of a flight; lens and stop are those given, else its tag's, else those of its file."""
-        return FlightFrame(
-            self,
-            FlightFolder(flight).file(frame.name),
-            focal_length_mm or (tag.focal_length_mm if tag else None),
-            f_number or (tag.f_number if tag else None),
-        )
+        """One frame of a flight (see `exposure`); its mask's shadow is taken from `others`, too."""
+        one = exposure(flight, frame, tag, focal_length_mm=focal_length_mm, f_number=f_number)
+        return FlightFrame(self, one.path, one.focal_length_mm, one.f_number, others)
+
+
+def exposure(
+    flight: Path, frame: Frame, tag: Tag | None, *, focal_length_mm: float | None = None, f_number: float | None = None
+) -> LensFrame:
+    """A frame's file; lens and stop are those given, else its tag's, else those of its file."""
+    return LensFrame(
+        FlightFolder(flight).file(frame.name),
+        focal_length_mm or (tag.focal_length_mm if tag else None),
+        f_number or (tag.f_number if tag else None),
+    )
+
+
+def exposures(
+    flight: Path, recorded: Iterable[tuple[Frame, Tag | None]], *, focal_length_mm: float | None, f_number: float | None
+) -> dict[int, LensFrame]:
+    """The files of a flight's frames by image index (see `exposure`), but those that don't lie in it."""
+    made = {}
+    for frame, tag in recorded:
+        with suppress(DappledError):
+            made[frame.index] = exposure(flight, frame, tag, focal_length_mm=focal_length_mm, f_number=f_number)
+    return made
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +79,7 @@ class FlightFrame:
     path: Path
     focal_length_mm: float | None
     f_number: float | None
+    others: Sequence[LensFrame] = ()
     _found: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     _kept: dict[str, Photograph] = field(default_factory=dict)  # by projection
 
@@ -93,7 +116,9 @@ class FlightFrame:
         return photographs.photograph(station, light_field, profile, projection, view=view, focus_m=focus_m)
 
     def _pictured(self, maker: PictureMaker, station: Station, projection: Projection, focus_m: float) -> Photograph:
-        made = maker.picture(self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number)
+        made = maker.picture(
+            self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number, others=self.others
+        )
         profile = self.laboratory.darkroom.camera(made.raw.camera_model or "")
         colour = self.laboratory.recipe.colour
         one = photographs.of_picture(station, made, profile, projection, focus_m=focus_m, colour=colour)
