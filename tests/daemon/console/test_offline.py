@@ -27,7 +27,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.lightfield import LightField
 from dappled.decode.picture.picture import UnmaskedPicture
-from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
+from dappled.drivers.raw.picture_maker import LensFrame, MadePicture, PictureMaker
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Finding, finding, text
 from dappled.flight import Result, flight_report, layout, recording
@@ -270,7 +270,12 @@ class PlainMaker(PictureMaker):
         self.asked: list[tuple[str, float | None, float | None]] = []
 
     def picture(
-        self, path: Path | str, *, focal_length_mm: float | None = None, f_number: float | None = None
+        self,
+        path: Path | str,
+        *,
+        focal_length_mm: float | None = None,
+        f_number: float | None = None,
+        others: Sequence[LensFrame] = (),
     ) -> MadePicture:
         self.asked.append((Path(path).name, focal_length_mm, f_number))
         plane = np.full((40, 60), 0.25, np.float32)
