@@ -38,7 +38,7 @@ _TOLD_SIGMA = 0.02  # of a predicted W: f-number and stop
 _MANY_DARK = 0.01  # of the pixels
 _BESIDE = 8  # frames whose shadows are averaged
 
-Lens = tuple[float, float | None]
+_Lens = tuple[float, float | None]
 """Focal length in mm and f-number."""
 
 
@@ -85,7 +85,7 @@ class PictureMaker:
         self._darkroom = Darkroom(replace(recipe, white=""))
         self._recipe = recipe
         self._white: Shadow | None = None
-        self._told: dict[tuple[Path, Lens, str], ShadowEvidence | None] = {}
+        self._told: dict[tuple[Path, _Lens, str], ShadowEvidence | None] = {}
 
     def check(self) -> None:
         """Raise DappledError when the recipe names something that is missing or wrong, or lenslets."""
@@ -134,7 +134,7 @@ class PictureMaker:
             plane, valid, pattern = _spread(plane), _spread(valid), _spread_pattern(pattern)
         return MosaicPlane(plane, pattern, None if valid.all() else valid)
 
-    def _told_by(self, one: LensFrame, like: RawFile, decoder: MaskDecoder, lens: Lens) -> ShadowEvidence | None:
+    def _told_by(self, one: LensFrame, like: RawFile, decoder: MaskDecoder, lens: _Lens) -> ShadowEvidence | None:
         """What a frame of the same camera, lens and stop tells; None where it is none or can't be read."""
         key = one.path, lens, decoder.optics.law
         if key not in self._told:
@@ -155,7 +155,7 @@ class PictureMaker:
                 )
         return self._told[key]
 
-    def _shadow(self, mosaic: MosaicPlane, decoder: MaskDecoder, lens: Lens, told: Sequence[ShadowEvidence]) -> Shadow:
+    def _shadow(self, mosaic: MosaicPlane, decoder: MaskDecoder, lens: _Lens, told: Sequence[ShadowEvidence]) -> Shadow:
         focal_length_mm, f_number = lens
         orders, lattice = _orders(decoder, focal_length_mm, f_number), decoder.lattice_at(focal_length_mm)
         known = decoder.calibration is not None
@@ -187,7 +187,7 @@ class PictureMaker:
         raw: RawFile,
         made: UnmaskedPicture,
         decoder: MaskDecoder,
-        lens: Lens,
+        lens: _Lens,
     ) -> tuple[Finding, ...]:
         found, shadow = [], made.shadow
         if raw.developed:
