@@ -32,7 +32,7 @@ from scipy import fft
 from dappled.config import profiles
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lenslets import MOSAIC_ROLLOFF, LensletDecoder
-from dappled.decode.lightfield.aperture import Aperture, transfer
+from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer
 from dappled.decode.lightfield.views import from_slices
 from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum import Lineariser, Plane, Slices
@@ -160,7 +160,7 @@ def views(buffers: SpectrumBuffers, linear: Lineariser, decoder: MaskDecoder, mo
     orders = [(carrier.ky, carrier.kx) for carrier in cut.carriers]
     transfers = transfer(orders, np.where(np.arange(len(orders)) == 0, 1.0, 0.5), (0.1, 0.2))
     return lambda: from_slices(
-        cut.values, orders, transfers, kappa_cycles=1.0, rotation_rad=0.0, aperture=Aperture(5), noise_variance=1e-4
+        cut.values, angular_frequencies(orders, 1.0, 0.0), transfers, aperture=Aperture(5), noise_variance=1e-4
     )
 
 

@@ -71,7 +71,7 @@ class LensletDecoder:
     def decode(
         self, plane: Source, *, focal_length_mm: float | None = None, f_number: float | None = None
     ) -> LightField:
-        """The light field of a plane float32 (H, W). Raises DecodeError, DecodeError."""
+        """The light field of a plane float32 (H, W). Raises DecodeError."""
         return self.decode_reported(plane, focal_length_mm=focal_length_mm, f_number=f_number)[0]
 
     def decode_reported(

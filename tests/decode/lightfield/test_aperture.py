@@ -79,10 +79,8 @@ def test_views_through_a_round_stop_are_those_of_its_cells() -> None:
     def error(aperture: Aperture, kappa: float) -> float:
         made, _ = from_slices(
             slices,
-            ORDERS,
+            angular_frequencies(ORDERS, kappa, 0.01),
             TRANSFERS,
-            kappa_cycles=kappa,
-            rotation_rad=0.01,
             aperture=aperture,
             noise_variance=2e-10,
             model_error=1e-3,

@@ -32,13 +32,11 @@ def test_reference_camera_is_at_the_ideal_frequency() -> None:
 def test_views_come_back_from_their_slices(cycles: float, rotation: float) -> None:
     views = _views()
     transfers = transfer(ORDERS, [1.0, *[0.5] * 6, *[-0.25] * 6], (0.31, -0.12))
-    slices = _slices(views, angular_frequencies(ORDERS, cycles, rotation), transfers)
+    angular = angular_frequencies(ORDERS, cycles, rotation)
     found, noise = from_slices(
-        slices,
-        ORDERS,
+        _slices(views, angular, transfers),
+        angular,
         transfers,
-        kappa_cycles=cycles,
-        rotation_rad=rotation,
         aperture=Aperture(5),
         noise_variance=0.0,
         model_error=0.0,
@@ -69,15 +67,14 @@ def test_noise_turns_weak_carriers_down() -> None:
 def test_a_stopped_down_frame_gives_its_one_image_not_noise() -> None:
     views = np.broadcast_to(_views(spread=0.0), (5, 5, 12, 14))
     transfers = transfer(ORDERS, [1.0, *[0.5] * 12], (0.1, 0.2))
-    slices = _slices(views, angular_frequencies(ORDERS, 0.125, 0.0), transfers)
+    angular = angular_frequencies(ORDERS, 0.125, 0.0)
+    slices = _slices(views, angular, transfers)
     noise = 1e-3 * np.random.default_rng(1).normal(size=(2, *slices.shape))
     noisy = (slices + noise[0] + 1j * noise[1]).astype(np.complex64)
     found, _ = from_slices(
         noisy,
-        ORDERS,
+        angular,
         transfers,
-        kappa_cycles=0.125,
-        rotation_rad=0.0,
         aperture=Aperture(5),
         noise_variance=2e-6,
     )
@@ -95,10 +92,8 @@ def test_a_diagonal_mask_leaves_what_it_does_not_sample_at_the_common_image() ->
         views = np.broadcast_to(light.reshape(5, 5, 1, 1), (5, 5, 6, 6))
         found, _ = from_slices(
             _slices(views, angular, transfers),
-            orders,
+            angular,
             transfers,
-            kappa_cycles=1.0,
-            rotation_rad=0.0,
             aperture=Aperture(5),
             noise_variance=0.0,
         )

@@ -178,10 +178,8 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
     """
     alone, noise = from_slices(
         taken.values,
-        taken.orders,
+        taken.angular,
         taken.transfers,
-        kappa_cycles=taken.kappa_cycles,
-        rotation_rad=taken.rotation_rad,
         aperture=taken.aperture,
         noise_variance=taken.noise_variance,
         colours=taken.colours,

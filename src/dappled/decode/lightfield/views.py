@@ -19,8 +19,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer
-from dappled.decode.optics import Carrier, Order
+from dappled.decode.lightfield.aperture import Aperture, transfer
+from dappled.decode.optics import Carrier
 
 Views = NDArray[np.float32]
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
@@ -118,11 +118,9 @@ def combine(coefficients: NDArray[np.complex128], slices: NDArray[np.complex64])
 
 def from_slices(
     slices: NDArray[np.complex64],
-    orders: Sequence[Order],
+    angular: NDArray[np.float64],
     transfers: NDArray[np.complex128],
     *,
-    kappa_cycles: float,
-    rotation_rad: float,
     aperture: Aperture,
     noise_variance: float,
     model_error: float | None = None,
@@ -130,13 +128,13 @@ def from_slices(
 ) -> tuple[Views, NDArray[np.float64]]:
     """(views float32 (V, U, h, w), variance float64 (V, U) that the noise leaves in them) of a masked frame.
 
-    `slices` complex64 (K, h, w) with DC first and no carrier together with its conjugate; `transfers` (K,) their T_k
-    (T_0 = 1); `noise_variance` of a slice pixel; `model_error` the relative error of what all views share, in a
-    coefficient (None: what the frame's end rings). With `colours` the frame was a colour mosaic: the chroma in a band
-    is estimated from its finest detail and counts as noise; where the orders carry no information, the views are the
-    image that they share. The variance is of white noise and chroma, and of what a view lacks of its own.
+    `slices` complex64 (K, h, w) with DC first and no carrier together with its conjugate; `angular` (K, 2) their
+    angular frequencies, `transfers` (K,) their T_k (T_0 = 1); `noise_variance` of a slice pixel; `model_error` the
+    relative error of what all views share, in a coefficient (None: what the frame's end rings). With `colours` the
+    frame was a colour mosaic: the chroma in a band is estimated from its finest detail and counts as noise; where the
+    orders carry no information, the views are the image that they share. The variance is of white noise and chroma, and
+    of what a view lacks of its own.
     """
-    angular = angular_frequencies(orders, kappa_cycles, rotation_rad)
     if model_error is None:
         model_error = _MODEL_ERROR / math.sqrt(min(slices.shape[1:]))
     # What all views share comes through a carrier with the aperture's transform of it, and its error with that.
