@@ -60,6 +60,7 @@ SUBSTITUTES = {
 """What a real camera, card or day would have made, and what stands for it here."""
 
 ELSEWHERE = {
+    " --panel": "tests/cli/test_panel.py",
     "calibrate --kit": "tests/cli/calibrate/test_kit.py",  # frames behind two printed masks
     "calibrate --lens": "tests/products/test_chessboard.py",  # pictures of a chessboard
     "--camera my-450d.toml": "tests/products/test_chessboard.py",  # what comes of them
