@@ -106,6 +106,7 @@ def test_clipped_pixels_are_left_out_and_not_trusted() -> None:
     assert (
         np.abs(found.shadow.at(next(MosaicPlane(shot.frame, GREY).places())) - shot.shadow).std() < 0.025
     )  # 0.32 of it is shadow
+    assert found.shadow.sigma[0] > 0.02  # which is told
     assert not found.trusted[~valid].any()
     assert psnr(np.where(valid, found.plane, shot.truth), shot.truth) > 40
 

@@ -411,6 +411,7 @@ class _Equations:
     energy: Floats
     count: Floats
     odd: NDArray[np.bool_]
+    sound: float  # share of the samples that aren't left out
 
     @classmethod
     def of(cls, means: _Means, lattice: Lattice, orders: tuple[Order, ...], like: Lattice | None = None) -> _Equations:
@@ -456,7 +457,8 @@ class _Equations:
         y, x = np.meshgrid(*middles, indexing="ij")
         odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
         centres = np.column_stack([y.ravel(), x.ravel()])
-        return cls(mosaic.shape, lattice, like or lattice, orders, centres, whole, right, energy, count, odd)
+        sound = float(np.mean([1 if good is None else good.mean() for _, _, good in means.means]))
+        return cls(mosaic.shape, lattice, like or lattice, orders, centres, whole, right, energy, count, odd, sound)
 
     def moved(self, lattice: Lattice) -> _Equations:
         """About the same at a lattice so near that waves turn little within a block."""
@@ -562,7 +564,8 @@ class _Equations:
             image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
             scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
             errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
-            spread.append((np.abs(errors) ** 2).sum(axis=0)[half])
+            # Where pixels are clipped dark places alone are left, which err alike.
+            spread.append((np.abs(errors) ** 2).sum(axis=0)[half] / max(self.sound, _LEAST) ** 2)
             found.append(c[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
         return _Fit(degree, np.array(found), np.array(spread), self.held_out(degree))
 
