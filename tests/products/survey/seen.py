@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,13 @@ def eyes(places: Sequence[tuple[float, float]], tilt_deg: float = 1.0) -> list[E
         one = eye_at(height_m=HEIGHT_M, tilt_deg=(tilt_deg, -tilt_deg * (number % 2), 0.0))
         made.append(replace(one, centre=one.centre + np.array([east, north, 0.0])))
     return made
+
+
+def folder(parent: Path) -> str:
+    """A flight's folder with nothing in it but an empty ledger."""
+    (parent / "flight").mkdir()
+    (parent / "flight" / "flight.sqlite").touch()
+    return str(parent / "flight")
 
 
 def flown(

@@ -92,7 +92,7 @@ def test_a_flight_is_swept_from_the_command_line(
     flight = seen.flown(PLACES)
     monkeypatch.setattr(Refining, "placed", lambda *_, **__: flight)
     out = tmp_path / "swept.tif"
-    assert main(["depth", "--flight", ".", "--together", "--cell", "0.2", "-o", str(out), "--json"]) == 0
+    assert main(["depth", "--flight", seen.folder(tmp_path), "--together", "--cell", "0.2", "-o", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     with rasterio.open(out) as read:
         height, sigma = read.read()

@@ -107,16 +107,17 @@ def test_planes_are_cut_to_common_ground() -> None:
 
 
 @pytest.fixture
-def placed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command line finds frames of the ground by rays, in place of a flight's."""
+def placed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
+    """A flight of which the command line finds frames of the ground by rays, in place of its own."""
     flight = seen.flown(LINE[:3])
     monkeypatch.setattr(Refining, "placed", lambda *_, **__: flight)
+    return seen.folder(tmp_path)
 
 
 def test_a_flight_is_refocused_from_the_command_line(
-    placed: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    placed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["refocus", "--flight", ".", "--cell", "0.1"]
+    words = ["refocus", "--flight", placed, "--cell", "0.1"]
     assert main([*words, "--combine", "median", "-o", str(tmp_path / "ground.tif"), "--json"]) == 0
     (plane,) = json.loads(capsys.readouterr().out)["planes"]
     assert plane["aperture_m"] == pytest.approx(1.0, abs=0.01)
@@ -131,14 +132,14 @@ def test_a_flight_is_refocused_from_the_command_line(
 
 
 def test_two_frames_are_a_stereo_pair_from_the_command_line(
-    placed: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    placed: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "pair.png"
-    assert main(["refocus", "--flight", ".", "--eyes", "anaglyph", "-o", str(out)]) == 0
+    assert main(["refocus", "--flight", placed, "--eyes", "anaglyph", "-o", str(out)]) == 0
     assert "m apart, 3% of the distance" in capsys.readouterr().out
     with Image.open(out) as picture:
         assert picture.mode == "RGB"
-    assert main(["refocus", "--flight", ".", "--eyes", "anaglyph", "--height", "1", "-o", str(tmp_path / "b.png")]) == 2
+    assert main(["refocus", "--flight", placed, "--eyes", "anaglyph", "--height", "1", "-o", str(tmp_path / "b.png")]) == 2
     assert "leave --height and --combine out" in capsys.readouterr().err
 
 
@@ -146,8 +147,8 @@ def test_two_frames_are_a_stereo_pair_from_the_command_line(
     ("more", "said"),
     [
         (["-o", "x.png"], "name a decoded light field, or a flight with --flight"),
-        (["--flight", ".", "--alpha", "1", "-o", "x.png"], "--alpha is of a light field"),
-        (["--flight", ".", "--height", "0", "1", "-o", "x.tif"], "x.tif holds one height"),
+        (["--flight", placed, "--alpha", "1", "-o", "x.png"], "--alpha is of a light field"),
+        (["--flight", placed, "--height", "0", "1", "-o", "x.tif"], "x.tif holds one height"),
         ([".", "--height", "2", "-o", "x.png"], "--height goes with --flight FLIGHT and no light field"),
     ],
 )

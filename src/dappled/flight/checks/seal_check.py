@@ -64,7 +64,7 @@ def compare(
     notes += [
         finding(Code.SEAL_BY_OWNER, SEAL, seal=number, key=seal.key)
         for number, seal in file.seals.items()
-        if seal.why is seals.Occasion.OWNER
+        if seal.why == seals.Occasion.OWNER
     ]
     notes += [found for event in ledger.events() if event.kind == seals.CHANGED and (found := event.finding)]
     last = file.last
@@ -72,7 +72,7 @@ def compare(
         return SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), tuple(problems), tuple(notes))
     unsealed = max(0, len(links) - last.links)
     if unsealed:
-        notes.append(finding(Code.SEAL_UNSEALED, SEAL, seal=last.seal, work=last.why.value, links=unsealed))
+        notes.append(finding(Code.SEAL_UNSEALED, SEAL, seal=last.seal, work=last.why, links=unsealed))
     for wrong, found in _files(folder, last, _vouched_by_ledger(ledger, facts), unsealed=unsealed > 0):
         (problems if wrong else notes).append(replace(found, level=Level.STOP if wrong else Level.NOTE))
     if not unsealed:
