@@ -120,7 +120,7 @@ def test_the_operator_s_page_is_rehearsed_from_the_settings_to_the_copy(
     link = f"udpin:127.0.0.1:{free_port()}"
     step(["init", "--camera", "canon-eos-450d", "--mask", "mask-2", "--link", link])
     assert "dappled.toml: good" in step(steps("3.")["config check"])
-    (made,) = re.findall(r"`python -m (dappled\.mocks\.shoot .*)`", OPERATING)
+    (made,) = re.findall(r"`python -m (dappled\.mocks\.shoot [^`]*)`", OPERATING)
     subprocess.run([sys.executable, "-m", *made.split()], cwd=tmp_path, check=True, timeout=120)
     calibrate = [word.replace(".cr2", ".dng") for word in steps("4.")["calibrate"]]
     assert "written to calibration.toml" in step(calibrate)
