@@ -118,7 +118,8 @@ def seal(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None 
                 or (path.stat().st_size, durable.hash_file(path))
                 for path in sealed_paths(folder)
             }
-            values = (count, of_flight(facts), clock.utc_ns(), why.value, head.number, head.link, files, _last_digest(before))
+            chain = (head.number, head.link, files, _last_digest(before))
+            values = (count, of_flight(facts), clock.utc_ns(), why.value, *chain)
             made = Seal(*values, key=None if key is None else key.name)
             if key is not None:
                 made = Seal(*values, key=key.name, mac=key.sign(made.signed_part()))

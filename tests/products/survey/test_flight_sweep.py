@@ -91,8 +91,8 @@ def test_a_flight_is_swept_from_the_command_line(
     """Frames of the ground by rays stand for a flight's."""
     flight = seen.flown(PLACES)
     monkeypatch.setattr(Refining, "placed", lambda *_, **__: flight)
-    out = tmp_path / "swept.tif"
-    assert main(["depth", "--flight", seen.folder(tmp_path), "--together", "--cell", "0.2", "-o", str(out), "--json"]) == 0
+    out, flown = tmp_path / "swept.tif", seen.folder(tmp_path)
+    assert main(["depth", "--flight", flown, "--together", "--cell", "0.2", "-o", str(out), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     with rasterio.open(out) as read:
         height, sigma = read.read()

@@ -139,7 +139,8 @@ def test_two_frames_are_a_stereo_pair_from_the_command_line(
     assert "m apart, 3% of the distance" in capsys.readouterr().out
     with Image.open(out) as picture:
         assert picture.mode == "RGB"
-    assert main(["refocus", "--flight", placed, "--eyes", "anaglyph", "--height", "1", "-o", str(tmp_path / "b.png")]) == 2
+    words = ["refocus", "--flight", placed, "--eyes", "anaglyph", "--height", "1", "-o", str(tmp_path / "b.png")]
+    assert main(words) == 2
     assert "leave --height and --combine out" in capsys.readouterr().err
 
 
@@ -147,8 +148,8 @@ def test_two_frames_are_a_stereo_pair_from_the_command_line(
     ("more", "said"),
     [
         (["-o", "x.png"], "name a decoded light field, or a flight with --flight"),
-        (["--flight", placed, "--alpha", "1", "-o", "x.png"], "--alpha is of a light field"),
-        (["--flight", placed, "--height", "0", "1", "-o", "x.tif"], "x.tif holds one height"),
+        (["--flight", ".", "--alpha", "1", "-o", "x.png"], "--alpha is of a light field"),
+        (["--flight", ".", "--height", "0", "1", "-o", "x.tif"], "x.tif holds one height"),
         ([".", "--height", "2", "-o", "x.png"], "--height goes with --flight FLIGHT and no light field"),
     ],
 )
