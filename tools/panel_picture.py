@@ -25,10 +25,10 @@ from dappled.mocks.scene import dng
 from dappled.mocks.scene.masked_camera import MAKE, MODEL
 from dappled.mocks.scene.ray_camera import REAL_COLOURS, RayCamera
 from dappled.mocks.scene.sharp_boards import SharpBoard
+from dappled.products.handover.reflectance import STEPS
 
 SHAPE = (288, 384)  # of a frame, pixels
 F_NUMBER, EXPOSURE_S, OF_WHITE = 16.0, 1 / 500, 0.3  # what a reflectance of 1 gives there
-STEPS = 32768  # of a TIFF at a reflectance of 1
 PANEL_PX, PANEL = (134, 86, 250, 202), 0.5
 GROUND = (0.24, 0.20, 0.15)
 FIELDS = (  # reflectances of red, green and blue

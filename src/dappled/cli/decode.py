@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ class DecodeFrames(Overwriting, Doubtable, Several, FramesArguments, Verb):
             self.output.mkdir(parents=True, exist_ok=True)
 
         workers = processes.worth(self.workers, len(found))
-        make = _Decoding(self, recipe if workers == 1 else replace(recipe, workers=1), single)
+        make = _Decoding(self, recipe.shared_by(workers), single)
         return each_frame(found, output, make, workers=workers, into_folder=not single, failure="could not be decoded")
 
 

@@ -98,7 +98,7 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
 
         workers = processes.worth(self.workers, len(found))
         flight = tuple(LensFrame(one, self.focal_length, self.f_number) for one in found)
-        make = _Picturing(self, recipe if workers == 1 else replace(recipe, workers=1), single, panel, flight)
+        make = _Picturing(self, recipe.shared_by(workers), single, panel, flight)
         return each_frame(found, output, make, workers=workers, into_folder=not single, failure="gave no picture")
 
     def made(

@@ -69,6 +69,10 @@ class Recipe:
     keep_law: bool = False
     decided: LawDecision | None = None
 
+    def shared_by(self, processes: int) -> Recipe:
+        """The recipe of each of so many processes: where there are several, each has one thread."""
+        return self if processes == 1 else replace(self, workers=1)
+
 
 def of_flight(flight: Path, facts: Mapping[str, Any], overrides: Mapping[str, Any]) -> Recipe | None:
     """Return the recipe that a recorded flight was decoded by, with the flight's own copies of its files.

@@ -145,9 +145,7 @@ def survey(
     if (planned := _foreseen(flight, laboratory, stations, projection, options)) is not None:
         foresee(planned)
     workers = 1 if watch is not None else processes.worth(workers, len(stations))
-    develop = _Developing(
-        flight, recipe if workers == 1 else replace(recipe, workers=1), options, projection.name, scratch, watch, files
-    )
+    develop = _Developing(flight, recipe.shared_by(workers), options, projection.name, scratch, watch, files)
     taken: list[Photograph] = []
     with closing(processes.in_order(stations, develop, workers, lost=_lost)) as made:
         for number, station in enumerate(stations):

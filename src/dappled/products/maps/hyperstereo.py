@@ -23,12 +23,12 @@ from dappled.products.maps.photographs import Photograph
 
 WINDOW = 9  # cells on a side, of a match: heights nearer to each other have their errors in common
 LEAST_OVERLAP = 0.2  # of a frame, for a pair
+FORESEEN = 0.5  # of the least overlap: where poses alone tell less, no picture will have enough
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _STEP_PX = 0.7  # of parallax between heights
 _LEAST_SCORE = 0.88  # lower scores come from edges and false matches: wrong more often than not
 _MOST_PARTNERS = 3
 _APART = "no two frames of the flight overlap by a fifth: heights need ground that was seen twice"
-_FORESEEN = 0.5  # of the least overlap: where poses alone tell less, no picture will have enough
 _BULGE = 0.05  # of a frame: its border may bend out of the box around some of its points
 
 
@@ -103,7 +103,7 @@ def _level_sigma(one: Photograph, two: Photograph, level_m: float) -> float:
 
 def check_overlap(photographs: Sequence[Photograph], level_m: float) -> None:
     """Raise HyperstereoError where the poses tell, without a picture, that no two frames will overlap enough."""
-    boxes, least = _boxes(photographs, level_m), _FORESEEN * LEAST_OVERLAP
+    boxes, least = _boxes(photographs, level_m), FORESEEN * LEAST_OVERLAP
     if not any(_partners(number, photographs, boxes, level_m, least) for number in range(len(photographs))):
         raise HyperstereoError(_APART)
 

@@ -16,11 +16,11 @@ from dappled.decode.lightfield.refocus import StereoPair
 from dappled.errors import DappledError
 from dappled.products.maps import map_grid
 from dappled.products.maps.georeference import Survey
+from dappled.products.maps.hyperstereo import FORESEEN
 from dappled.products.maps.photographs import Photograph
 
 _STEEPEST = 0.3  # baseline over distance: more is hard to look at
 _LEAST_OVERLAP = 0.3
-_FORESEEN = 0.5  # of the least overlap: where poses alone tell less, no picture will have enough
 _APART = (
     f"no two frames share {_LEAST_OVERLAP:.0%} of their ground from places far enough apart: a stereo pair needs "
     "frames that overlap"
@@ -44,7 +44,7 @@ def check(made: Survey) -> None:
     """Raise DappledError where poses alone tell that there will be no pair; `made` needs no pictures."""
     photos = made.photographs
     if not any(
-        _worth(made, one, two, _FORESEEN * _LEAST_OVERLAP)
+        _worth(made, one, two, FORESEEN * _LEAST_OVERLAP)
         for number, one in enumerate(photos)
         for two in photos[number + 1 :]
     ):
