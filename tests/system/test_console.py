@@ -337,19 +337,20 @@ def test_pictures_leave_connections_to_the_shutter(chromium: Browser, daemon: Da
     held: list[Route] = []
     let_go = False
     page.route("**/api/frames/**", lambda route: route.continue_() if let_go else held.append(route))
-    pictured = page.locator("#strip [data-frame] img")
-    for count in range(pictured.count() + 1, pictured.count() + 4):
+    indices = []
+    for _ in range(3):
         until(page, "!document.querySelector('#shoot').disabled")
         page.evaluate("document.querySelector('#outcome').textContent = ''")
         page.click("#shoot")
         until(page, "document.querySelector('#outcome').textContent.startsWith('shot ')")
-        pictured.nth(count - 1).wait_for(state="attached")
-    index = int(page.inner_text("#outcome").split()[1])
+        indices.append(int(page.inner_text("#outcome").split()[1]))
+        page.locator(f'#strip [data-frame="{indices[-1]}"] img').wait_for(state="attached")
     assert len(held) == 3, "thumbnails, the map's pictures and the views together"
     let_go = True
     for one in held:
         one.continue_()
-    until(page, f"document.querySelector('#strip [data-frame=\"{index}\"] img').naturalWidth > 0")
+    for index in indices:
+        until(page, f"document.querySelector('#strip [data-frame=\"{index}\"] img').naturalWidth > 0")
     assert watched.wrong == []
 
 
