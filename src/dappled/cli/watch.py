@@ -88,7 +88,9 @@ class WatchStream(Verb):
                 )
             asked_again = f"{subscriber.recovered} after a repeated request"
             said = f"{counted(seen.frames, 'frame')} received, {asked_again}, {subscriber.lost} lost"
-            return Report(None, [said], failed=bool(seen.short_of(self.count) or subscriber.lost))
+            if subscriber.unsent:
+                said += f"; the daemon left out {subscriber.unsent}, since it could not keep up: decode the flight"
+            return Report(None, [said], failed=bool(seen.short_of(self.count) or subscriber.lost or subscriber.unsent))
 
 
 CLASSES = {"watch": WatchStream}

@@ -97,6 +97,11 @@ def test_a_full_queue_drops_previews_before_slices_and_never_frames(endpoint: st
     assert {topic: count for topic, count in statistics.dropped.items() if count} == {"slices": 2, "preview": 1}
     assert statistics.waiting == 3
     one.start("f", no_answer)
+    with Subscriber(endpoint) as subscriber:
+        connected(one, subscriber)
+        one.publish("end", {"utc_ns": 0, "shots": {}})
+        unsent = receive(subscriber, "end").header["unsent"]
+        assert {topic: count for topic, count in unsent.items() if count} == {"slices": 2, "preview": 1}
     one.stop(0.2)
 
 

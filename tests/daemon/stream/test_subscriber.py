@@ -86,6 +86,21 @@ def test_a_header_that_claims_the_impossible_costs_no_memory() -> None:
     assert gaps.gaps == gaps.lost + gaps.waiting_for
 
 
+def test_what_the_sender_dropped_is_counted_to_its_last() -> None:
+    """The last ones stand in no slices' header, only in the `end`; what was dropped before one came is another's."""
+
+    def dropped(topic: str, header: dict[str, object]) -> Message:
+        return Message(topic, {"flight": "f", **header})
+
+    early, late = Gaps(can_ask=True, from_start=True), Gaps(can_ask=True)
+    for gaps in (early, late):
+        gaps.received(dropped("slices", {"seq": 0, "dropped": 2}))
+        gaps.received(dropped("slices", {"seq": 1, "dropped": 3}))
+        gaps.received(dropped("end", {"sent": {"slices": 2}, "unsent": {"slices": 7, "preview": 20}}))
+    assert (early.unsent, late.unsent) == (7, 5)
+    assert early.gaps == late.gaps == 0
+
+
 def test_an_end_without_a_count_is_no_gap() -> None:
     gaps = Gaps(can_ask=True)
     gaps.received(slices(0))

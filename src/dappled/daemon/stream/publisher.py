@@ -252,7 +252,7 @@ class Publisher:
     def _send(self, message: Message) -> None:
         header = self._envelope(message, self._sent[message.topic])
         if message.topic == "end":
-            header["sent"] = dict(self._sent)  # so that a subscriber can tell what it missed last
+            header["sent"], header["unsent"] = dict(self._sent), dict(self._dropped)  # what a subscriber missed last
         body = None if message.body is None else memoryview(message.body)
         patience_s = _PATIENCE_S
         if body is not None and body.nbytes >= _LARGE_BYTES:

@@ -32,8 +32,9 @@ _Steps = Generator[Any, Any, Message | None]
 class Gaps:
     """Decides which slices to ask for again; has neither a socket nor a clock. Times are seconds of any one clock.
 
-    `gaps` counts the slices that were missed, `recovered` those received by asking, `lost` those given up. Without
-    `can_ask` all missed ones are lost. With `from_start` what a flight sent before the first message counts as missed.
+    `gaps` counts the slices that were missed, `recovered` those received by asking, `lost` those given up, `unsent`
+    those that the sender dropped. Without `can_ask` all missed ones are lost. With `from_start` what a flight sent, or
+    dropped, before the first message counts too.
     """
 
     def __init__(self, *, can_ask: bool, from_start: bool = False, answer_timeout_s: float = 30.0) -> None:
@@ -41,6 +42,7 @@ class Gaps:
         self._next: dict[str, int] = {}
         self._missing: deque[_Key] = deque()
         self._asked: dict[_Key, float] = {}  # the deadline of each
+        self._dropped: dict[str, tuple[int, int]] = {}  # by flight: of its slices, at first and by now
         self.gaps = self.recovered = self.lost = 0
 
     @property
@@ -48,16 +50,24 @@ class Gaps:
         """How many answers are outstanding."""
         return len(self._asked) + len(self._missing)
 
+    @property
+    def unsent(self) -> int:
+        """How many slices the sender dropped since the first message."""
+        return sum(now - first for first, now in self._dropped.values())
+
     def received(self, message: Message) -> None:
         """Take note of a message of the stream."""
         header = message.header
         flight, seq = str(header.get("flight", "")), header.get("seq")
         if message.topic == "slices" and isinstance(seq, int):
-            until, after = seq, seq + 1
-        elif message.topic == "end" and isinstance(sent := _sent(header), int):
-            until = after = sent
+            until, after, dropped = seq, seq + 1, header.get("dropped")
+        elif message.topic == "end" and isinstance(sent := _slices_of(header, "sent"), int):
+            until, after, dropped = sent, sent, _slices_of(header, "unsent")
         else:
             return
+        if isinstance(dropped, int):
+            first_dropped, before = self._dropped.get(flight, (0 if self._from_start else dropped, 0))
+            self._dropped[flight] = (first_dropped, max(dropped, before))
         first = self._next.get(flight, 0 if self._from_start else until)
         missed = max(0, until - first)
         wanted = min(missed, MOST_MISSING) if self._can_ask else 0
@@ -152,6 +162,11 @@ class _SubscriberCore:
     def lost(self) -> int:
         """Missed slices that were given up."""
         return self._gaps.lost
+
+    @property
+    def unsent(self) -> int:
+        """Slices that the sender dropped: no message holds them, the flight does."""
+        return self._gaps.unsent
 
     @property
     def waiting_for(self) -> int:
@@ -351,10 +366,10 @@ def subscribe(
     return Subscription(endpoint, ask, topics=topics, from_start=from_start, idle_s=idle_s, keys=pair)
 
 
-def _sent(header: Mapping[str, Any]) -> Any:
-    """How many slices a flight sent, by its `end`."""
-    sent = header.get("sent")
-    return sent.get("slices", 0) if isinstance(sent, Mapping) else None
+def _slices_of(end: Mapping[str, Any], counts: str) -> Any:
+    """How many slices a flight's `end` counts as `sent` or `unsent`."""
+    counted = end.get(counts)
+    return counted.get("slices", 0) if isinstance(counted, Mapping) else None
 
 
 def _connect(one: zmq.Socket[Any], endpoint: str, keys: ClientKeys | None) -> None:
