@@ -44,6 +44,7 @@ _ENOUGH = 0.1  # of the frame
 _SHEARED = 5e-4  # of a print on its way: longer along one axis, or at no right angle
 _STILL_BINS = 3e-3  # of a frame: a lattice so near is kept
 _LEAST = 1e-3  # of the frame's mean: darker local means tell nothing of the shadow
+_UNPULLED = 0.2  # where a few blocks make the whole fit, their scatter tells next to nothing
 _COMMON = 0.5  # of a frame's standard error: what the next one's scene doesn't cure
 _UNLIKE = 6.0  # times the mean square of their errors: what differs by more is not one shadow
 
@@ -205,10 +206,11 @@ def _of_bins(shape: tuple[int, int], bins: Floats) -> Lattice:
     return Lattice((float(a), float(b)), (float(c), float(d)))
 
 
-def no_shadow(shape: tuple[int, int], lattice: Lattice, orders: Sequence[Order], colours: int) -> Shadow:
-    """W = 1."""
-    none = np.zeros((colours, len(orders), 1), dtype=np.complex128)
-    return Shadow(shape, lattice, tuple(orders), none, 0, ShadowFrom.NONE, np.zeros(colours))
+def _no_shadow(told: ShadowEvidence) -> Shadow:
+    """W = 1, known as well as a shadow is weak that a frame doesn't show."""
+    found = told.fits[0].found
+    sigma = np.sqrt(2 * (np.abs(found[:, :, 0]) ** 2).sum(axis=1))
+    return Shadow(told.shape, told.lattice, told.orders, 0 * found, 0, ShadowFrom.NONE, sigma)
 
 
 def shadow_of(
@@ -234,7 +236,7 @@ def shadow_of(
     equations, means = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
     evidence = equations.evidence()
     own = evidence.shadow(ShadowFrom.FRAME)
-    best, gain = own or no_shadow(mosaic.shape, equations.at, equations.orders, mosaic.colours), evidence.held
+    best, gain = own or _no_shadow(evidence), evidence.held
     if own is None and beside:
         evidence = beside[0]
     same = [one for one in beside if one.unlike(evidence) < _UNLIKE]
@@ -553,6 +555,14 @@ class _Equations:
         sure = np.asarray(np.linalg.inv(self._lattice_step[1] + 1e-8 * np.eye(4)))
         return ShadowEvidence(self.shape, self.at, self.orders, sure, tuple(map(self._fitted, degrees)))
 
+    def _unpulled(self, colour: int, weights: Floats, terms: Floats) -> Floats:
+        """(blocks,) 1 − how far a block draws the fit towards itself, by which its residual is too small."""
+        sure = weights * self.gram[colour][:, 0, 0].real
+        whole = np.einsum("bi,b,bj->ij", terms, sure, terms)
+        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole)), 1e-30)
+        pull = sure * np.einsum("bi,ij,bj->b", terms, np.linalg.inv(whole), terms)
+        return np.asarray(np.maximum(1 - pull, _UNPULLED))
+
     def _fitted(self, degree: int) -> _Fit:
         """Coefficients, and their errors by the scatter between blocks."""
         half = slice(1, len(self.orders) + 1)
@@ -564,6 +574,7 @@ class _Equations:
             image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
             scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
             errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
+            errors /= self._unpulled(colour, weights, terms)[:, None, None]
             # Where pixels are clipped dark places alone are left, which err alike.
             spread.append((np.abs(errors) ** 2).sum(axis=0)[half] / max(self.sound, _LEAST) ** 2)
             found.append(c[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L

@@ -31,7 +31,7 @@ from dappled.findings import Code, Finding, Level, Subject, finding
 
 _TURNED, _SCALED = 0.03, 0.02  # radians, and of the period: how far a mask may lie from a law's prediction
 _TURNED_SINCE, _SCALED_SINCE = 0.02, 0.006  # since its calibration
-_WEAK = 2e-3  # of the mean: orders that are never stronger cast no shadow that is worth its error
+_WEAK = 2e-4  # of the mean: orders that are never stronger cast no shadow that is worth its error
 _DEEP = 0.03  # standard deviation of W: where as much is predicted at least, some must be found
 _UNCERTAIN = 0.02  # standard error of W
 _TOLD_SIGMA = 0.02  # of a predicted W: f-number and stop
