@@ -150,6 +150,22 @@ def test_shares_within_one_and_two_sigma_where_detail_ends_before_the_noise() ->
     assert 0.9 < shares[1] < 0.997
 
 
+@pytest.mark.parametrize(
+    "number",
+    [
+        150,  # grey, 0.3 px a view: blur takes the finest detail, and what is left there is noise
+        pytest.param(40, marks=pytest.mark.slow),  # staggered, in focus, SNR 54
+        pytest.param(184, marks=pytest.mark.slow),
+        pytest.param(163, marks=pytest.mark.slow),  # 3 px a view: ghosts reach into the band around the mean
+        pytest.param(23, marks=pytest.mark.slow),
+    ],
+)
+def test_blurred_detail_is_no_less_noise_and_ghosts_within_the_band_are_errors(number: int) -> None:
+    shares = judged(draw()[number]).shares
+    assert 0.5 < shares[0] < 0.85
+    assert shares[1] > 0.8
+
+
 @pytest.mark.long
 @pytest.mark.timeout(3600)
 def test_two_hundred_drawn_pictures() -> None:

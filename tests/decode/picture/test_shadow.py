@@ -111,6 +111,17 @@ def test_clipped_pixels_are_left_out_and_not_trusted() -> None:
     assert psnr(np.where(valid, found.plane, shot.truth), shot.truth) > 40
 
 
+def test_on_a_staggered_chip_what_lies_around_clipped_pixels_is_left_out_too() -> None:
+    shot = Shot(f_number=15.0, exponent=1.8)
+    there = np.add.outer(np.arange(shot.shape[0]), np.arange(shot.shape[1])) % 2 == 0
+    limit = np.float32(np.quantile(shot.frame, 0.95))
+    frame = np.where(there, np.minimum(shot.frame, limit), np.float32(0))
+    mosaic = MosaicPlane(frame, np.array([[0, EMPTY], [EMPTY, 0]]), there & (shot.frame < limit))
+    shadow = _shadow(shot, mosaic)
+    off = np.concatenate([(shadow.at(one) - shot.shadow[one.cut]).ravel() for one in mosaic.places()])
+    assert off.std() < 2.5 * shadow.sigma[0]  # five times before
+
+
 def test_each_colour_has_a_shadow_of_its_own() -> None:
     shots = [Shot(f_number=f, shape=(256, 320)) for f in (15.0, 12.0, 20.0)]
     pattern = np.array([[0, 1], [1, 2]])

@@ -37,6 +37,12 @@ class MosaicPlane:
         """How many colours there are."""
         return int(self.pattern.max()) + 1
 
+    @property
+    def there(self) -> NDArray[np.bool_]:
+        """(H, W) where the chip has samples."""
+        repeats = [-(-side // n) for side, n in zip(self.shape, self.pattern.shape, strict=True)]
+        return np.asarray(np.tile(self.pattern != EMPTY, repeats)[: self.shape[0], : self.shape[1]])
+
     def places(self) -> Iterator[PatternPlace]:
         """The samples of each place of the pattern that has any."""
         for (row, column), colour in np.ndenumerate(self.pattern):

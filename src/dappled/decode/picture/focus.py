@@ -124,15 +124,22 @@ def mixed(samples: Sequence[Sharp], pattern: NDArray[np.bool_], shadow: Shadow) 
         for n, one, number in zip(shape, found.lengths, counts, strict=True)
     ]
     step = samples[0].place.step
+    # What reaches into the band from around the carriers is kept.
+    in_band = (ghosts @ (spectra * _within_band(shadow) ** 2).mean(axis=(1, 2))).astype(np.float32)
+    wide = [
+        between(np.arange(n, dtype=np.float64) + 0.5, length, number).astype(np.float32)
+        for n, length, number in zip(shape, lengths, in_band.shape, strict=True)
+    ]
     # The band's own noise is left in any case.
     least = min(1.0, abs(float(np.linalg.det(shadow.lattice.matrix()))) / fill)
-    noise_left = share.most * np.maximum(found.noise_left, least)
+    noise_left = share.mean * np.maximum(found.noise_left, least)
     pictures, variances = [], []
     for one, band in zip(samples, bands, strict=True):
         pictures.append(band + found.kept[one.place.cut])
         down, across = smooth[0][one.place.row :: step[0]], smooth[1][one.place.column :: step[1]]
         noises, ghost = (down @ left.astype(np.float32) @ across.T for left in (noise_left, found.ghosts_left / fill))
-        variances.append(one.noise * noises + ghost)
+        inside = wide[0][one.place.row :: step[0]] @ in_band @ wide[1][one.place.column :: step[1]].T
+        variances.append(one.noise * noises + ghost + inside)
     return Mixed(pictures, variances, float(np.mean(found.ghost_share > 0.5)))
 
 
@@ -206,7 +213,7 @@ def _spectra(shadow: Shadow, pattern: NDArray[np.bool_], exponent: float) -> Sin
     does within the band, wherever the pattern of samples repeats it."""
     matrix = shadow.lattice.matrix()
     inverse, half = np.linalg.inv(matrix), 0.5 / SIDE
-    fall = max(2 - exponent, _FALL)
+    fall = float(np.clip(2 - exponent, _FALL, 0))
     fy, fx = np.meshgrid(fft.fftfreq(SIDE), fft.fftfreq(SIDE), indexing="ij")
     repeats = np.abs(fft.fft2(pattern)) ** 2
     made = np.zeros((len(shadow.orders), SIDE, SIDE))
@@ -222,6 +229,13 @@ def _spectra(shadow: Shadow, pattern: NDArray[np.bool_], exponent: float) -> Sin
                 made[index] += weight * around / around[inside].sum()
     made *= SIDE**2 / (2 * repeats.sum())
     return np.ascontiguousarray(made[:, :, : SIDE // 2 + 1], dtype=np.float32)
+
+
+def _within_band(shadow: Shadow) -> Floats:
+    """(SIDE, SIDE // 2 + 1) what `bands_of` keeps of each frequency."""
+    inverse = np.linalg.inv(shadow.lattice.matrix())
+    f = np.stack(np.meshgrid(fft.fftfreq(SIDE), fft.rfftfreq(SIDE), indexing="ij"), axis=-1)
+    return np.asarray(np.clip((_EDGE[1] - np.abs(f @ inverse)) / (_EDGE[1] - _EDGE[0]), 0, 1).prod(axis=-1))
 
 
 def _frequencies(shadow: Shadow) -> tuple[Floats, Floats, NDArray[np.intp]]:

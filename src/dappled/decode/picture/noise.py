@@ -33,6 +33,7 @@ _SIDE, _LEAST_SIDE = 48, 12  # samples of a block whose spectrum is taken, and o
 _BLOCKS = 8  # of them along a side of the picture, at most
 _LOWEST = 4  # bins: below these the window's own width shows
 _EXPONENTS = np.arange(1.6, 6.05, 0.1)  # of the power of detail
+_BLURS_PX = (0.0, 0.4, 0.6, 0.8, 1.0)  # Gaussian, of lens, pixels and focus over the stop: standard deviations
 _LIKELY = 5.0  # twice the log likelihood, of one block alone: exponents that explain a spectrum as badly are left out
 _MOST = 2.0  # times the variance that the quietest parts tell
 _POOR = 0.05  # mean square of what a power law leaves, relative: it is none, as where a ghost or blur is strong
@@ -41,10 +42,11 @@ _ROUNDS = 10  # of the least squares
 
 @dataclass(frozen=True, slots=True)
 class NoiseShare:
-    """Of what is taken for noise, the shares that are noise at least and at most, and the exponent of the likeliest
-    power law that detail falls with (power, over frequency)."""
+    """Of what is taken for noise, the shares that are noise at least, as a mean over all that is likely, and at most;
+    and the exponent of the likeliest plain power law that detail falls with (power, over frequency)."""
 
     least: float
+    mean: float
     most: float
     exponent: float
 
@@ -85,7 +87,7 @@ def noise_share(pictures: Sequence[tuple[PatternPlace, Singles]], variance: floa
     all of one step."""
     side = min(_SIDE, *(min(one.shape) for _, one in pictures))
     if side < _LEAST_SIDE or variance <= 0:
-        return NoiseShare(1.0, 1.0, float(_EXPONENTS[len(_EXPONENTS) // 4]))
+        return NoiseShare(1.0, 1.0, 1.0, float(_EXPONENTS[len(_EXPONENTS) // 4]))
     power = np.mean([_spectrum(one, side) for _, one in pictures], axis=0)
     across = fft.rfftfreq(side)
     known = np.hypot(fft.fftfreq(side)[:, None], across) > _LOWEST / side
@@ -106,9 +108,13 @@ def noise_share(pictures: Sequence[tuple[PatternPlace, Singles]], variance: floa
     made = detail[:, None] * falls + noise[:, None]
     unlikely = (twice * (seen / made + np.log(made))).sum(axis=1)
     likely = unlikely - unlikely.min() < _LIKELY
-    shares, best = np.clip(noise[likely] / variance, 0, _MOST), np.argmin(unlikely)
-    misfit = float((twice * (seen / made[best] - 1) ** 2).sum() / twice.sum())
-    return NoiseShare(float(shares.min()), float(shares.max()) if misfit < _POOR else 1.0, float(_EXPONENTS[best]))
+    shares, best = np.clip(noise / variance, 0, _MOST), int(np.argmin(unlikely))
+    exponent = float(_EXPONENTS[np.argmin(unlikely[:: len(_BLURS_PX)])])  # those of no blur
+    least, most = float(shares[likely].min()), float(shares[likely].max())
+    if float((twice * (seen / made[best] - 1) ** 2).sum() / twice.sum()) > _POOR:
+        return NoiseShare(min(least, 1.0), 1.0, 1.0, exponent)
+    odds = np.exp((unlikely[best] - unlikely) / 2)
+    return NoiseShare(least, float(shares @ odds / odds.sum()), most, exponent)
 
 
 def _spectrum(image: Singles, side: int) -> Floats:
@@ -129,14 +135,16 @@ def _spectrum(image: Singles, side: int) -> Floats:
 
 @lru_cache(maxsize=8)
 def _falls(side: int, step: tuple[int, int]) -> Floats:
-    """f^-b up to the sensor's sampling limit for each exponent, as samples `step` apart have it."""
-    total = np.zeros((len(_EXPONENTS), side, side // 2 + 1))
+    """f^-b, blurred, up to the sensor's sampling limit for each exponent and blur, as samples `step` apart have it."""
+    total = np.zeros((len(_EXPONENTS), len(_BLURS_PX), side, side // 2 + 1))
+    blurs = (2 * np.pi * np.array(_BLURS_PX)) ** 2
     for folds in itertools.product(*(range(-(one // 2) - 1, one // 2 + 2) for one in step)):
         y, x = (
             (f + fold) / one for f, fold, one in zip((fft.fftfreq(side), fft.rfftfreq(side)), folds, step, strict=True)
         )
         inside = np.outer(*(np.clip((0.5 - np.abs(one)) * 1e9 + 0.5, 0, 1) for one in (y, x)))  # half on the limit
         if inside.any():
-            logs = np.log(np.maximum(np.hypot(y[:, None], x), 1e-3))
-            total += inside * np.exp(-_EXPONENTS[:, None, None] * logs)
-    return total
+            f = np.maximum(np.hypot(y[:, None], x), 1e-3)
+            blurred = inside * np.exp(-blurs[:, None, None] * f**2)
+            total += np.exp(-_EXPONENTS[:, None, None] * np.log(f))[:, None] * blurred
+    return total.reshape(-1, side, side // 2 + 1)

@@ -20,11 +20,12 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, ndimage
+from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.optics import Lattice, Order
 from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, kept_by_mean, local_mean, wave_sums
+from dappled.decode.picture.lattice_search import searched
 
 Coefficients = NDArray[np.complex128]
 # Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
@@ -34,8 +35,6 @@ _RIDGE = 1e-6  # of the mean of the diagonal: orders that fall together on a coa
 _DEGREES = (0, 2)  # of the polynomials that are tried
 _SURE = 4.0  # log likelihood by which held-out blocks must prefer the more complicated one
 _SEARCH_SIDE = 2048  # pixels of the frame's middle that the lattice is searched in
-_STEP_BINS = 0.3  # of the search, at the outermost order
-_CLEAR = 5.5  # standard deviations of what the search finds where no carriers are
 _FOUND_BINS = 0.5  # standard error of the lattice after the search
 _DEEP = 0.2  # standard deviation of W from which on local means are taken again with the shadow known
 _KEPT = 0.02  # of a carrier in local means: from which on it counts that it is missing beside them
@@ -268,7 +267,7 @@ def _equations_of(
     half = tuple(order for order in orders if order != (0, 0))
     mosaic = _unclipped(mosaic, period_of(lattice))
     means = _Means.of(mosaic, period_of(lattice))
-    found = _searched(means, lattice, half, turned=turned, scaled=scaled)
+    found = searched(means.quotient(), lattice, half, turned=turned, scaled=scaled)
     equations = _Equations.of(means, found, half)
     for _ in range(_STEPS):
         if (finer := equations.lattice()) is None:
@@ -302,8 +301,9 @@ def _unclipped(mosaic: MosaicPlane, period: float) -> MosaicPlane:
     of the mask makes them, only those of dark places of the scene are not clipped."""
     if mosaic.valid is None:
         return mosaic
-    sound = ndimage.minimum_filter(mosaic.valid, 2 * math.ceil(period / 2) + 1)
-    return replace(mosaic, valid=sound) if float(sound.mean()) > _ENOUGH else mosaic
+    here = mosaic.there
+    sound = ndimage.minimum_filter(mosaic.valid | ~here, 2 * math.ceil(period / 2) + 1) & here
+    return replace(mosaic, valid=sound) if float(sound.sum()) > _ENOUGH * float(here.sum()) else mosaic
 
 
 def _powers(degree: int) -> list[tuple[int, int]]:
@@ -356,46 +356,15 @@ class _Means:
     def floor(self) -> float:
         return _LEAST * max(float(np.mean([mean[::7, ::7].mean() for _, mean, _ in self.means])), 1e-9)
 
-    def quotient(self) -> tuple[Singles, tuple[int, int]]:
-        """(frame − local mean) / local mean in the frame's middle, and where that begins."""
+    def quotient(self) -> Singles:
+        """(frame − local mean) / local mean in the frame's middle."""
         shape, floor = self.mosaic.shape, self.floor()
         made = np.zeros(shape, dtype=np.float32)
         for place, mean, good in self.means:
             part = self.mosaic.plane[place.cut] / np.maximum(mean, floor) - 1
             made[place.cut] = np.clip(part if good is None else part * good, -2, 4)
         start = [max(0, (side - _SEARCH_SIDE) // 2) for side in shape]
-        return made[start[0] : start[0] + _SEARCH_SIDE, start[1] : start[1] + _SEARCH_SIDE], (start[0], start[1])
-
-
-def _searched(means: _Means, lattice: Lattice, orders: Sequence[Order], *, turned: float, scaled: float) -> Lattice:
-    """The lattice, turned and scaled, at which the spectrum of frame over local mean has its peaks; the given one where
-    it has none."""
-    if not (turned or scaled):
-        return lattice
-    part, _ = means.quotient()
-    part = part * np.outer(np.hanning(part.shape[0]), np.hanning(part.shape[1])).astype(np.float32)
-    size = [fft.next_fast_len(side, real=True) for side in part.shape]
-    power = np.abs(fft.rfft2(part, s=size)) ** 2
-    there = np.asarray(orders, dtype=np.float64) @ lattice.matrix()
-    largest = float(np.hypot(*(there * part.shape).T).max())
-    counts = [math.ceil(reach * largest / _STEP_BINS) for reach in (scaled, turned)]
-    scales, turns = (np.linspace(-reach, reach, 2 * n + 1) for reach, n in zip((scaled, turned), counts, strict=True))
-    scores = np.zeros((len(scales), len(turns)))
-    for fy, fx in there:
-        y = (1 + scales[:, None]) * (np.cos(turns) * fy - np.sin(turns) * fx)
-        x = (1 + scales[:, None]) * (np.sin(turns) * fy + np.cos(turns) * fx)
-        flip = np.where(x - np.round(x) < 0, -1, 1)  # a real frame: the other half is conjugate
-        rows = np.round(flip * y * size[0]).astype(np.intp) % size[0]
-        columns = np.minimum(np.round(np.abs(x - np.round(x)) * size[1]).astype(np.intp), power.shape[1] - 1)
-        near = power[rows, columns]
-        scores += np.log1p(near / max(float(np.median(near)) / math.log(2), 1e-12))
-    middle, scatter = 0.596 * len(there), 0.62 * math.sqrt(len(there))  # of log(1 + an exponential variable)
-    at = np.unravel_index(int(np.argmax(scores)), scores.shape)
-    if scores[at] < middle + _CLEAR * scatter:
-        return lattice
-    turn, scale = turns[at[1]], 1 + scales[at[0]]
-    (a, b), (c, d) = scale * np.asarray(lattice.rotated(float(turn)).matrix())
-    return Lattice((float(a), float(b)), (float(c), float(d)))
+        return made[start[0] : start[0] + _SEARCH_SIDE, start[1] : start[1] + _SEARCH_SIDE]
 
 
 @dataclass(frozen=True, eq=False)
