@@ -69,7 +69,8 @@ class DecodeFrames(Overwriting, Doubtable, Several, FramesArguments, Verb):
 
         workers = processes.worth(self.workers, len(found))
         make = _Decoding(self, recipe.shared_by(workers), single)
-        return each_frame(found, output, make, workers=workers, into_folder=not single, failure="could not be decoded")
+        with processes.Crew(workers) as crew:
+            return each_frame(found, output, make, crew=crew, into_folder=not single, failure="could not be decoded")
 
 
 @dataclass(frozen=True)

@@ -164,17 +164,17 @@ def each_frame(
     output: Output,
     make: Callable[[Path], FrameMade],
     *,
-    workers: int,
+    crew: processes.Crew,
     into_folder: bool,
     failure: str,
 ) -> Report:
-    """Make something of each frame, in so many processes: one that fails is told, and the others go on.
+    """Make something of each frame, in the processes of a crew: one that fails is told, and the others go on.
 
     `failure` says what became of the frames that failed. Raises the DappledError of a frame that goes to no folder.
     """
     bad = 0
     found: dict[Path, Sequence[Finding]] = {}
-    answers = processes.in_order(frames, partial(_tried, make) if into_folder else make, workers, lost=_lost)
+    answers = crew.in_order(frames, partial(_tried, make) if into_folder else make, _lost)
     with closing(answers):
         for frame, made in zip(output.each(frames), answers, strict=True):
             if isinstance(made, FrameMade):

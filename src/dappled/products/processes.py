@@ -8,11 +8,11 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Generic, TypeVar
+from typing import Any, Self, TypeVar
 
 from dappled.shown import guard_output
 
@@ -29,9 +29,10 @@ Answer = TypeVar("Answer")
 
 
 @dataclass(slots=True)
-class _Worker(Generic[Job]):
+class _Worker:
     process: BaseProcess
     channel: Connection
+    make: Callable[[Any], Any] | None = None  # what it does with its jobs
     number: int | None = None  # of its job
     until_s: float = 0.0  # when that is overdue
 
@@ -41,95 +42,116 @@ def worth(asked: int, jobs: int) -> int:
     return max(1, min(asked, jobs // _WORTH))
 
 
-def in_order(
-    jobs: Sequence[Job], make: Callable[[Job], Answer], workers: int, *, lost: Callable[[Job, str], Answer]
-) -> Generator[Answer]:
-    """The answers in the order of the jobs, from so many processes, or from this one where that is one."""
-    yield from map(make, jobs) if workers == 1 else in_processes(jobs, make, workers, lost=lost, ordered=True)
+class Crew:
+    """So many processes with one thread each, for one piece of work after the other. Use as a context manager.
 
-
-def in_processes(
-    jobs: Sequence[Job],
-    make: Callable[[Job], Answer],
-    workers: int,
-    *,
-    lost: Callable[[Job, str], Answer],
-    ordered: bool = False,
-    job_s: float = JOB_S,
-    now_s: Callable[[], float] = time.monotonic,
-) -> Iterator[Answer]:
-    """Run jobs in a number of processes with one thread each, and yield their answers: as they are ready, or `ordered`
-    as the jobs are. `make`, which is sent to each process once, must not raise.
-
-    A process that dies, or does not answer for `job_s`, is replaced, and its job run again, three times in all; what is
-    `lost` then gets a sentence's end that says why.
+    Processes are started when there are jobs for them. `make`, which is sent to each of them once, must not raise. One
+    that dies, or does not answer for `job_s`, is replaced, and its job run again, three times in all; what is `lost`
+    then gets a sentence's end that says why.
     """
-    waiting = deque(range(len(jobs)))
-    deaths: dict[int, int] = {}
-    early: dict[int, Answer] = {}
-    due = 0
-    crew: list[_Worker[Job]] = []
-    try:
-        while waiting or any(worker.number is not None for worker in crew):
-            while waiting and len(crew) < workers:
-                crew.append(_hired(make))
-            for worker in crew:
-                if worker.number is None and waiting:
-                    worker.number, worker.until_s = waiting.popleft(), now_s() + job_s
-                    _hand(worker, jobs[worker.number])
-            busy = [w for w in crew if w.number is not None]
-            ready = wait([w.channel for w in busy], max(0.0, min(w.until_s for w in busy) - now_s()))
-            for worker in [w for w in busy if w.channel in ready or now_s() >= w.until_s]:
-                number = worker.number
-                assert number is not None
-                answer: Answer
-                try:
-                    answer = _answer(worker)
-                except (EOFError, OSError):
-                    crew.remove(worker)
-                    _dismiss(worker)
-                    deaths[number] = deaths.get(number, 0) + 1
-                    if deaths[number] < ATTEMPTS:
-                        waiting.appendleft(number)
-                        continue
-                    answer = lost(jobs[number], f"ended or held up {ATTEMPTS} workers: out of memory, or damaged?")
-                worker.number = None
-                early[number] = answer
-                if not ordered:
-                    yield early.pop(number)
-                while ordered and due in early:
-                    yield early.pop(due)
-                    due += 1
-    finally:
-        for worker in crew:
+
+    def __init__(self, workers: int, *, job_s: float = JOB_S, now_s: Callable[[], float] = time.monotonic) -> None:
+        self.workers = workers
+        self._job_s, self._now_s = job_s, now_s
+        self._crew: list[_Worker] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for worker in self._crew:
             _dismiss(worker)
 
+    def in_order(
+        self, jobs: Sequence[Job], make: Callable[[Job], Answer], lost: Callable[[Job, str], Answer]
+    ) -> Generator[Answer]:
+        """The answers in the order of the jobs; of one worker's jobs, from this process."""
+        if self.workers == 1:
+            yield from map(make, jobs)
+            return
+        early: dict[int, Answer] = {}
+        due = 0
+        with closing(self._numbered(jobs, make, lost)) as answers:
+            for number, answer in answers:
+                early[number] = answer
+                while due in early:
+                    yield early.pop(due)
+                    due += 1
 
-def _hired(make: Callable[[Job], Answer]) -> _Worker[Job]:
+    def as_ready(
+        self, jobs: Sequence[Job], make: Callable[[Job], Answer], lost: Callable[[Job, str], Answer]
+    ) -> Generator[Answer]:
+        """The answers in the order in which they are ready, all from other processes."""
+        with closing(self._numbered(jobs, make, lost)) as answers:
+            for _, answer in answers:
+                yield answer
+
+    def _numbered(
+        self, jobs: Sequence[Job], make: Callable[[Job], Answer], lost: Callable[[Job, str], Answer]
+    ) -> Generator[tuple[int, Answer]]:
+        waiting = deque(range(len(jobs)))
+        deaths: dict[int, int] = {}
+        crew = self._crew
+        try:
+            while waiting or any(worker.number is not None for worker in crew):
+                idle = sum(worker.number is None for worker in crew)
+                while len(waiting) > idle and len(crew) < self.workers:
+                    crew.append(_hired())
+                    idle += 1
+                for worker in crew:
+                    if worker.number is None and waiting:
+                        worker.number, worker.until_s = waiting.popleft(), self._now_s() + self._job_s
+                        _hand(worker, make, jobs[worker.number])
+                busy = [w for w in crew if w.number is not None]
+                ready = wait([w.channel for w in busy], max(0.0, min(w.until_s for w in busy) - self._now_s()))
+                for worker in [w for w in busy if w.channel in ready or self._now_s() >= w.until_s]:
+                    number = worker.number
+                    assert number is not None
+                    answer: Answer
+                    try:
+                        answer = _answer(worker)
+                    except (EOFError, OSError):
+                        crew.remove(worker)
+                        _dismiss(worker)
+                        deaths[number] = deaths.get(number, 0) + 1
+                        if deaths[number] < ATTEMPTS:
+                            waiting.appendleft(number)
+                            continue
+                        answer = lost(jobs[number], f"ended or held up {ATTEMPTS} workers: out of memory, or damaged?")
+                    worker.number = None
+                    yield number, answer
+        finally:
+            for worker in [one for one in crew if one.number is not None]:  # what was asked is wanted no more
+                crew.remove(worker)
+                _dismiss(worker)
+
+
+def _hired() -> _Worker:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
-    process = context.Process(target=_work, args=(there, make), daemon=True)
+    process = context.Process(target=_work, args=(there,), daemon=True)
     with _environment(_ENVIRONMENT):
         process.start()
     there.close()
     return _Worker(process, here)
 
 
-def _hand(worker: _Worker[Job], job: Job) -> None:
+def _hand(worker: _Worker, make: Callable[[Job], Answer], job: Job) -> None:
     try:
-        worker.channel.send(job)
+        worker.channel.send((None if worker.make is make else make, job))
     except OSError:
         return  # it died at once: reading from it will raise
+    worker.make = make
 
 
-def _answer(worker: _Worker[Job]) -> Any:
+def _answer(worker: _Worker) -> Any:
     """Read a worker's answer. Raises EOFError or OSError where it will never answer."""
     if not worker.channel.poll():
         raise TimeoutError("overdue")
     return worker.channel.recv()
 
 
-def _dismiss(worker: _Worker[Job]) -> None:
+def _dismiss(worker: _Worker) -> None:
     worker.channel.close()
     worker.process.terminate()
     worker.process.join(5.0)
@@ -138,16 +160,20 @@ def _dismiss(worker: _Worker[Job]) -> None:
         worker.process.join()
 
 
-def _work(channel: Connection, make: Callable[[Job], Answer]) -> None:
-    """Run in a worker: read a job, send its result, until the pipe is closed."""
+def _work(channel: Connection) -> None:
+    """Run in a worker: read a job, and what is made of it where that is new, send its result, until the pipe is
+    closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that hands out the jobs
     guard_output()
     single_threaded()
+    make: Callable[[Any], Any] | None = None
     while True:
         try:
-            job: Job = channel.recv()
+            new, job = channel.recv()
         except (EOFError, OSError):
             return
+        make = new or make
+        assert make is not None
         channel.send(make(job))
 
 

@@ -27,7 +27,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.geometry import camera_pose
 from dappled.decode.lightfield import LightField
 from dappled.decode.picture.picture import UnmaskedPicture
-from dappled.drivers.raw.picture_maker import LensFrame, MadePicture, PictureMaker
+from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker, ToldShadow
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Finding, finding, text
 from dappled.flight import Result, flight_report, layout, recording
@@ -275,7 +275,7 @@ class PlainMaker(PictureMaker):
         *,
         focal_length_mm: float | None = None,
         f_number: float | None = None,
-        others: Sequence[LensFrame] = (),
+        told: Sequence[ToldShadow] = (),
     ) -> MadePicture:
         self.asked.append((Path(path).name, focal_length_mm, f_number))
         plane = np.full((40, 60), 0.25, np.float32)

@@ -48,7 +48,7 @@ def shadow_in(shot: Drawn, beside: Sequence[ShadowEvidence] = ()) -> tuple[Mosai
 
 def _told(shots: Sequence[Drawn]) -> list[ShadowEvidence]:
     found = [told_by(*_masked(shot), turned=0.03, scaled=0.02) for shot in shots]
-    return [one for one in found if one is not None]
+    return [one.evidence for one in found if one.seen]
 
 
 def judged(shot: Drawn, beside: Sequence[ShadowEvidence] = ()) -> Judged:

@@ -23,6 +23,8 @@ from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
 from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
+from dappled.decode.picture import shadow
+from dappled.decode.picture.blocks import MosaicPlane
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
@@ -93,7 +95,8 @@ def test_a_flight_becomes_maps(
     assert main(words(short_flight, tmp_path, *more)) == 0
     said = capsys.readouterr().out
     assert f"{len(names)} frame{'s' if several else ''} on EPSG:32615" in said
-    stretches = "develop", *(("find features", "match neighbours") if several else ()), "draw maps"
+    more_stretches = ("find features", "match neighbours") if several else ()
+    stretches = "measure the mask's shadow", "develop", *more_stretches, "draw maps"
     assert tuple(dict.fromkeys(what for what, _, _ in steps)) == stretches  # no stretch of the work is silent
     assert {(what, 0, total) for what, _, total in steps} <= set(steps)
     assert [done for what, done, _ in steps if what == "develop"] == list(range(len(names) + 1))
@@ -320,6 +323,26 @@ def test_heights_are_refused_before_the_frames_are_made_for_other_maps(
     assert main([*given, "--camera", CAMERA, "--mask", MASK, "--as", "footprints", "terrain"]) == 1
     assert len(said) == 2
     assert "no two frames of the flight overlap by a fifth" in said[0]
+
+
+@pytest.mark.slow
+def test_a_flight_s_shadow_is_measured_once_in_each_frame(
+    short_flight: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is taken from all frames together."""
+    measured = []
+    measure = shadow._equations_of
+
+    def counted(mosaic: MosaicPlane, *where: Any, **reach: float) -> Any:
+        measured.append(mosaic.shape)
+        return measure(mosaic, *where, **reach)
+
+    monkeypatch.setattr(shadow, "_equations_of", counted)
+    output = tmp_path / "maps"
+    main(words(short_flight, output, "--as", "cog", "--gsd", "0.1", "--workers", "1"))
+    frames = json.loads((output / "report.json").read_text())["frames"]
+    assert len(frames) > 1
+    assert len(measured) == len(frames)
 
 
 @pytest.mark.long

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +25,11 @@ from dappled.errors import counted
 if not words_only:
     from dappled.cli.picture import places
     from dappled.drivers.raw.darkroom import Recipe
-    from dappled.drivers.raw.picture_maker import LensFrame, MadePicture, PictureMaker, beside
+    from dappled.drivers.raw.picture_maker import LensFrame, MadePicture, PictureMaker, ToldShadow, beside
     from dappled.products import processes
     from dappled.products.handover import picture_files, reflectance
     from dappled.products.handover.reflectance import ReflectancePanel, ReflectancePicture
+    from dappled.products.maps.laboratory import ShadowAsked, laboratory, shadows
 
 _PANEL = "reflectance"
 
@@ -97,9 +99,15 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
             durable.make_folder(self.output)
 
         workers = processes.worth(self.workers, len(found))
-        flight = tuple(LensFrame(one, self.focal_length, self.f_number) for one in found)
-        make = _Picturing(self, recipe.shared_by(workers), single, panel, flight)
-        return each_frame(found, output, make, workers=workers, into_folder=not single, failure="gave no picture")
+        recipe = recipe.shared_by(workers)
+        near = beside([LensFrame(one, self.focal_length, self.f_number) for one in found])
+        asked = {one.path: [ShadowAsked(recipe, other) for other in few] for one, few in near.items()}
+        with processes.Crew(workers) as crew:
+            shown = partial(output.show, "measure the mask's shadow")
+            told = shadows((one for few in asked.values() for one in few), crew.in_order, shown)
+            each = {path: tuple(told[one] for one in few if one in told) for path, few in asked.items()}
+            make = _Picturing(self, recipe, single, panel, each)
+            return each_frame(found, output, make, crew=crew, into_folder=not single, failure="gave no picture")
 
     def made(
         self,
@@ -107,13 +115,12 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
         frame: Path,
         target: Path,
         panel: ReflectancePanel | None,
-        flight: tuple[LensFrame, ...],
+        told: Sequence[ToldShadow],
     ) -> FrameMade:
         """Make and write one picture. Raises DappledError."""
         errors, factors = target.with_suffix(".sigma.tif"), target.with_suffix(".panel.toml")
         self.refuse_existing(target, errors if self.sigma else None, None if self.panel is None else factors)
-        others = beside(LensFrame(frame, self.focal_length, self.f_number), flight)
-        made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number, others=others)
+        made = maker.picture(frame, focal_length_mm=self.focal_length, f_number=self.f_number, told=told)
         measured = reflected = None
         if self.panel is not None and self.reflectance is not None:
             measured, more = reflectance.measured(
@@ -141,18 +148,15 @@ class _Picturing:
     recipe: Recipe
     single: bool
     panel: ReflectancePanel | None
-    flight: tuple[LensFrame, ...]
-
-    @cached_property
-    def maker(self) -> PictureMaker:
-        """Its decoders, which are made once."""
-        return PictureMaker(self.recipe)
+    told: Mapping[Path, Sequence[ToldShadow]]
 
     def __call__(self, frame: Path) -> FrameMade:
         """Make and write a frame's picture. Raises DappledError."""
         asked = self.asked
         target = asked.output if self.single else asked.output / f"{frame.stem}.{asked.kind}"
-        return asked.made(self.maker, frame, target, self.panel, self.flight)
+        maker = laboratory(self.recipe).pictures
+        assert maker is not None  # it was checked
+        return asked.made(maker, frame, target, self.panel, self.told[frame])
 
 
 CLASSES = {"picture": MakePictures}

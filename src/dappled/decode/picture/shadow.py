@@ -232,32 +232,58 @@ def shadow_of(
     """
     if beside:
         lattice = _of_bins(mosaic.shape, np.median([_bins(mosaic.shape, one.lattice) for one in beside], axis=0))
-    equations, means = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
-    evidence = equations.evidence()
-    own = evidence.shadow(ShadowFrom.FRAME)
-    best, gain = own or _no_shadow(evidence), evidence.held
-    if own is None and beside:
-        evidence = beside[0]
-    same = [one for one in beside if one.unlike(evidence) < _UNLIKE]
-    others_tell = [one for one in same if one is not evidence]
-    if others_tell:
-        best = evidence.with_those(others_tell).shadow(ShadowFrom.FLIGHT) or best
-    best = replace(best, alike=len(same), unlike=len(beside) - len(same))
-    at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
-    for one in others:
-        if (where := (one.lattice, one.orders)) not in at:
-            at[where] = _Equations.of(means, *where)
-        if (told := at[where].explained(one, equations.weights) - equations.unexplained) > gain:
-            best, gain = one, told
-    return best
+    return told_by(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others).shadow(others, beside)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class OwnShadow:
+    """What a frame tells of its shadow, its `evidence`; `gains` are the log likelihoods by which each of other shadows
+    explains it better than none."""
+
+    evidence: ShadowEvidence
+    gains: tuple[float, ...]
+
+    @property
+    def seen(self) -> bool:
+        """Whether the frame shows a shadow."""
+        return self.evidence.shadow(ShadowFrom.FRAME) is not None
+
+    def shadow(self, others: Sequence[Shadow], beside: Sequence[ShadowEvidence]) -> Shadow:
+        """The best shadow, see `shadow_of`; `others` are those that the gains are of."""
+        evidence = self.evidence
+        own = evidence.shadow(ShadowFrom.FRAME)
+        best, gain = own or _no_shadow(evidence), evidence.held
+        if own is None and beside:
+            evidence = beside[0]
+        same = [one for one in beside if one.unlike(evidence) < _UNLIKE]
+        others_tell = [one for one in same if one is not evidence]
+        if others_tell:
+            best = evidence.with_those(others_tell).shadow(ShadowFrom.FLIGHT) or best
+        best = replace(best, alike=len(same), unlike=len(beside) - len(same))
+        for one, its in zip(others, self.gains, strict=True):
+            if its > gain:
+                best, gain = one, its
+        return best
 
 
 def told_by(
-    mosaic: MosaicPlane, lattice: Lattice, orders: Sequence[Order], *, turned: float = 0.0, scaled: float = 0.0
-) -> ShadowEvidence | None:
-    """What one frame tells of the shadow, see `shadow_of`; None where it shows none."""
-    made = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)[0].evidence()
-    return made if made.shadow(ShadowFrom.FRAME) else None
+    mosaic: MosaicPlane,
+    lattice: Lattice,
+    orders: Sequence[Order],
+    *,
+    turned: float = 0.0,
+    scaled: float = 0.0,
+    others: Sequence[Shadow] = (),
+) -> OwnShadow:
+    """What one frame tells of its shadow, and of `others`, see `shadow_of`."""
+    equations, means = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
+    at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
+    gains = []
+    for one in others:
+        if (where := (one.lattice, one.orders)) not in at:
+            at[where] = _Equations.of(means, *where)
+        gains.append(at[where].explained(one, equations.weights) - equations.unexplained)
+    return OwnShadow(equations.evidence(), tuple(gains))
 
 
 def _equations_of(

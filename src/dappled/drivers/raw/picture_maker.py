@@ -21,7 +21,7 @@ from dappled.decode.optics import LAWS, Lattice, Order, Sensor
 from dappled.decode.optics.visibility import OrderStrength, order_strengths
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
-from dappled.decode.picture.shadow import Shadow, ShadowEvidence, ShadowFrom, period_of, shadow_of, told_by
+from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of, shadow_of, told_by
 from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
@@ -40,6 +40,8 @@ _BESIDE = 8  # frames whose shadows are averaged
 
 _Lens = tuple[float, float | None]
 """Focal length in mm and f-number."""
+_Alike = tuple[str | None, tuple[int, int], _Lens, str]
+"""Of frames that have one shadow: camera, shape, lens, and the law that predicts it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,17 +53,28 @@ class LensFrame:
     f_number: float | None = None
 
 
-def beside(one: LensFrame | None, flight: Sequence[LensFrame]) -> tuple[LensFrame, ...]:
-    """The frames to take a frame's shadow from, too: of those in its folder with its lens and stop, a few from all over
-    the flight; the same ones for each of them, so that each is asked once."""
-    same = (
-        []
-        if one is None
-        else [
-            other for other in flight if replace(other, path=one.path) == one and other.path.parent == one.path.parent
-        ]
-    )
-    return tuple(same[int(at)] for at in np.unique(np.linspace(0, len(same) - 1, _BESIDE).round()) if same)
+def beside(flight: Sequence[LensFrame]) -> dict[LensFrame, tuple[LensFrame, ...]]:
+    """The frames to take each frame's shadow from: of those in its folder with its lens and stop, a few from all over
+    the flight; the same ones for each of them, so that each is asked once. None for a frame that is alone."""
+    alike: dict[tuple[Path, float | None, float | None], list[LensFrame]] = {}
+    for one in flight:
+        alike.setdefault((one.path.parent, one.focal_length_mm, one.f_number), []).append(one)
+    chosen: dict[LensFrame, tuple[LensFrame, ...]] = {}
+    for same in alike.values():
+        at = np.unique(np.linspace(0, len(same) - 1, _BESIDE).round())
+        few = tuple(same[int(number)] for number in at) if len(same) > 1 else ()
+        chosen |= dict.fromkeys(same, few)
+    return chosen
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToldShadow:
+    """What a frame tells of its shadow to those of the same camera, lens and stop (`alike`): a small value, which goes
+    from process to process."""
+
+    path: Path
+    alike: _Alike
+    own: OwnShadow
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,14 +91,36 @@ class MadePicture:
     findings: tuple[Finding, ...]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    path: Path
+    raw: RawFile
+    mosaic: MosaicPlane
+    decoder: MaskDecoder
+    lens: _Lens
+
+    @property
+    def alike(self) -> _Alike:
+        return self.raw.camera_model, self.mosaic.shape, self.lens, self.decoder.optics.law
+
+    @property
+    def expected(self) -> tuple[Lattice, list[Order]]:
+        """Where carriers are predicted, and which."""
+        return self.decoder.lattice_at(self.lens[0]), _orders(self.decoder, *self.lens)
+
+    @property
+    def reach(self) -> tuple[float, float]:
+        """How far the lattice is searched: a turn in radians, and a share of the period."""
+        return (_TURNED, _SCALED) if self.decoder.calibration is None else (_TURNED_SINCE, _SCALED_SINCE)
+
+
 class PictureMaker:
-    """Makes pictures of frames by one recipe; keeps the shadow of its white frame, and what frames tell of theirs."""
+    """Makes pictures of frames by one recipe; keeps the shadow of its white frame."""
 
     def __init__(self, recipe: Recipe) -> None:
         self._darkroom = Darkroom(replace(recipe, white=""))
         self._recipe = recipe
         self._white: Shadow | None = None
-        self._told: dict[tuple[Path, _Lens, str], ShadowEvidence | None] = {}
 
     def check(self) -> None:
         """Raise DappledError when the recipe names something that is missing or wrong, or lenslets."""
@@ -99,25 +134,35 @@ class PictureMaker:
         *,
         focal_length_mm: float | None = None,
         f_number: float | None = None,
-        others: Sequence[LensFrame] = (),
+        told: Sequence[ToldShadow] = (),
     ) -> MadePicture:
-        """The picture of a frame; arguments that are None are taken from its file. `others` are frames behind the same
-        mask (see `beside`), which tell more of its shadow than it does alone. Raises DappledError."""
-        raw = self._darkroom.read(path)
-        focal_length_mm, f_number = focal_length_mm or raw.focal_length_mm, f_number or raw.f_number
-        if focal_length_mm is None:
-            raise DappledError(f"{path}: its focal length is unknown: give it with --focal-length")
+        """The picture of a frame; arguments that are None are taken from its file. `told` is what frames behind the
+        same mask (see `beside`) tell of its shadow, it among them or not. Raises DappledError."""
+        frame = self._frame(LensFrame(Path(path), focal_length_mm, f_number))
+        raw, decoder, lens = frame.raw, frame.decoder, frame.lens
         with self._darkroom.naming(path):
+            shadow = self._shadow(frame, [one for one in told if one.alike == frame.alike])
+            made = picture_of(frame.mosaic, shadow, period_of(shadow.lattice))
+        found = self._findings(Subject("frame", str(path)), raw, made, decoder, lens)
+        return MadePicture(made, raw, decoder.optics.sensor, *lens, _colour_matrix(path, raw), found)
+
+    def tell(self, one: LensFrame) -> ToldShadow | None:
+        """What a frame tells of its shadow; None where it shows none. Raises DappledError."""
+        frame = self._frame(one)
+        with self._darkroom.naming(one.path):
+            turned, scaled = frame.reach
+            own = told_by(frame.mosaic, *frame.expected, turned=turned, scaled=scaled, others=self._known(frame))
+        return ToldShadow(one.path, frame.alike, own) if own.seen else None
+
+    def _frame(self, one: LensFrame) -> _Frame:
+        raw = self._darkroom.read(one.path)
+        focal_length_mm = one.focal_length_mm or raw.focal_length_mm
+        if focal_length_mm is None:
+            raise DappledError(f"{one.path}: its focal length is unknown: give it with --focal-length")
+        with self._darkroom.naming(one.path):
             mosaic = self._mosaic(raw)
             decoder = self._darkroom.mask_decoder(mosaic.shape, raw.camera_model or "")
-            lens = focal_length_mm, f_number
-            told = [self._told_by(one, raw, decoder, lens) for one in others if one.path != Path(path)]
-            shadow = self._shadow(mosaic, decoder, lens, [one for one in told if one is not None])
-            made = picture_of(mosaic, shadow, period_of(shadow.lattice))
-        found = self._findings(Subject("frame", str(path)), raw, made, decoder, lens)
-        return MadePicture(
-            made, raw, decoder.optics.sensor, focal_length_mm, f_number, _colour_matrix(path, raw), found
-        )
+        return _Frame(one.path, raw, mosaic, decoder, (focal_length_mm, one.f_number or raw.f_number))
 
     def _mosaic(self, raw: RawFile) -> MosaicPlane:
         """A frame's linear values with its colours as they are; a staggered chip's samples at their places."""
@@ -134,50 +179,32 @@ class PictureMaker:
             plane, valid, pattern = _spread(plane), _spread(valid), _spread_pattern(pattern)
         return MosaicPlane(plane, pattern, None if valid.all() else valid)
 
-    def _told_by(self, one: LensFrame, like: RawFile, decoder: MaskDecoder, lens: _Lens) -> ShadowEvidence | None:
-        """What a frame of the same camera, lens and stop tells; None where it is none or can't be read."""
-        key = one.path, lens, decoder.optics.law
-        if key not in self._told:
-            self._told[key] = None
-            try:
-                raw = self._darkroom.read(one.path)
-            except DappledError:  # told where its own picture is made
-                return None
-            own = one.focal_length_mm or raw.focal_length_mm, one.f_number or raw.f_number
-            if (raw.camera_model, raw.mosaic.shape, own) == (like.camera_model, like.mosaic.shape, lens):
-                turned, scaled = _reach(decoder)
-                self._told[key] = told_by(
-                    self._mosaic(raw),
-                    decoder.lattice_at(lens[0]),
-                    _orders(decoder, *lens),
-                    turned=turned,
-                    scaled=scaled,
-                )
-        return self._told[key]
-
-    def _shadow(self, mosaic: MosaicPlane, decoder: MaskDecoder, lens: _Lens, told: Sequence[ShadowEvidence]) -> Shadow:
-        focal_length_mm, f_number = lens
-        orders, lattice = _orders(decoder, focal_length_mm, f_number), decoder.lattice_at(focal_length_mm)
-        known = decoder.calibration is not None
-        others = [self._white_shadow(decoder, orders, lattice)] if self._recipe.white else []
-        if known and f_number:
-            others += _told(decoder, mosaic, orders, focal_length_mm=focal_length_mm, f_number=f_number)
-        turned, scaled = _reach(decoder)
-        made = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others, beside=told)
-        if made.source == ShadowFrom.NONE and self._recipe.try_laws and not known:
+    def _shadow(self, frame: _Frame, told: Sequence[ToldShadow]) -> Shadow:
+        decoder, known = frame.decoder, self._known(frame)
+        turned, scaled = frame.reach
+        beside = [one.own.evidence for one in told if one.path != frame.path]
+        if own := next((one.own for one in told if one.path == frame.path), None):
+            made = own.shadow(known, beside)
+        else:
+            made = shadow_of(frame.mosaic, *frame.expected, turned=turned, scaled=scaled, others=known, beside=beside)
+        if made.source == ShadowFrom.NONE and self._recipe.try_laws and decoder.calibration is None:
             for law in LAWS:
                 there = replace(decoder, optics=decoder.optics.by(law))
-                if law != decoder.optics.law and there.predict(focal_length_mm)[1:]:
-                    orders, lattice = _orders(there, focal_length_mm, f_number), there.lattice_at(focal_length_mm)
-                    tried = shadow_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
+                if law != decoder.optics.law and there.predict(frame.lens[0])[1:]:
+                    expected = replace(frame, decoder=there).expected
+                    tried = shadow_of(frame.mosaic, *expected, turned=turned, scaled=scaled)
                     made = tried if tried.source != ShadowFrom.NONE else made
         return made
 
-    def _white_shadow(self, decoder: MaskDecoder, orders: list[Order], lattice: Lattice) -> Shadow:
+    def _known(self, frame: _Frame) -> list[Shadow]:
+        """Shadows that may be a frame's: its white frame's, and those that its calibration predicts."""
+        return [*([self._white_shadow(frame)] if self._recipe.white else []), *_calibrated(frame)]
+
+    def _white_shadow(self, frame: _Frame) -> Shadow:
         if self._white is None:
             with self._darkroom.naming(self._recipe.white):
                 mosaic = self._mosaic(self._darkroom.read(self._recipe.white))
-                found = shadow_of(mosaic, lattice, orders, turned=_TURNED, scaled=_SCALED)
+                found = shadow_of(mosaic, *frame.expected, turned=_TURNED, scaled=_SCALED)
                 self._white = replace(found, source=ShadowFrom.WHITE)
         return self._white
 
@@ -211,11 +238,6 @@ class PictureMaker:
         return tuple(found)
 
 
-def _reach(decoder: MaskDecoder) -> tuple[float, float]:
-    """How far the lattice is searched: a turn in radians, and a share of the period."""
-    return (_TURNED, _SCALED) if decoder.calibration is None else (_TURNED_SINCE, _SCALED_SINCE)
-
-
 def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[Order]:
     """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them."""
     predicted = _strengths(decoder, focal_length_mm, f_number)
@@ -236,11 +258,12 @@ def _least_depth(decoder: MaskDecoder, focal_length_mm: float, f_number: float |
     return math.sqrt(2 * sum(one.least**2 for one in _strengths(decoder, focal_length_mm, f_number)))
 
 
-def _told(
-    decoder: MaskDecoder, mosaic: MosaicPlane, orders: list[Order], *, focal_length_mm: float, f_number: float
-) -> list[Shadow]:
-    """What a calibration predicts, behind a stop of each shape."""
-    assert decoder.calibration is not None
+def _calibrated(frame: _Frame) -> list[Shadow]:
+    """What a calibration predicts, behind a stop of each shape; none without an f-number."""
+    (focal_length_mm, f_number), decoder, mosaic = frame.lens, frame.decoder, frame.mosaic
+    if decoder.calibration is None or not f_number:
+        return []
+    lattice, orders = frame.expected
     known = decoder.calibration.nearest(focal_length_mm)
     magnitudes = dict(zip(decoder.optics.mask.half_orders(), known.transfer, strict=True))
     transfers = transfer(orders, [magnitudes[order] for order in orders], known.origin)
@@ -248,7 +271,6 @@ def _told(
         decoder.optics.mask.frequency_per_mm * known.print_scale, known.mask_distance_mm, focal_length_mm, f_number
     )
     angular = angular_frequencies(orders, cycles, known.rotation_rad)
-    lattice = decoder.lattice_at(focal_length_mm)
     made = []
     for shape in SHAPES:
         through = transfers * Aperture(decoder.optics.mask.views_per_axis, shape).transform(angular)

@@ -22,7 +22,7 @@ from typing import Self
 from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
-from dappled.drivers.raw.picture_maker import LensFrame, beside
+from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError, sentence
 from dappled.findings import Finding
 from dappled.flight import Frame, Tag
@@ -34,7 +34,7 @@ from dappled.products.handover.forms import HandedFrame
 from dappled.products.maps import cog, georeference, map_files, photographs
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.georeference import Options
-from dappled.products.maps.laboratory import FlightFrame, Laboratory, exposures
+from dappled.products.maps.laboratory import MEAN, FlightFrame, exposures, laboratory
 from dappled.products.maps.photographs import Photograph, Station
 
 MAPS = ("cog", "kmz")
@@ -49,7 +49,7 @@ class Job:
     """One frame and all that is to be made of it. `station` is the error where its position isn't known;
     `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on.
     `utc_ns` is mid-exposure, corrected; None where UTC was never known. `others` are the frames that the mask's shadow
-    is taken from, too."""
+    is taken from, and `told` what these tell of it, as soon as they were asked."""
 
     flight: str
     frame: Frame
@@ -63,6 +63,7 @@ class Job:
     key: str
     utc_ns: int | None = None
     others: tuple[LensFrame, ...] = ()
+    told: tuple[ToldShadow, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,10 +150,12 @@ def plan(
         "kinds": sorted(kinds),
     }
     jobs = []
+    pictured = set(kinds) & set(FORMS if options.view != MEAN else PLACED)
+    near = beside(list(files.values())) if pictured else {}
     for frame in frames:
         tag = tags.get(frame.index)
         utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
-        others = beside(files.get(frame.index), list(files.values())) if set(kinds) & set(PLACED) else ()
+        others = near.get(files[frame.index], ()) if frame.index in files else ()
         said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
                 "tag": codec.plain(tag), "others": [hashes[one.path] for one in others]}  # fmt: skip
         if frame.index in stations and stations[frame.index].camera.height_ellipsoid_m is not None:
@@ -256,7 +259,7 @@ def _making(job: Job) -> _Making:
     if isinstance(job.station, DappledError) and set(job.kinds) <= set(PLACED):
         raise job.station
     given = {"focal_length_mm": job.options.focal_length_mm, "f_number": job.options.f_number}
-    frame = _laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given, others=job.others)
+    frame = laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given, told=job.told)
     return _Making(job, frame)
 
 
@@ -311,16 +314,7 @@ def _plain(options: Options) -> dict[str, object]:
     return {name: value if isinstance(value, str | None) else repr(value) for name, value in values.items()}
 
 
-_here = threading.local()  # a decoder keeps buffers: one for each working thread
-
-
-def _laboratory(recipe: Recipe) -> Laboratory:
-    """This thread's laboratory for a recipe, kept from job to job."""
-    kept: dict[Recipe, Laboratory] = _here.__dict__.setdefault("laboratories", {})
-    if recipe not in kept:
-        kept.clear()
-        kept[recipe] = Laboratory(recipe)
-    return kept[recipe]
+_here = threading.local()
 
 
 def _projection(name: str) -> Projection:

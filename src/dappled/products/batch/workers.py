@@ -6,30 +6,36 @@ Results come in the order in which they are ready.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
+from typing import Any, TypeVar
+from uuid import uuid4
 
 from dappled.errors import DappledError
 from dappled.products import processes
 from dappled.products.batch.batch import Done, Job
 from dappled.products.extras import need
+from dappled.products.maps.laboratory import ShadowAsked, shadows
 from dappled.products.processes import JOB_S
 
 _PATIENCE_S = 10.0  # for the scheduler to answer
 _WORKERS_S = 60.0  # for its first worker to be there
 
 Make = Callable[[Job], Done]
+_Job = TypeVar("_Job")
+_Answer = TypeVar("_Answer")
+_Run = Callable[[Sequence[Any], Callable[[Any], Any], Callable[[Any, str], Any]], Generator[Any]]
+"""As `Crew.as_ready`."""
 
 
 def in_processes(
     jobs: Sequence[Job], make: Make, workers: int, *, job_s: float = JOB_S, now_s: Callable[[], float] = time.monotonic
 ) -> Iterator[Done]:
     """Run jobs in a number of processes with one thread each, and yield their results."""
-
-    def lost(job: Job, why: str) -> Done:
-        return given_up(job, f"{job.frame.name} {why}")
-
-    return processes.in_processes(jobs, make, workers, lost=lost, job_s=job_s, now_s=now_s)
+    with processes.Crew(workers, job_s=job_s, now_s=now_s) as crew:
+        yield from _run(jobs, make, crew.as_ready)
 
 
 def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done]:
@@ -51,15 +57,27 @@ def on_cluster(jobs: Sequence[Job], make: Make, scheduler: str) -> Iterator[Done
             raise DappledError(
                 f"the Dask scheduler at {scheduler} has no workers: start some with dask worker {scheduler}"
             ) from None
-        named = {job.key: job for job in jobs}
-        futures = [client.submit(make, job, key=f"dappled-{job.key}", pure=False) for job in named.values()]
-        for future in distributed.as_completed(futures, loop=client.loop):
-            key = future.key.removeprefix("dappled-")
-            if future.status == "finished":
-                yield future.result()
-            else:
-                yield given_up(named[key], f"{named[key].frame.name}: the cluster gave it up: {future.exception()}")
-            future.release()
+
+        def as_ready(
+            some: Sequence[_Job], made: Callable[[_Job], _Answer], lost: Callable[[_Job, str], _Answer]
+        ) -> Generator[_Answer]:
+            asked = {client.submit(made, job, key=f"dappled-{uuid4()}", pure=False): job for job in some}
+            for future in distributed.as_completed(list(asked), loop=client.loop):
+                finished = future.status == "finished"
+                why = f"was given up by the cluster: {None if finished else future.exception()}"
+                yield future.result() if finished else lost(asked[future], why)
+                future.release()
+
+        yield from _run(list({job.key: job for job in jobs}.values()), make, as_ready)
+
+
+def _run(jobs: Sequence[Job], make: Make, run: _Run) -> Generator[Done]:
+    """The jobs' results, as they are ready; first of all, the frames are asked for their shadows."""
+    asked = [(job, [ShadowAsked(job.recipe, one) for one in job.others]) for job in jobs]
+    told = shadows((one for _, few in asked for one in few), run)
+    ready = [replace(job, told=tuple(told[one] for one in few if one in told)) for job, few in asked]
+    with closing(run(ready, make, lambda job, why: given_up(job, f"{job.frame.name} {why}"))) as answers:
+        yield from answers
 
 
 def given_up(job: Job, why: str) -> Done:

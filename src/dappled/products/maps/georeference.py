@@ -16,7 +16,7 @@ import numpy as np
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
-from dappled.drivers.raw.picture_maker import LensFrame, beside
+from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError
 from dappled.findings import Finding, first_by_name, text
 from dappled.flight import FlightFolder
@@ -27,7 +27,7 @@ from dappled.products.maps.eye import EyeError
 from dappled.products.maps.ground import Flat, Ground, Raster
 from dappled.products.maps.ground import check as check_ground
 from dappled.products.maps.ground import load as load_ground
-from dappled.products.maps.laboratory import MEAN, Laboratory, exposures
+from dappled.products.maps.laboratory import MEAN, Laboratory, ShadowAsked, exposures, laboratory, shadows
 from dappled.products.maps.map_grid import MapError
 from dappled.products.maps.photographs import Photograph, Station
 from dappled.products.maps.references import BaseMap
@@ -138,25 +138,47 @@ def survey(
     projection.at(first.latitude_deg, first.longitude_deg)
     level = level_of(stations, options)
     scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
-    laboratory = Laboratory(recipe)
-    laboratory.darkroom.check()
+    decoders = Laboratory(recipe)
+    decoders.darkroom.check()
     if options.terrain is not None:
         check_ground(options.terrain)
-    if (planned := _foreseen(flight, laboratory, stations, projection, options)) is not None:
+    if (planned := _foreseen(flight, decoders, stations, projection, options)) is not None:
         foresee(planned)
     workers = 1 if watch is not None else processes.worth(workers, len(stations))
-    develop = _Developing(flight, recipe.shared_by(workers), options, projection.name, scratch, watch, files)
+    recipe = recipe.shared_by(workers)
     taken: list[Photograph] = []
-    with closing(processes.in_order(stations, develop, workers, lost=_lost)) as made:
-        for number, station in enumerate(stations):
-            progress("develop", number, len(stations))
-            one = next(made)
-            if isinstance(one, DappledError):
-                left.append((station.frame.name, str(one)))
-            else:
-                taken.append(_from_shelf(one, scratch))
+    with processes.Crew(workers) as crew:
+        told = _told(recipe, stations, files, crew, progress) if options.view == MEAN else {}
+        develop = _Developing(flight, recipe, options, projection.name, scratch, watch, told)
+        with closing(crew.in_order(stations, develop, _lost)) as made:
+            for number, station in enumerate(stations):
+                progress("develop", number, len(stations))
+                one = next(made)
+                if isinstance(one, DappledError):
+                    left.append((station.frame.name, str(one)))
+                else:
+                    taken.append(_from_shelf(one, scratch))
     progress("develop", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
+
+
+def _told(
+    recipe: Recipe,
+    stations: Sequence[Station],
+    files: Mapping[int, LensFrame],
+    crew: processes.Crew,
+    progress: Progress,
+) -> dict[int, tuple[ToldShadow, ...]]:
+    """What frames beside each one tell of its mask's shadow, by image index."""
+    near = beside(list(files.values()))
+    asked = {
+        index: tuple(ShadowAsked(recipe, other) for other in near[files[index]])
+        for index in (one.frame.index for one in stations)
+        if index in files
+    }
+    every = (one for few in asked.values() for one in few)
+    found = shadows(every, crew.in_order, lambda done, of: progress("measure the mask's shadow", done, of))
+    return {index: tuple(found[one] for one in few if one in found) for index, few in asked.items()}
 
 
 @dataclass(frozen=True)
@@ -169,12 +191,7 @@ class _Developing:
     projection_name: str
     scratch: Path
     watch: Watch | None
-    files: Mapping[int, LensFrame]
-
-    @cached_property
-    def laboratory(self) -> Laboratory:
-        """Its decoders, which are made once."""
-        return Laboratory(self.recipe)
+    told: Mapping[int, tuple[ToldShadow, ...]]
 
     @cached_property
     def projection(self) -> Projection:
@@ -185,10 +202,10 @@ class _Developing:
         """A photograph without its picture, which lies on the shelf; or why there is none."""
         options = self.options
         try:
-            frame = self.laboratory.frame(
+            frame = laboratory(self.recipe).frame(
                 self.flight, station.frame, station.tag,
                 focal_length_mm=options.focal_length_mm, f_number=options.f_number,
-                others=beside(self.files.get(station.frame.index), list(self.files.values())),
+                told=self.told.get(station.frame.index, ()),
             )  # fmt: skip
             one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
             if self.watch is not None:
@@ -204,7 +221,7 @@ def _lost(station: Station, why: str) -> DappledError:
 
 def _foreseen(
     flight: Path,
-    laboratory: Laboratory,
+    decoders: Laboratory,
     stations: Sequence[Station],
     projection: Projection,
     options: Options,
@@ -212,7 +229,7 @@ def _foreseen(
     """The survey of all that poses and optics tell; None where they don't."""
     try:
         read = reading.read_metadata(FlightFolder(flight).file(stations[0].frame.name))
-        profile = laboratory.darkroom.camera(read.model or "")
+        profile = decoders.darkroom.camera(read.model or "")
         length = options.focal_length_mm
         photos = [
             photographs.foreseen(

@@ -5,8 +5,9 @@ A picture costs a tenth of the views. What shows a frame as a whole is made of i
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+import threading
+from collections.abc import Callable, Generator, Iterable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from dappled.config import profiles
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.picture_maker import LensFrame, PictureMaker
+from dappled.drivers.raw.picture_maker import LensFrame, PictureMaker, ToldShadow
 from dappled.errors import DappledError
 from dappled.findings import Finding
 from dappled.flight import FlightFolder, Frame, Tag
@@ -42,11 +43,61 @@ class Laboratory:
         *,
         focal_length_mm: float | None = None,
         f_number: float | None = None,
-        others: Sequence[LensFrame] = (),
+        told: Sequence[ToldShadow] = (),
     ) -> FlightFrame:
-        """One frame of a flight (see `exposure`); its mask's shadow is taken from `others`, too."""
+        """One frame of a flight (see `exposure`), and what frames beside it have `told` of the mask's shadow."""
         one = exposure(flight, frame, tag, focal_length_mm=focal_length_mm, f_number=f_number)
-        return FlightFrame(self, one.path, one.focal_length_mm, one.f_number, others)
+        return FlightFrame(self, one.path, one.focal_length_mm, one.f_number, told)
+
+
+_here = threading.local()  # a decoder keeps buffers: one for each working thread
+
+
+def laboratory(recipe: Recipe) -> Laboratory:
+    """This thread's laboratory for a recipe, kept from job to job."""
+    kept: dict[Recipe, Laboratory] = _here.__dict__.setdefault("laboratories", {})
+    if recipe not in kept:
+        kept.clear()
+        kept[recipe] = Laboratory(recipe)
+    return kept[recipe]
+
+
+@dataclass(frozen=True, slots=True)
+class ShadowAsked:
+    """A frame that is asked for its shadow, for the pictures of others."""
+
+    recipe: Recipe
+    frame: LensFrame
+
+
+_Answer = tuple[ShadowAsked, ToldShadow | None]
+_Asking = Callable[
+    [Sequence[ShadowAsked], Callable[[ShadowAsked], _Answer], Callable[[ShadowAsked, str], _Answer]],
+    Generator[_Answer],
+]
+"""As `Crew.in_order`: jobs, what is made of each, and what is told of one that was lost."""
+
+
+def shadows(
+    asked: Iterable[ShadowAsked], ask: _Asking, progress: Callable[[int, int], None] = lambda *_: None
+) -> dict[ShadowAsked, ToldShadow]:
+    """What frames tell of their shadows, each measured once, in any process; without those that tell nothing."""
+    each = list(dict.fromkeys(asked))
+    told = {}
+    with closing(ask(each, _tell, lambda one, _: (one, None))) as answers:
+        for number, (one, shadow) in enumerate(answers):
+            progress(number, len(each))
+            if shadow is not None:
+                told[one] = shadow
+    return told
+
+
+def _tell(asked: ShadowAsked) -> _Answer:
+    """One that can't be read tells nothing here: why is told where its own picture is made."""
+    with suppress(Exception):
+        pictures = laboratory(asked.recipe).pictures
+        return asked, None if pictures is None else pictures.tell(asked.frame)
+    return asked, None
 
 
 def exposure(
@@ -79,7 +130,7 @@ class FlightFrame:
     path: Path
     focal_length_mm: float | None
     f_number: float | None
-    others: Sequence[LensFrame] = ()
+    told: Sequence[ToldShadow] = ()
     _found: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     _kept: dict[str, Photograph] = field(default_factory=dict)  # by projection
 
@@ -116,9 +167,7 @@ class FlightFrame:
         return photographs.photograph(station, light_field, profile, projection, view=view, focus_m=focus_m)
 
     def _pictured(self, maker: PictureMaker, station: Station, projection: Projection, focus_m: float) -> Photograph:
-        made = maker.picture(
-            self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number, others=self.others
-        )
+        made = maker.picture(self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number, told=self.told)
         profile = self.laboratory.darkroom.camera(made.raw.camera_model or "")
         colour = self.laboratory.recipe.colour
         one = photographs.of_picture(station, made, profile, projection, focus_m=focus_m, colour=colour)
