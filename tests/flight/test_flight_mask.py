@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dappled.decode.mask_odds import SEEN_NATS
 from dappled.findings import FRAME, Code, Finding, Level, finding, remedy
-from dappled.flight.flight_mask import FlightMask
+from dappled.flight.flight_mask import FlightMask, doubts_over
 
 
 def test_the_odds_of_a_mask_add_up_over_a_flight() -> None:
@@ -38,3 +38,15 @@ def test_a_mask_that_every_frame_shows_is_told_only_where_it_is_asked_for() -> N
     assert flight.unseen == ()
     assert flight.told is not None
     assert flight.told.level == Level.NOTE
+
+
+def test_a_flight_s_doubts_are_those_of_its_frames_that_others_don_t_relieve() -> None:
+    unseen, clipped = finding(Code.MASK_UNSEEN, FRAME, nats=-3.0), finding(Code.FRAME_CLIPPED, FRAME, share=0.02)
+    frames = [("0", 20.0, ()), ("1", -3.0, (unseen, clipped)), ("2", None, (clipped,))]
+    found = doubts_over(frames)
+    assert [(one.code, str(one.subject), one.level) for one in found] == [
+        (Code.FRAME_CLIPPED, "frame 1", Level.CAUTION),
+        (Code.MASK_OVER_FLIGHT, "mask", Level.NOTE),
+    ]
+    assert [one.level for one in doubts_over(frames[1:]) if one.code is Code.MASK_OVER_FLIGHT] == [Level.CAUTION]
+    assert Code.MASK_UNSEEN in [one.code for one in doubts_over(frames[1:])]

@@ -14,12 +14,12 @@ from dappled.cli.placing import Placing
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, argument, flag, option
 from dappled.errors import DappledError, counted
-from dappled.findings import Finding, Subject, first_by_name
+from dappled.findings import Finding, Subject
 from dappled.products.handover import FORMS, KINDS
 
 if not words_only:
     from dappled.flight import disk_error, layout
-    from dappled.flight.flight_mask import FlightMask
+    from dappled.flight.flight_mask import doubts_over
     from dappled.products.batch import batch, workers
     from dappled.products.batch.batch import Done, Job, Manifest
     from dappled.products.geotags import geotags, marks
@@ -149,12 +149,8 @@ def _doubts(manifest: Manifest, jobs: Sequence[Job]) -> list[Finding]:
     """What is in doubt about the light fields of each flight."""
     found = []
     for flight in dict.fromkeys(job.flight for job in jobs):
-        mask, frames = FlightMask(), []
-        for job in jobs:
-            if job.flight == flight and (done := manifest.done.get(job.key)) is not None:
-                mask.add(job.frame.index, done.mask_nats)
-                frames.append((Path(done.frame).stem, mask.relieved(done.doubts)))
-        doubts = [*first_by_name(frames), *mask.unseen]
+        made = (manifest.done.get(job.key) for job in jobs if job.flight == flight)
+        doubts = doubts_over((Path(one.frame).stem, one.mask_nats, one.doubts) for one in made if one is not None)
         found += [replace(one, subject=_of_flight(Path(flight).name, one.subject)) for one in doubts]
     return found
 

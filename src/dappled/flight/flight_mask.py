@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from dappled.decode.mask_odds import SEEN_NATS
-from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.findings import Code, Finding, Level, Subject, finding, first_by_name
 
 _MOST_NATS = 20.0  # a mask that falls out is in doubt after five frames with texture: each tells 3.4 nats at most
 
@@ -45,3 +45,13 @@ class FlightMask:
     def relieved(self, doubts: Sequence[Finding]) -> tuple[Finding, ...]:
         """A frame's doubts: that it can't show the mask is none where the odds are that it is there."""
         return tuple(one for one in doubts if not (self.there and one.code is Code.MASK_UNSEEN))
+
+
+def doubts_over(frames: Iterable[tuple[str, float | None, Sequence[Finding]]]) -> list[Finding]:
+    """What is in doubt about frames of a flight in their order, each by its name, log odds and doubts, and about the
+    mask that they tell of together."""
+    mask, found = FlightMask(), []
+    for index, (name, nats, doubts) in enumerate(frames):
+        mask.add(index, nats)
+        found.append((name, mask.relieved(doubts)))
+    return [*first_by_name(found), *mask.unseen]

@@ -18,8 +18,9 @@ from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError
-from dappled.findings import Finding, first_by_name, text
+from dappled.findings import Finding, text
 from dappled.flight import FlightFolder
+from dappled.flight.flight_mask import doubts_over
 from dappled.products import processes
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
@@ -82,9 +83,10 @@ class Survey:
 
     @property
     def doubts(self) -> list[Finding]:
-        """What is in doubt about the photographs' light fields, and what their lens was not told."""
+        """What is in doubt about the photographs, the mask that their light fields show, and what their lens was not
+        told."""
         of_lens = self.lens.doubts if self.lens else ()
-        return [*first_by_name((one.name, one.doubts) for one in self.photographs), *of_lens]
+        return [*doubts_over((one.name, one.mask_nats, one.doubts) for one in self.photographs), *of_lens]
 
     def coarse(self) -> Survey:
         """The survey in pictures that heights are searched in: as fine as its own map where that was chosen coarser
@@ -210,6 +212,7 @@ class _Developing:
             one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
             if self.watch is not None:
                 self.watch(one, frame.decoded.light_field)
+            one = replace(one, doubts=frame.doubts, mask_nats=frame.mask_nats)
         except DappledError as error:
             return DappledError(str(error))  # it may come from another process
         return _shelved(one, self.scratch)

@@ -72,7 +72,8 @@ class Photograph:
 
     Sigmas are one standard deviation of the eye's centre (m) and attitude (rad) as recorded. `grid` maps to the
     sensor, as in `LightField`. With `views` (n, h, w[, 3]) and their aperture points, maps are drawn from the views:
-    their mean on the ground is the frame refocused there. `doubts` are the light field's; `lens` is that of the eye.
+    their mean on the ground is the frame refocused there. `doubts` are the picture's and the light field's,
+    `mask_nats` the log odds that this shows its mask, None without one; `lens` is that of the eye.
     """
 
     name: str
@@ -87,6 +88,7 @@ class Photograph:
     aperture: ApertureWidth | None = None
     doubts: tuple[Finding, ...] = ()
     lens: Lens | None = None
+    mask_nats: float | None = None
 
     def eye_on(self, grid: Matrix, shape: tuple[int, int]) -> Eye:
         """The same eye for samples that lie elsewhere on the sensor: `grid` (2, 3) and their `shape`, as in
