@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -25,6 +26,7 @@ from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.picture import shadow
 from dappled.decode.picture.blocks import MosaicPlane
+from dappled.drivers.raw import picture_maker
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
@@ -331,13 +333,16 @@ def test_a_flight_s_shadow_is_measured_once_in_each_frame(
 ) -> None:
     """It is taken from all frames together."""
     measured = []
-    measure = shadow._equations_of
 
-    def counted(mosaic: MosaicPlane, *where: Any, **reach: float) -> Any:
-        measured.append(mosaic.shape)
-        return measure(mosaic, *where, **reach)
+    def counted(measure: Callable[..., Any]) -> Callable[..., Any]:
+        def one(mosaic: MosaicPlane, *where: Any, **reach: Any) -> Any:
+            measured.append(mosaic.shape)
+            return measure(mosaic, *where, **reach)
 
-    monkeypatch.setattr(shadow, "_equations_of", counted)
+        return one
+
+    monkeypatch.setattr(picture_maker, "told_by", counted(shadow.told_by))
+    monkeypatch.setattr(picture_maker, "shadow_of", counted(shadow.shadow_of))
     output = tmp_path / "maps"
     main(words(short_flight, output, "--as", "cog", "--gsd", "0.1", "--workers", "1"))
     frames = json.loads((output / "report.json").read_text())["frames"]
