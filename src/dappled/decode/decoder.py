@@ -551,23 +551,26 @@ class MaskDecoder:
         corner = at_corner(known.origin, lattice, self.optics.sensor.shape)
         transfers = transfer(taken.orders, [magnitudes[order] for order in taken.orders], corner)
         taken = replace(taken, transfers=transfers, rotation_rad=known.rotation_rad + turn_rad)
+        if not self.joint_views:
+            width = taken.width(distance_known=known.distance_fitted)
+            return taken.through(width), width, None
+        by_means = taken.shift(distance_known=known.distance_fitted)  # else the aperture is fitted to moved phases
+        taken = taken.moved(by_means)
         width = taken.width(distance_known=known.distance_fitted)
         found = taken.through(width)
-        if not self.joint_views:
-            return found, width, None
         turned = cycles_per_radian(lattice, self.optics.sensor)
-        place = self._own_place(found.used(), turned)
-        if place is None or not place.moved:
+        rest = self._own_place(found.used(), turned)
+        place = None if rest is None else rest.beyond(by_means)
+        if rest is None or not rest.moved:
             return found, width, place
         moved = replace(
-            taken,
-            values=place.undone(taken.values, taken.orders, turned, taken.samples_px),
-            rotation_rad=taken.rotation_rad + place.turn_rad,
-            transfers=transfers * transfer(taken.orders, np.ones(len(transfers)), place.periods),
+            taken.moved(rest.periods),
+            values=rest.undone(taken.values, taken.orders, turned, taken.samples_px),
+            rotation_rad=taken.rotation_rad + rest.turn_rad,
         )
         again = moved.width(distance_known=known.distance_fitted)
         if width.fits and not again.fits:
-            return found, width, None
+            return found, width, rest.beyond(by_means, alone=True) if any(by_means) else None
         return moved.through(again), again, place
 
     def _own_place(self, taken: TakenSlices, turned: Floats) -> MaskPlace | None:

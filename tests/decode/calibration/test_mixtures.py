@@ -1,4 +1,7 @@
-"""Random cameras and scenes, decoded as in flight: no mask goes without a doubt, and few right frames are doubted."""
+"""Random cameras and scenes, decoded as in flight: no mask goes without a doubt, and few right frames are doubted.
+
+With views: what changed since the calibration is made good, or in doubt.
+"""
 
 from __future__ import annotations
 
@@ -49,3 +52,33 @@ def test_no_mask_is_always_in_doubt_and_right_frames_hardly_ever(count: int) -> 
     assert unsaid == [], f"without a doubt, of {len(without)} without a mask"
     most = int(stats.binom.ppf(0.99, len(right), _SHARE))
     assert len(wrongly) <= most, f"seeds {wrongly} are doubted, of {len(right)} with their mask"
+
+
+def _views(one: Mixture) -> tuple[float, float, bool]:
+    """PSNR of its views and of their true mean in dB, and whether it is in doubt; no views are 0 dB."""
+    plane, true = one.exposed(views=True)
+    try:
+        light, report = _decoder().decode_reported(
+            plane, focal_length_mm=one.told_mm, f_number=one.told_f or one.f_number
+        )
+    except DecodeError:
+        return 0.0, 0.0, True
+    return *true.psnr(light.views, light.grid), bool(report.doubts)
+
+
+@pytest.mark.slow
+def test_views_behind_a_mask_that_moved_far_or_turned_are_right() -> None:
+    for seed, changed in ((6, "moved_um"), (10, "turned_deg")):  # 50 um; 0.3 degrees
+        one = Mixture.disturbed(seed)
+        assert one.changed == changed
+        views, mean, _ = _views(one)
+        assert views > mean - 1, changed
+
+
+@pytest.mark.long
+def test_what_changed_since_the_calibration_spoils_no_views_without_a_doubt() -> None:
+    changed = [one for one in map(Mixture.disturbed, range(_LONG)) if one.changed]
+    views = {one.seed: _views(one) for one in changed}
+    undoubted = [one for one in changed if not views[one.seed][2]]
+    spoilt = [one.seed for one in undoubted if views[one.seed][0] < _views(one.unchanged())[0] - 3]
+    assert len(spoilt) <= int(stats.binom.ppf(0.99, len(changed), 0.01)), f"seeds {spoilt} of {len(changed)}"

@@ -17,7 +17,7 @@ from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.peaks import Measured, measure
 from dappled.findings import FRAME, Code, Finding, finding
 
-_WEAK = 0.005  # of the mean: parallax alone leaves up to a thousandth
+_WEAK = 0.0025  # of the mean: parallax alone leaves up to a thousandth
 _FULL_WEIGHT = 0.02  # of the mean: weaker peaks are shifted by what the scene holds around them
 _FEWEST = 6  # peaks of a half plane, and half of those predicted
 _INNER = 4  # carriers that a mask far off is first looked for by

@@ -14,7 +14,14 @@ from dappled.decode.joint.joint_views import PatchShares, joint_views
 from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, mask_place
 from dappled.decode.joint.patch_model import FARTHEST, SIDE
 from dappled.decode.joint.slice_model import SliceModel
-from dappled.decode.lightfield.aperture import Aperture, UsedAperture, angular_frequencies, used_aperture
+from dappled.decode.lightfield.aperture import (
+    Aperture,
+    UsedAperture,
+    angular_frequencies,
+    shift_shown,
+    transfer,
+    used_aperture,
+)
 from dappled.decode.lightfield.views import Views, chroma_noise, from_slices
 from dappled.decode.optics import Carrier, Order
 from dappled.findings import FRAME, Code, Finding, finding
@@ -87,6 +94,23 @@ class TakenSlices:
             aperture=self.aperture,
             distance_known=distance_known,
         )
+
+    def shift(self, *, distance_known: bool) -> tuple[float, float]:
+        """By how many periods the slices' means show the mask to have moved."""
+        return shift_shown(
+            self.values,
+            self.transfers,
+            self.orders,
+            nominal_kappa=self.kappa_cycles,
+            rotation_rad=self.rotation_rad,
+            aperture=self.aperture,
+            distance_known=distance_known,
+        )
+
+    def moved(self, periods: tuple[float, float]) -> TakenSlices:
+        """The same, of a mask that has moved by so many periods."""
+        turns = transfer(self.orders, np.ones(len(self.orders)), periods)
+        return replace(self, transfers=self.transfers * turns)
 
     def through(self, width: UsedAperture) -> TakenSlices:
         """The same, taken through this aperture."""

@@ -93,6 +93,12 @@ class MaskPlace:
         """Whether the patches agree on this place: else there is no mask, or nothing has parallax or texture."""
         return self.nats > SEEN_NATS
 
+    def beyond(self, periods: tuple[float, float], *, alone: bool = False) -> MaskPlace:
+        """The place by slices of a mask that had moved by so many periods before; `alone`: nothing but that."""
+        rest, turn = ((0.0, 0.0), 0.0) if alone else (self.periods, self.turn_rad)
+        y, x = (one + other - round(one + other) for one, other in zip(rest, periods, strict=True))
+        return replace(self, periods=(float(y), float(x)), turn_rad=turn)
+
     def nowhere(self, nats: float) -> MaskPlace:
         """It without any move, and with these odds: a turn at the search's edge that led nowhere."""
         return replace(self, periods=(0.0, 0.0), turn_rad=0.0, nats=nats)

@@ -51,6 +51,8 @@ _PRINTED = 0.04  # of a carrier: how well a design says the strength of a print'
 _GAINS = np.linspace(0.8, 1.25, 10)  # of all carriers of a print: its film's contrast
 _GAIN_SIGMA = 0.1  # relative: of a film's contrast; chosen by hand, as no print was measured
 _DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
+_MOVES, _COARSER = 48, 10  # of a period: how finely moves are tried, and κ with them in steps
+_MOVED = 30.0  # squared deviations: a smaller gain is no move
 _AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
 
 
@@ -256,18 +258,12 @@ def used_aperture(
     """
     sigma, far = (_NOMINAL_SIGMA, _FAR_NOMINAL) if distance_known else (_UNKNOWN_SIGMA, _FAR_UNKNOWN)
     nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
-    means = mean_of_slices(slices)
-    known = np.abs(transfers) > 1e-3
-    known[0] = False
-    if not known.any() or not means[0].real > 0:
+    shown = _shown_means(slices, transfers, orders)
+    if shown is None:
         return nominal
-    seen = (means[known] / means[0].real / transfers[known]).real
-    error = _TEXTURE / np.abs(transfers[known])
-    wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
-
-    steps = round(math.log(SEARCHED) / _STEP)
-    off = _STEP * np.arange(-steps, steps + 1)
-    prior = np.minimum((off / sigma) ** 2, (off / _WRONG_SIGMA) ** 2 + 2 * math.log(_WRONG_SIGMA / sigma / _WRONG))
+    wanted, complex_means, error = shown
+    seen = complex_means.real
+    off, prior = _kappas(sigma)
     best: UsedAperture | None = None
     least = math.inf
     for shape in SHAPES:
@@ -286,6 +282,71 @@ def used_aperture(
         return replace(nominal, share=math.nan)
     share = best.kappa / nominal_kappa
     return replace(best, share=share) if abs(math.log(share)) > far else best
+
+
+def shift_shown(
+    slices: NDArray[np.complex64],
+    transfers: NDArray[np.complex128],
+    orders: Sequence[Order],
+    *,
+    nominal_kappa: float,
+    rotation_rad: float,
+    aperture: Aperture,
+    distance_known: bool = True,
+) -> tuple[float, float]:
+    """By how many periods (ky, kx; −0.5 to 0.5) the means of slices, as `used_aperture`, show a mask to have moved.
+
+    A move by δ turns mean k by 2πk·δ, and the stop may turn its sign: so move, stop and κ are fitted together.
+    (0, 0) where none is sure.
+    """
+    shown = _shown_means(slices, transfers, orders)
+    if shown is None or np.linalg.matrix_rank(shown[0]) < 2:
+        return 0.0, 0.0
+    wanted, seen, error = shown
+    off, prior = _kappas(_NOMINAL_SIGMA if distance_known else _UNKNOWN_SIGMA)
+    off, prior = off[::_COARSER], prior[::_COARSER]
+    angular = [angular_frequencies(wanted, nominal_kappa * math.exp(one), rotation_rad) for one in off]
+    there = np.concatenate([Aperture(aperture.views, one).transform(np.concatenate(angular)).real for one in SHAPES])
+    there = there.reshape(-1, len(wanted)) / error
+    alone = (there**2).sum(axis=1) + np.tile(prior, len(SHAPES)) + float((np.abs(seen / error) ** 2).sum())
+
+    def costs(moves: NDArray[np.float64], some: slice = slice(None)) -> NDArray[np.float64]:
+        back = (seen * np.exp(-2j * np.pi * moves @ np.array(wanted, dtype=np.float64).T)).real / error
+        return np.asarray(alone[some, None] - 2 * there[some] @ back.T)
+
+    axis = np.arange(-_MOVES // 2, _MOVES // 2) / _MOVES
+    tried = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
+    found = costs(tried)
+    at, best = divmod(int(found.argmin()), len(tried))
+    still = float(costs(np.zeros((1, 2))).min())
+    deviations = max(1.0, float(found[at, best]) / (2 * len(wanted)))
+    if still - float(found[at, best]) < _MOVED * deviations or deviations > _AGREEMENT**2:
+        return 0.0, 0.0
+    fine = tried[best] + (tried - tried[0]) * (2 / _MOVES) - 1 / _MOVES
+    moved = fine[int(costs(fine, slice(at, at + 1)).argmin())]
+    return _turn(float(moved[0])), _turn(float(moved[1]))
+
+
+def _shown_means(
+    slices: NDArray[np.complex64], transfers: NDArray[np.complex128], orders: Sequence[Order]
+) -> tuple[list[Order], NDArray[np.complex128], NDArray[np.float64]] | None:
+    """The orders whose transfers are known, their slices' means over those and over the plane's mean, and what a scene
+    adds to these; None where there are none."""
+    means = mean_of_slices(slices)
+    known = np.abs(transfers) > 1e-3
+    known[0] = False
+    if not known.any() or not means[0].real > 0:
+        return None
+    wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
+    return wanted, means[known] / means[0].real / transfers[known], _TEXTURE / np.abs(transfers[known])
+
+
+def _kappas(sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The logarithms of the factors of κ that are tried, and what each costs before the frame is seen."""
+    steps = round(math.log(SEARCHED) / _STEP)
+    off = _STEP * np.arange(-steps, steps + 1)
+    wrong = (off / _WRONG_SIGMA) ** 2 + 2 * math.log(_WRONG_SIGMA / sigma / _WRONG)
+    return np.asarray(off, dtype=np.float64), np.asarray(np.minimum((off / sigma) ** 2, wrong), dtype=np.float64)
 
 
 def shown_aperture(
@@ -314,11 +375,8 @@ def shown_aperture(
     relative = means[drawn] / means[0].real
     origin, _ = origin_of(wanted, relative)
     real = (relative * np.conj(transfer(wanted, np.ones(len(wanted)), origin))).real
-    steps = round(math.log(SEARCHED) / _STEP)
-    off = _STEP * np.arange(-steps, steps + 1)
-    prior = np.minimum(
-        (off / _NOMINAL_SIGMA) ** 2, (off / _WRONG_SIGMA) ** 2 + 2 * math.log(_WRONG_SIGMA / _NOMINAL_SIGMA / _WRONG)
-    )
+    off, prior = _kappas(_NOMINAL_SIGMA)
+    steps = len(off) // 2
     angular = np.concatenate(
         [angular_frequencies(wanted, float(kappa), rotation_rad) for kappa in nominal_kappa * np.exp(off)]
     )
