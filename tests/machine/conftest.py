@@ -11,7 +11,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -21,6 +22,7 @@ from tests.machine.uml import HERE, Machine, Network, Station, copy, station
 
 ROOT = Path(__file__).parents[2]
 PACKAGED = ("src", "systemd", "tools/deb.py", "tools/install.py", "requirements-onboard.lock")
+SUITE = "bookworm"
 SIZE = 2_000_000
 FLIGHTS = "/var/lib/dappled/flights"
 SOON_S = 30.0  # it takes 10 to 20 on two calm cores; one that takes longer is no machine for what has to be done soon
@@ -46,9 +48,61 @@ def builds(request: pytest.FixtureRequest) -> bool:
     return any(item.get_closest_marker("long") for item in request.session.items)
 
 
+class Parts:
+    """What a machine is made of, for each of Debian's releases; made when first asked for, where it is missing."""
+
+    def __init__(self, folder: Callable[[], Path], *, builds: bool) -> None:
+        self._folder, self.builds = folder, builds
+
+    @cache  # noqa: B019 (it lives as long as the session)
+    def built(self, suite: str = SUITE) -> Path:
+        """Kernel and disk."""
+        return machine_part(f"--suite={suite}", *([] if self.builds else ["--cached"]))
+
+    @cache  # noqa: B019
+    def package(self, suite: str = SUITE) -> Path:
+        """The package of this state of the source."""
+        built = self.built(suite)
+        made = built / f"package-{_state()}.deb"
+        if not made.exists():
+            folder = self._folder()
+            make = [sys.executable, ROOT / "tools/deb.py", "--arch=amd64", f"--suite={suite}", "--out", folder]
+            subprocess.run([str(word) for word in make], check=True, stdout=sys.stderr)
+            for older in built.glob("package-*"):
+                older.unlink()
+            (found,) = folder.glob("*.deb")
+            copy(found, made)
+        return made
+
+    @cache  # noqa: B019
+    def installed(self, suite: str = SUITE) -> Path:
+        """A disk on which the package was installed while the machine ran; where nothing is built, of any state."""
+        built = self.built(suite)
+        disk = built / f"installed-{_state()}"
+        older = list(built.glob("installed-*"))
+        if disk in older:
+            return disk
+        if not self.builds:
+            return older[0] if older else pytest.skip("no package was installed in a machine here: run make machine")
+        package, folder = self.package(suite), self._folder()
+        with Network().inside():
+            machine = Machine(built, [copy(built / "disk", folder / "disk")], folder / "console")
+            try:
+                machine.start()
+                machine.put("/root/dappled.deb", package.read_bytes())
+                machine.run("dpkg -i /root/dappled.deb && rm /root/dappled.deb", timeout_s=600)
+                machine.off()
+            finally:
+                machine.cut()
+        for one in older:
+            one.unlink()
+        copy(folder / "disk", disk)
+        return disk
+
+
 @pytest.fixture(scope="session")
-def built(builds: bool) -> Path:
-    return machine_part(*([] if builds else ["--cached"]))
+def parts(builds: bool, tmp_path_factory: pytest.TempPathFactory) -> Parts:
+    return Parts(lambda: tmp_path_factory.mktemp("part"), builds=builds)
 
 
 def machine_part(*words: str) -> Path:
@@ -60,21 +114,6 @@ def machine_part(*words: str) -> Path:
     return Path(done.stdout.strip())
 
 
-@pytest.fixture(scope="session")
-def package(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package of this state of the source."""
-    made = built / f"package-{_state()}.deb"
-    if not made.exists():
-        folder = tmp_path_factory.mktemp("package")
-        make = [sys.executable, ROOT / "tools/deb.py", "--arch=amd64", "--suite=bookworm", "--out", folder]
-        subprocess.run([str(word) for word in make], check=True, stdout=sys.stderr)
-        for older in built.glob("package-*"):
-            older.unlink()
-        (found,) = folder.glob("*.deb")
-        copy(found, made)
-    return made
-
-
 def _state() -> str:
     return hashlib.sha256(b"".join((ROOT / name).read_bytes() for name in _files(*PACKAGED))).hexdigest()[:16]
 
@@ -82,32 +121,6 @@ def _state() -> str:
 def _files(*below: str) -> list[str]:
     found = [path for name in below for path in (ROOT / name, *(ROOT / name).rglob("*"))]
     return sorted(str(path.relative_to(ROOT)) for path in found if path.is_file() and path.parent.name != "__pycache__")
-
-
-@pytest.fixture(scope="session")
-def installed(built: Path, builds: bool, request: pytest.FixtureRequest) -> Path:
-    """A disk on which the package was installed while the machine ran; where nothing is built, of any state."""
-    disk = built / f"installed-{_state()}"
-    older = list(built.glob("installed-*"))
-    if disk in older:
-        return disk
-    if not builds:
-        return older[0] if older else pytest.skip("no package was installed in a machine here: run make machine")
-    package: Path = request.getfixturevalue("package")
-    folder = request.getfixturevalue("tmp_path_factory").mktemp("install")
-    with Network().inside():
-        machine = Machine(built, [copy(built / "disk", folder / "disk")], folder / "console")
-        try:
-            machine.start()
-            machine.put("/root/dappled.deb", package.read_bytes())
-            machine.run("dpkg -i /root/dappled.deb && rm /root/dappled.deb", timeout_s=600)
-            machine.off()
-        finally:
-            machine.cut()
-    for one in older:
-        one.unlink()
-    copy(folder / "disk", disk)
-    return disk
 
 
 class Scene:
@@ -161,22 +174,23 @@ class Scene:
 
 
 class _Shared:
-    """The machine that is on. `must`: one that does not start is a failure."""
+    """The machine that is on. Where parts are built, one that does not start is a failure."""
 
-    def __init__(self, built: Path, disk: Path, network: Network, folder: Callable[[], Path], *, must: bool) -> None:
-        self._built, self._disk, self._folder, self._must = built, disk, folder, must
+    def __init__(self, parts: Parts, network: Network, folder: Callable[[], Path]) -> None:
+        self._parts, self._folder, self._must = parts, folder, parts.builds
         self.network = network
         self._on: Machine | None = None
         self._kind: object = None
 
-    def machine(self, memory_mb: int, disks: Sequence[Path], usb: Path | None) -> Machine:
+    def machine(self, memory_mb: int, disks: Sequence[Path], usb: Path | None, *, suite: str) -> Machine:
         """The one that is on, as if it had been started now, or another one."""
-        kind = memory_mb, usb
+        kind = memory_mb, usb, suite
         if self._on is None or disks or kind != self._kind or not self._is_as_new(self._on):
             self.cut()
-            folder = self._folder()
-            root = f"{folder / 'written'},{self._disk}"
-            self._on, self._kind = Machine(self._built, [root, *disks], folder / "console", memory_mb, usb), kind
+            folder, disk = self._folder(), self._parts.installed(suite)
+            root = f"{folder / 'written'},{disk}"
+            made = Machine(self._parts.built(suite), [root, *disks], folder / "console", memory_mb, usb)
+            self._on, self._kind = made, kind
             try:
                 self._on.start() if self._must else self._on.start(SOON_S)
             except (OSError, AssertionError) as error:
@@ -184,7 +198,7 @@ class _Shared:
                 if self._must:
                     raise
                 pytest.skip(f"no machine starts here within {SOON_S:g} s ({type(error).__name__})")
-            if self._disk.name.rpartition("-")[2] != _state():
+            if disk.name.rpartition("-")[2] != _state():
                 source = ["/bin/tar", "-C", "src", "-c", *(name.removeprefix("src/") for name in _files("src"))]
                 packed = subprocess.run(source, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
                 self._on.put("/root/source.tar", packed)
@@ -204,6 +218,13 @@ class _Shared:
             return False  # as a USB bus that does not let go of a body
         return True
 
+    def said(self) -> str:
+        """The end of the service's log."""
+        if self._on is None:
+            return ""
+        with self.network.inside():
+            return self._on.run("journalctl -u dappled --no-pager -n 50", check=False)
+
     def cut(self) -> None:
         """Nobody wants it any more."""
         if self._on is not None:
@@ -212,26 +233,25 @@ class _Shared:
 
 
 @pytest.fixture(scope="package")
-def shared(builds: bool, built: Path, installed: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Shared]:
+def shared(parts: Parts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Shared]:
     try:
         network = Network()
     except (OSError, subprocess.SubprocessError) as error:
-        if builds:
+        if parts.builds:
             raise
         pytest.skip(f"no machine can have a network here: {error}")
-    made = _Shared(built, installed, network, lambda: tmp_path_factory.mktemp("machine"), must=builds)
+    made = _Shared(parts, network, lambda: tmp_path_factory.mktemp("machine"))
     yield made
     made.cut()
 
 
 @pytest.fixture
-def scene(shared: _Shared, request: pytest.FixtureRequest) -> Iterator[Callable[..., Scene]]:
+def scene(parts: Parts, shared: _Shared, request: pytest.FixtureRequest) -> Iterator[Callable[..., Scene]]:
     """Makes the scene: a machine with so much memory that is on, a body, and a station. `disks`: it has these, too.
     `spoils`: no other scene can have this machine afterwards."""
     failed = request.session.testsfailed
     unfit = False
     with ExitStack() as stack:
-        stack.enter_context(shared.network.inside())
 
         def made(
             memory_mb: int = 1024,
@@ -239,16 +259,23 @@ def scene(shared: _Shared, request: pytest.FixtureRequest) -> Iterator[Callable[
             disks: Sequence[Path] = (),
             usb: Path | None = None,
             *,
+            suite: str = SUITE,
             spoils: bool = False,
         ) -> Scene:
             nonlocal unfit
             unfit = spoils or bool(disks)
-            machine = shared.machine(memory_mb, disks, usb)
+            parts.installed(suite)  # what is fetched for it comes from outside
+            stack.enter_context(shared.network.inside())
+            machine = shared.machine(memory_mb, disks, usb, suite=suite)
             options = body or BodyOptions(picture=f"pattern:{SIZE}:cr2", bind=HERE)
             return Scene(machine, stack.enter_context(SimulatedBody.start(options)), stack.enter_context(station()))
 
         yield made
-    if unfit or request.session.testsfailed > failed:
+    broken = request.session.testsfailed > failed
+    if broken:
+        with suppress(subprocess.SubprocessError):
+            sys.stderr.write(shared.said())
+    if unfit or broken:
         shared.cut()
 
 

@@ -8,31 +8,34 @@ from collections.abc import Callable
 import pytest
 
 from dappled.mocks.body.body import pattern
-from tests.machine.conftest import SIZE, Scene
+from tests.machine.conftest import SIZE, SUITE, Scene
 
 pytestmark = [pytest.mark.long, pytest.mark.machine, pytest.mark.alone, pytest.mark.timeout(3600)]
 Make = Callable[..., Scene]
 CGROUP = "/sys/fs/cgroup/system.slice/dappled.service"
 
 
+@pytest.mark.parametrize("suite", ["trixie", SUITE])
 def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
-    scene: Make, table: Callable[[str, object], None]
+    scene: Make, table: Callable[[str, object], None], suite: str
 ) -> None:
-    flown = scene()
+    flown = scene(suite=suite)
     flown.configure()
     flown.machine.run("systemctl start dappled")
     began_us, ready_us = (int(flown.shown(f"{name}TimestampMonotonic")) for name in ("InactiveExit", "ActiveEnter"))
-    table("READY=1, s from the start of the unit", (ready_us - began_us) / 1e6)
+    table(f"{suite}: READY=1, s from the start of the unit", (ready_us - began_us) / 1e6)
     flown.begin()
     for _ in range(20):
         flown.station.shoot()
-    table("most memory of the service, MB", int(flown.machine.run(f"cat {CGROUP}/memory.peak")) / 1e6)
-    table("installed, MB", flown.machine.run("du -sm /usr/lib/dappled | cut -f1").strip())
+    table(f"{suite}: most memory of the service, MB", int(flown.machine.run(f"cat {CGROUP}/memory.peak")) / 1e6)
+    table(f"{suite}: installed, MB", flown.machine.run("du -sm /usr/lib/dappled | cut -f1").strip())
     pictures = {hashlib.sha256(pattern(number, SIZE)).hexdigest() for number in range(1, 21)}
     assert set(flown.frames().values()) == pictures
     assert sorted(flown.frames()) == sorted(flown.station.captured) == list(range(20))
     said = flown.machine.run("systemd-analyze security dappled --no-pager | tail -n 2")
-    assert float(said.split("dappled.service: ")[1].split()[0]) <= 1.5
+    exposure = float(said.split("dappled.service: ")[1].split()[0])
+    table(f"{suite}: exposure", exposure)
+    assert exposure <= 1.5
     assert flown.shown("NRestarts") == "0"
     doctor = flown.machine.run("dappled doctor --config /etc/dappled/dappled.toml 2>&1 || true")
     assert "of user dappled runs here" in doctor

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.machine.conftest import FLIGHTS, Scene
+from tests.machine.conftest import FLIGHTS, Parts, Scene
 from tests.machine.uml import copy
 
 pytestmark = [pytest.mark.long, pytest.mark.machine, pytest.mark.alone, pytest.mark.timeout(3600)]
@@ -83,9 +83,9 @@ pidfile /run/chronyd.pid
 
 
 @pytest.fixture(scope="session")
-def chrony(built: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def chrony(parts: Parts, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Debian's package; all that it needs is in the machine."""
-    kept = built / "chrony.deb"
+    kept = parts.built() / "chrony.deb"
     if not kept.exists():
         folder = tmp_path_factory.mktemp("chrony")
         done = subprocess.run(
@@ -138,11 +138,11 @@ def test_a_restart_under_a_running_interval_loses_no_announced_frame(scene: Make
 
 
 @pytest.fixture(scope="session")
-def newer(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def newer(parts: Parts, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package as a later version, with other default settings."""
     folder = tmp_path_factory.mktemp("newer")
     stage = folder / "stage"
-    subprocess.run(["/usr/bin/dpkg-deb", "-R", package, stage], check=True)
+    subprocess.run(["/usr/bin/dpkg-deb", "-R", parts.package(), stage], check=True)
     for name, pattern, text in (
         ("DEBIAN/control", r"(?m)^Version: .*", "Version: 99.0+bookworm"),
         ("usr/lib/dappled/dappled/__init__.py", r'__version__ = "[^"]+"', '__version__ = "99.0"'),

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
-from tests.machine.conftest import FLIGHTS, Scene, machine_part
+from tests.machine.conftest import FLIGHTS, SUITE, Scene, machine_part
 from tests.machine.uml import HERE
 from tests.waiting import eventually
 
@@ -36,8 +36,10 @@ def usb_kernel() -> Path:
 
 @pytest.fixture
 def on_usb(usb_kernel: Path, scene: Callable[..., Scene], request: pytest.FixtureRequest) -> Scene:
-    """A machine with an empty USB bus, a body to be plugged in; its pictures are small, or as large as given."""
-    made = scene(body=replace(BODY, **getattr(request, "param", {})), usb=usb_kernel)
+    """A machine with an empty USB bus, a body to be plugged in; its pictures are small, or as given, and so is Debian's
+    release."""
+    given = dict(getattr(request, "param", {}))
+    made = scene(usb=usb_kernel, suite=given.pop("suite", SUITE), body=replace(BODY, **given))
     made.configure("usb:")
     return made
 
@@ -52,6 +54,7 @@ def pictures(*numbers: int) -> list[str]:
     return sorted(hashlib.sha256(pattern(number, SMALL)).hexdigest() for number in numbers)
 
 
+@pytest.mark.parametrize("on_usb", [{"suite": "trixie"}, {"suite": SUITE}], indirect=True, ids=lambda it: it["suite"])
 def test_a_camera_that_is_plugged_in_late_is_found_and_every_byte_recorded(on_usb: Scene) -> None:
     flown = on_usb
     flown.machine.run(

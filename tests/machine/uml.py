@@ -26,6 +26,7 @@ _CLONE_NEWNET = 0x40000000
 _NETWORK = "/proc/thread-self/ns/net"
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _MARK = b"mark"
+_ANSWER_S = 2.0
 _PAGE = 4096  # what flash writes as a whole, and a block of ext4
 
 
@@ -64,7 +65,12 @@ class Machine:
     or "WRITTEN,FILE" where FILE is not to be changed. The second one has a volatile write cache."""
 
     def __init__(
-        self, built: Path, disks: Sequence[str | Path], log: Path, memory_mb: int = 1024, usb: Path | None = None
+        self,
+        built: Path,
+        disks: Sequence[str | Path],
+        log: Path,
+        memory_mb: int = 1024,
+        usb: Path | None = None,
     ) -> None:
         self._built, self._disks, self._log, self._memory_mb = built, disks, log, memory_mb
         self._kernel = (usb or built) / "linux"
@@ -88,19 +94,25 @@ class Machine:
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **here},
             )  # fmt: skip
         while time.monotonic() < began + within_s:
-            with contextlib.suppress(subprocess.SubprocessError):
-                self.run("true", timeout_s=10)
-                self._wire = subprocess.Popen(self._shell("", "-M", "-N"), stdin=subprocess.DEVNULL)
-                return
+            wire = subprocess.Popen(self._shell("", "-M", "-N"), stdin=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            while wire.poll() is None and time.monotonic() < began + within_s:
+                if self._socket.exists():  # made when it is let in
+                    self._wire = wire
+                    return
+                time.sleep(0.1)  # a machine that boots has nothing to wait on
+            wire.kill()
+            wire.wait()
             assert self._process.poll() is None, self._log.read_text(errors="replace")[-2000:]
-            time.sleep(0.5)  # a machine that boots has nothing to wait on, and each try is a process
+            time.sleep(0.5)  # each try is a process
         raise TimeoutError(self._log.read_text(errors="replace")[-2000:])
 
     def run(self, command: str, *, timeout_s: float = 120, check: bool = True) -> str:
         """What a command prints there, as root. Raises subprocess.SubprocessError."""
         done = subprocess.run(self._shell(command), capture_output=True, text=True, timeout=timeout_s, check=False)
         if check and done.returncode:
-            raise subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr + done.stdout)
+            error = subprocess.CalledProcessError(done.returncode, command, done.stdout, done.stderr)
+            error.add_note(done.stderr + done.stdout)
+            raise error
         return done.stdout
 
     def put(self, path: str, data: bytes) -> None:
@@ -108,7 +120,7 @@ class Machine:
         subprocess.run(self._shell(f"cat >{path}"), input=data, check=True, timeout=120)
 
     def _shell(self, command: str, *more: str) -> list[str]:
-        options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "LogLevel=ERROR", "ConnectTimeout=5"]
+        options = ["StrictHostKeyChecking=no", "UserKnownHostsFile=/dev/null", "LogLevel=ERROR", "ConnectTimeout=30"]
         options.append(f"ControlPath={self._socket}")
         there = ["-i", str(self._built / "key"), *(word for one in options for word in ("-o", one)), f"root@{THERE}"]
         return ["ssh", *more, *there, *([command] if command else [])]
@@ -249,20 +261,28 @@ class Station:
         self._socket.sendto(_MARK, (HERE, STATION_PORT))
         self.until(lambda it: it._marks > marks, "its own mark")
 
-    def request(self, *, every_s: float = 0, count: int = 1) -> None:
-        """Ask for one photograph, or for one every so often (`count` 0: without an end), and don't wait."""
+    def request(self, *, every_s: float = 0, count: int = 1, repeat: int = 0) -> None:
+        """Ask for one photograph, or for one every so often (`count` 0: without an end), and don't wait. `repeat`: how
+        often this was asked for before."""
         self.until(lambda it: it.camera is not None, "a camera's heartbeat")
         assert self.camera is not None
         assert self._peer is not None
-        self._sequence += 1
+        self._sequence += not repeat
         name = mavlink.MAV_CMD_IMAGE_START_CAPTURE
-        asked = mavlink.MAVLink_command_long_message(*self.camera, name, 0, 0, every_s, count, self._sequence, 0, 0, 0)
+        asked = mavlink.MAVLink_command_long_message(
+            *self.camera, name, repeat, 0, every_s, count, self._sequence, 0, 0, 0
+        )
         self._socket.sendto(asked.pack(self._mav), self._peer)
 
     def shoot(self) -> None:
-        """One photograph, to its announcement."""
-        known = len(self.captured)
-        self.request()
+        """One photograph, to its announcement. A request that is not answered is repeated, for less than the 10 s in
+        which a repeated one is no new one."""
+        known, answers = len(self.captured), len(self.accepted_s) + len(self.refused_s)
+        for repeat in range(4):
+            self.request(repeat=repeat)
+            with self._lock:
+                if self._lock.wait_for(lambda: len(self.accepted_s) + len(self.refused_s) > answers, _ANSWER_S):
+                    break
         self.until(lambda it: len(it.captured) > known, "an announced image")
 
 

@@ -2,6 +2,7 @@
 """Build the whole machine of `make machine`: a User Mode Linux kernel, and a disk with Debian and systemd as PID 1.
 
     tools/machine/build.py            prints the folder that has both
+    tools/machine/build.py --suite trixie      the same with Debian 13
     tools/machine/build.py --usb      compiles a kernel with a USB bus (6 min): prints the folder of kernel and modules
 
 Everything comes from Debian's packages. What was made stays in ~/.cache/dappled/machine, by the hash of its recipe,
@@ -26,8 +27,8 @@ PACKAGES = (
 )
 NETWORK = "[Match]\nName=eth0\n[Network]\nAddress=192.168.77.2/24\nLinkLocalAddressing=no\nIPv6AcceptRA=no\n"
 MASKED = (
-    "apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer fstrim.timer dpkg-db-backup.timer getty@tty1.service "
-    "systemd-networkd-wait-online.service"
+    "apt-daily.timer apt-daily-upgrade.timer e2scrub_all.timer e2scrub_reap.service fstrim.timer dpkg-db-backup.timer "
+    "getty@tty1.service systemd-networkd-wait-online.service"
 )
 DISK_BYTES = 3 << 30
 OPTIONS = "kernel.options"
@@ -37,11 +38,14 @@ def main() -> int:
     """Print the folder; exit code 1 says why there is none."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--usb", action="store_true", help="a kernel with a USB bus, compiled")
+    parser.add_argument("--suite", choices=("bookworm", "trixie"), default="bookworm", help="of the disk")
     parser.add_argument("--cached", action="store_true", help="only what is there")
     given = parser.parse_args()
     recipe = hashlib.sha256()
     for path in [HERE / OPTIONS] if given.usb else sorted(HERE.iterdir()):
         recipe.update(path.read_bytes() if path.is_file() and (given.usb or path.name != OPTIONS) else b"")
+    if not given.usb:
+        recipe.update(given.suite.encode())
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dappled" / "machine"
     made = cache / (("usb-" if given.usb else "") + recipe.hexdigest()[:16])
     needed = ["make", "flex", "bison", "bc", "gcc"] if given.usb else ["mmdebstrap", "gcc", "ip", "ssh", "mkfs.ext4"]
@@ -58,7 +62,7 @@ def main() -> int:
                 usb_kernel(whole, Path(folder))
             else:
                 kernel(whole, Path(folder))
-                disk(whole, Path(folder))
+                disk(whole, Path(folder), given.suite)
             whole.rename(made)
     print(made)
     return 0
@@ -98,7 +102,7 @@ def usb_kernel(whole: Path, work: Path) -> None:
     )
 
 
-def disk(whole: Path, work: Path) -> None:
+def disk(whole: Path, work: Path, suite: str) -> None:
     """The disk of a machine that starts, has an address and lets this user in over ssh; what the kernel needs here."""
     call("gcc", "-shared", "-fPIC", "-O2", "-o", str(whole / "before_libc.so"), *map(str, HERE.glob("*.c")), "-ldl")
     call("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(whole / "key"))
@@ -109,7 +113,7 @@ def disk(whole: Path, work: Path) -> None:
         "--variant=minbase",
         f"--include={PACKAGES}",
         "--format=directory",
-        "bookworm",
+        suite,
         str(root),
     )
     texts = {
