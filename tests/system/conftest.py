@@ -10,12 +10,17 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from tests import shared
+from tests.needs import without
+from tests.system.browsing import CHROMIUM, FLAGS, Daemon, simulated
 from tests.waiting import eventually
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser  # not in the smaller environment
 
 FRAMES = 2
 
@@ -53,6 +58,34 @@ def sockets() -> Iterator[Path]:
     """A folder with a short name, for ipc sockets."""
     with tempfile.TemporaryDirectory(prefix="dpl-") as folder:
         yield Path(folder)
+
+
+@pytest.fixture(scope="package")
+def daemon(tmp_path_factory: pytest.TempPathFactory, sockets: Path) -> Iterator[Daemon]:
+    """One simulated daemon with a console, for all tests that leave it as it was."""
+    with simulated(tmp_path_factory.mktemp("console"), sockets) as one:
+        yield one
+
+
+@pytest.fixture(scope="package")
+def chromium() -> Iterator[Browser]:
+    """Debian's Chromium without a window; skips where there is none."""
+    if shutil.which(CHROMIUM) is None:
+        without(f"no browser at {CHROMIUM}: apt install chromium, or set CHROMIUM")
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415  not in the smaller environment
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def leave(chromium: Browser) -> Iterator[None]:
+    """A test's pages go with it, as a person closes them; each holds connections to the console."""
+    yield
+    for context in chromium.contexts:
+        context.close()
 
 
 @pytest.fixture(scope="session")

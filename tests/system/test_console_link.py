@@ -17,29 +17,25 @@ import pytest
 
 from dappled.findings import Code
 from tests.daemon.test_settings_check import calibration
-from tests.system.test_console import (
+from tests.system.browsing import (
     DEADLINE_MS,
     SCREENSHOTS,
     TOKEN,
     Daemon,
-    chromium,
     client,
-    daemon,
-    flown,
-    leave,
     shoot,
+    simulated,
     until,
     until_flown,
+    until_text,
 )
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page, Route
 
-__all__ = ["chromium", "daemon", "leave"]  # fixtures
-
 SIZES = {"phone": (390, 844), "phone-on-its-side": (844, 390), "tablet": (1024, 600), "laptop": (1280, 800)}
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.alone, pytest.mark.usefixtures("leave")]
 
 
 class Link:
@@ -129,6 +125,11 @@ def is_old(page: Page) -> bool:
     return bool(page.evaluate("document.body.hasAttribute('data-stale')"))
 
 
+def until_new(page: Page) -> None:
+    """Until what the page shows is what is heard now."""
+    until(page, "!document.body.hasAttribute('data-stale')")
+
+
 def top_of_page(page: Page) -> float:
     """Where the page begins below its header, in px."""
     return float(page.evaluate("document.querySelector('main').getBoundingClientRect().top"))
@@ -150,7 +151,7 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
 ) -> None:
     page = page_of(chromium, link.url, size)
     before, stood = requested(daemon), top_of_page(page)
-    assert not is_old(page)
+    until_new(page)
     link.cut()
     page.click("#shoot")
     until(page, said("sending…"))
@@ -169,7 +170,7 @@ def test_over_a_cut_link_nothing_is_fired_late_and_nothing_old_looks_new(
     until_flown(page)
     until(page, said("nothing was fired"))
     assert requested(daemon) == before
-    assert not is_old(page)
+    until_new(page)
     if size == "phone":
         shoot(page)
         until(page, f"Number(document.querySelector('#counters dd').textContent) === {before + 1}")
@@ -295,8 +296,10 @@ def test_what_a_thumb_needs_is_on_the_first_screen(chromium: Browser, daemon: Da
 def test_a_flight_s_end_is_told_and_a_death_is_no_end(
     chromium: Browser, tmp_path: Path, sockets: Path, number: int, word: str
 ) -> None:
-    with flown(tmp_path, sockets) as one:
+    with simulated(tmp_path, sockets) as one:
         page = page_of(chromium, one.url, "phone")
+        told = until_text(page, "#instruments", r"frames left\s*unknown", r"histogram\s*unknown")
+        assert not re.search(r"(?<![.\d])0(?![.\d])", told), "before the first frame what is not known is no number"
         shoot(page)
         one.process.send_signal(number)
         until(page, f"document.querySelector('#verdict-word').textContent === {word!r}")
@@ -345,7 +348,7 @@ BARE = '[camera]\ndriver = "simulated"\noptions = {picture = "pattern:60000:dng"
 def test_what_is_lost_without_mask_and_link_is_a_caution_with_names(
     chromium: Browser, tmp_path: Path, sockets: Path
 ) -> None:
-    with flown(tmp_path, sockets, settings=BARE) as one:
+    with simulated(tmp_path, sockets, settings=BARE) as one:
         page = page_of(chromium, one.url, "phone", "caution")
         assert page.inner_text("#verdict-word") == "Caution"
         assert state_of(page, Code.DECODE_NO_MASK) == "caution"
@@ -370,7 +373,7 @@ def test_a_calibration_of_another_camera_is_no_go_on_the_page_before_and_after_f
     chromium: Browser, tmp_path: Path, sockets: Path
 ) -> None:
     calibration(tmp_path / "c.toml", "canon-eos-450d", "reference-5x5", "geometric")
-    with flown(tmp_path, sockets, settings=UNDECODABLE) as one:
+    with simulated(tmp_path, sockets, settings=UNDECODABLE) as one:
         page = page_of(chromium, one.url, "phone", "no-go")
         assert state_of(page, Code.DECODE_MISFIT) == "no-go"
         at_all_sizes(page, "no-go")

@@ -14,17 +14,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from tests.system.test_console import SCREENSHOTS, Daemon, chromium, leave, opened, until
+from tests.system.browsing import SCREENSHOTS, Daemon, opened, until, until_text
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-__all__ = ["chromium", "leave"]  # fixtures
-
 SIZES = [(390, 844), (844, 390), (1024, 600), (1280, 800)]
 LIVE_ONLY = ("#verdict", "#shoot", "#interval-go", "#interval-stop", "#tab-live", "#counters", "#settings", "#clock")
 
-pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.alone]
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.alone, pytest.mark.usefixtures("leave")]
 
 
 def url(command: subprocess.Popen[str]) -> str:
@@ -78,8 +76,7 @@ def test_a_recording_is_looked_at_and_nothing_on_its_page_waits_for_a_daemon(
     picture = page.locator("#gl").bounding_box()
     assert picture is not None
     assert picture["height"] >= 0.4 * min(width, height)
-    first = page.inner_text("#map-text")
-    assert first.startswith("frame "), first
+    first = until_text(page, "#map-text", "^frame ")
     page.locator("#strip > *").first.click()
     until(page, f"document.querySelector('#map-text').textContent !== {json.dumps(first)}")
     for tab in ("views", "slices", "spectrum"):
@@ -97,7 +94,7 @@ def test_a_recording_is_looked_at_and_nothing_on_its_page_waits_for_a_daemon(
     page.screenshot(path=SCREENSHOTS / f"recording-{width}x{height}-full.png")
     page.click("#tab-views")
     page.wait_for_selector("#frame-box:not([data-full]) #picture[data-kind='views']")
-    assert "verdict" in page.inner_text("#facts").lower()
+    until_text(page, "#facts", "(?i)verdict")
     assert watched.wrong == []
 
 
