@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import os
+import re
 import sys
 import tempfile
 import threading
@@ -38,13 +40,21 @@ def pytest_collection() -> Generator[None, object, object]:
         gc.enable()
 
 
+@functools.cache
+def _marks_in(path: Path) -> set[str]:
+    return set(re.findall(r"mark\.(\w+)", path.read_text(encoding="utf-8")))
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """A long test is a slow one too. A slow test that names no limit of its own has a long one: a busy machine takes
-    twice as long."""
+    twice as long. Its mark stands in its file: the Makefile has others not even read."""
     for item in items:
         if item.get_closest_marker("long"):
             item.add_marker(pytest.mark.slow)
+        for mark, names in (("slow", {"slow", "long"}), ("alone", {"alone"})):
+            if item.get_closest_marker(mark) and not names & _marks_in(item.path):
+                raise pytest.UsageError(f"{item.nodeid} is {mark}, and its file doesn't say so")
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW_S))
 

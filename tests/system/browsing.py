@@ -26,9 +26,7 @@ SCREENSHOTS = Path(__file__).parents[2] / "build" / "screenshots"
 TOKEN = "only-for-this-test-0123456789"  # noqa: S105  # it opens nothing
 DEADLINE_MS = 90_000
 LAPTOP, PHONE = {"width": 1440, "height": 900}, {"width": 390, "height": 844}
-# WebGL by the processor; the page itself is drawn without it, which costs a third less.
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--disable-gpu-compositing"]
-FLAGS += ["--disable-gpu-rasterization"]
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 @dataclass

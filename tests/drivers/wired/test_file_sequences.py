@@ -272,7 +272,13 @@ def shrunk(events: list[Event], seed: int, *, in_flight: bool) -> list[Event]:
 
 @pytest.mark.parametrize("in_flight", [True, False])
 @pytest.mark.parametrize(
-    "seeds", [range(100), pytest.param(range(100, 2100), marks=pytest.mark.slow)], ids=["100", "2000"]
+    "seeds",
+    [
+        range(100),
+        pytest.param(range(100, 500), marks=pytest.mark.slow),
+        pytest.param(range(500, 2500), marks=pytest.mark.long),
+    ],
+    ids=["100", "400", "2000"],
 )
 def test_no_picture_becomes_another_shot_s_and_none_is_lost(seeds: range, *, in_flight: bool) -> None:
     undisturbed = false = single = right = 0
