@@ -27,7 +27,8 @@ from scipy.special import j1
 
 from dappled.config.profiles import VerdictBounds
 from dappled.daemon.navigation import Telemetry
-from dappled.daemon.pipeline.verdicts import Judge, PictureFacts, detail, noise_of
+from dappled.daemon.pipeline.picture_facts import PictureFacts, detail, noise_of
+from dappled.daemon.pipeline.verdicts import Judge
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, exposure
 from dappled.flight import Tag, TimeSource

@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 from dappled import codec
 from dappled.codec import CodecError
+from dappled.daemon.pipeline.picture_facts import PictureFacts
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.pipeline.verdicts import PictureFacts
 from dappled.decode import DecodeError
 from dappled.decode.calibration import LatticeFit
 from dappled.decode.calibration.swept_distance import SweptDistance

@@ -17,10 +17,11 @@ from dappled.daemon.navigation import BodyLatency, ExposureTime
 from dappled.daemon.pipeline.capture import Observer, PendingShot, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
+from dappled.daemon.pipeline.picture_facts import PictureFacts
 from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
-from dappled.daemon.pipeline.verdicts import Judge, PictureFacts
+from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.stream.publisher import Stream
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.camera import (

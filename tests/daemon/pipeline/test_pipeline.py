@@ -23,7 +23,7 @@ from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTim
 from dappled.daemon.health.standing import in_record
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline import capture
-from dappled.daemon.pipeline.verdicts import PictureFacts
+from dappled.daemon.pipeline.picture_facts import PictureFacts
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import PublisherStatistics
 from dappled.drivers.camera import Blob, CameraError, CameraEvent, Companion, Deferred, Noticed

@@ -14,16 +14,12 @@ from numpy.typing import NDArray
 from dappled.config.profiles import VerdictBounds
 from dappled.config.settings import PlannedBody
 from dappled.daemon.body_plan import exposure_of, plan_of
+from dappled.daemon.pipeline.picture_facts import PictureFacts, defocus, detail, fineness, noise_of
 from dappled.daemon.pipeline.verdicts import (
     FixedPlan,
     FrameFacts,
     Judge,
-    PictureFacts,
     Verdict,
-    defocus,
-    detail,
-    fineness,
-    noise_of,
     unjudged,
     verdict,
 )

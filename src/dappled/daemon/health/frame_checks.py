@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config import profiles
-from dappled.daemon.pipeline.verdicts import DIRECTIONS, fineness
+from dappled.daemon.pipeline.picture_facts import DIRECTIONS, fineness
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, exposure

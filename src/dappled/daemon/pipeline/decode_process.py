@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from dappled import codec
 from dappled.clock import Clock, SystemClock
-from dappled.daemon.pipeline.verdicts import PictureFacts
+from dappled.daemon.pipeline.picture_facts import PictureFacts
 from dappled.drivers.child_process import (
     DECODER_GOES,
     ChannelError,

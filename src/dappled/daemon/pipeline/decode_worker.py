@@ -21,7 +21,7 @@ from PIL import Image
 from dappled import codec
 from dappled.config.profiles import VerdictBounds
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
-from dappled.daemon.pipeline.verdicts import PictureFacts, detail, noise_of
+from dappled.daemon.pipeline.picture_facts import PictureFacts, detail, noise_of
 from dappled.daemon.stream import wire
 from dappled.decode import DecodeError
 from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence

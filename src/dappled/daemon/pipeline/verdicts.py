@@ -6,14 +6,13 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dappled import codec
 from dappled.config.profiles import VerdictBounds
+from dappled.daemon.pipeline.picture_facts import PictureFacts, blur_circle
 from dappled.daemon.pipeline.spacing import Height
 from dappled.decode.geometry import FrameGeometry, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
@@ -25,16 +24,12 @@ STATES: tuple[VerdictState, ...] = ("good", "usable", "bad", "unknown")
 BAD_IN_A_ROW = 3
 LAST = 40  # as many as the console's film strip shows
 _MOST, _LEAST, _SHARPEST = 2000, 5, 0.25
-_FLOOR = 0.05  # of the median: what is darker counts as so bright, because its logarithm is noise
 _FIX_3D = 3  # GPS_FIX_TYPE
-_NOISY = 0.5  # of the finest detail: more noise than this, and its detail says nothing
 _LOW_M = 2.0  # a barometer's height is no better
 _LATE_NS = 50_000_000  # a time that is known less well may be that of another turn and speed
 _SILENT_MS = 2000.0
 _STAYS = 10  # frames with the lens as it is: a change of its settings is over
 _SAME = 0.01  # lens settings that differ by less are equal, but for rounding
-_STEPS = (1, 2, 4)  # pixels
-DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1, -1)}
 
 
 class HasExposurePlan(Protocol):
@@ -48,26 +43,6 @@ class FixedPlan:
     """One that does not change."""
 
     exposure: ExposurePlan = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class PictureFacts:
-    """What the pixels of a decoded frame say, and the geometry of its camera.
-
-    `detail` is of the mean slice, along rows and along columns (see `detail`), and `noise` of its noise; `side_mm` is
-    (height, width) of the sensor, `view_mm` and `pixel_mm` the (row, column) pitch of views and of the frame; None
-    where the camera has no profile. `bounds` are the profile's.
-    """
-
-    clipped_share: float
-    black_share: float
-    mean_share: float
-    detail: tuple[tuple[float, ...], ...]
-    noise: float = 0.0
-    side_mm: tuple[float, float] | None = None
-    view_mm: tuple[float, float] | None = None
-    pixel_mm: tuple[float, float] | None = None
-    bounds: VerdictBounds = field(default_factory=VerdictBounds)
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,7 +274,7 @@ class Judge:
     def _defocus(self, lens: LensSettings, seen: PictureFacts) -> tuple[float | None, str]:
         """The circle of confusion beyond that of the sharpest quarter of the frames in focus so far, which are kept by
         the lens' settings; or None, and why."""
-        circle = _circle(seen)
+        circle = blur_circle(seen)
         if circle is None:
             return None, "the picture has more noise than fine detail"
         known = self._sharpest.setdefault(lens, deque(maxlen=_MOST))
@@ -360,96 +335,3 @@ def _moved(before: LensSettings, now: LensSettings) -> str:
 
 def _pixels(blur_mm: tuple[float, float], pitch_mm: tuple[float, float] | None) -> float | None:
     return None if pitch_mm is None else math.hypot(blur_mm[0] / pitch_mm[0], blur_mm[1] / pitch_mm[1])
-
-
-def fineness(picture: NDArray[Any]) -> dict[str, float]:
-    """How fine the detail of a picture (rows, columns) is, in four directions: the mean squared difference over one
-    step by that over two, of logarithms, so that shade counts like light. 0.25 is perfectly smooth, 1 is noise."""
-    logs = np.log(np.maximum(picture, 1e-6 * max(float(picture.max()), 1e-12)))
-    found = {}
-    for name, step in DIRECTIONS.items():
-        one, two = (_differences(logs, (step[0] * n, step[1] * n)) for n in (1, 2))
-        found[name] = one / two if two > 0 and math.isfinite(one / two) else 0.0
-    return found
-
-
-def _differences(values: NDArray[Any], step: tuple[int, int]) -> float:
-    (rows, columns), (height, width) = step, values.shape
-    a = values[_part(height, rows), _part(width, columns)]
-    b = values[_part(height, -rows), _part(width, -columns)]
-    return float(np.mean((a - b) ** 2))
-
-
-def _part(length: int, shift: int) -> slice:
-    return slice(max(shift, 0), length + min(shift, 0))
-
-
-def detail(picture: NDArray[Any]) -> tuple[tuple[float, ...], ...]:
-    """Mean squared differences of a picture's logarithms over 1, 2 and 4 pixels, down its columns and along its rows.
-
-    Logarithms, so that shade counts like light; what is darker than a twentieth of the median counts as so bright. An
-    eighth of the picture is left out on each side: a frame's sides don't match, and what they differ by rings in the
-    slices of its spectrum next to the border, as fine as detail can be.
-    """
-    picture = _middle(picture)
-    logs = np.log(np.maximum(picture, _floor(picture)))
-    return tuple(tuple(_differences(logs, (down * n, right * n)) for n in _STEPS) for down, right in ((1, 0), (0, 1)))
-
-
-def noise_of(picture: NDArray[Any], sigma: float) -> float:
-    """What white noise of `sigma` adds to each number of `detail`."""
-    picture = _middle(picture)
-    return float(2 * np.mean((sigma / np.maximum(picture, _floor(picture))) ** 2))
-
-
-def _middle(picture: NDArray[Any]) -> NDArray[Any]:
-    rows, columns = (side // 8 for side in picture.shape)
-    return picture[rows : picture.shape[0] - rows, columns : picture.shape[1] - columns]
-
-
-def _floor(picture: NDArray[Any]) -> float:
-    return max(_FLOOR * float(np.median(picture)), 1e-12)
-
-
-def _circle(seen: PictureFacts) -> float | None:
-    """The circle of confusion of a picture in pixels of a view, the smaller ones where they are not square; None where
-    noise covers its finest detail.
-
-    Along the axis where it is smaller: motion blurs along one.
-    """
-    pitch = seen.view_mm or (1.0, 1.0)
-    found = []
-    for along, each in zip(seen.detail, pitch, strict=True):
-        if not along[0] > 0 or not seen.noise < _NOISY * along[0]:
-            return None
-        found.append(defocus(tuple(one - seen.noise for one in along)) * each)
-    return min(found) / min(pitch)
-
-
-def defocus(along: Sequence[float]) -> float:
-    """The diameter, in pixels, of the circle that a picture is out of focus by, from its `detail` along an axis.
-
-    Ground without blur looks alike at all scales: its power falls as f^−β. The differences over 2 and 4 pixels say how
-    fast, and what those over 1 pixel lack then is blur, by the transfer exp(−(π f d)² / 8) of a circle of diameter d.
-    At most 4.
-    """
-    one, two, four = along
-    diameters, fine, coarse = _blurred()
-    expected = [float(np.interp(-two / four, -coarse[:, at], fine[:, at])) for at in range(len(diameters))]
-    return float(np.interp(-one / two, -np.minimum.accumulate(expected), diameters))
-
-
-@cache
-def _blurred() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Diameters (D,), and of pictures of 51 slopes β from 0 to 5, blurred by them, the mean squared difference over one
-    pixel by that over two, and over two by that over four, (B, D) each."""
-    diameters, slopes = np.linspace(0, 4, 41), np.linspace(0, 5, 51)
-    f = (np.arange(48) + 0.5) / 96
-    squared = f[:, None] ** 2 + f[None, :] ** 2
-    powers = squared ** (-slopes[:, None, None] / 2)
-    sums = np.empty((3, len(slopes), len(diameters)))
-    for column, diameter in enumerate(diameters):
-        spectrum = (powers * np.exp(-((np.pi * diameter) ** 2) * squared / 4)).sum(axis=1)
-        for at, step in enumerate(_STEPS):
-            sums[at, :, column] = spectrum @ (1 - np.cos(2 * np.pi * step * f))
-    return diameters, sums[0] / sums[1], sums[1] / sums[2]
