@@ -10,8 +10,8 @@ import threading
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from html import escape  # that of xml.sax loads urllib, SSL and e-mail
 from typing import Protocol
-from xml.sax.saxutils import escape, quoteattr
 
 from dappled.drivers.camera import CameraError, Setting, SettingName
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
@@ -269,7 +269,7 @@ def _described(parameter: Parameter) -> str:
     """One setting: choices in the body's order; the current value as the only one where it is read-only."""
     choices = parameter.choices or (parameter.value,)
     readonly = "" if parameter.choices else ' readonly="1"'
-    options = "".join(f'        <option name={quoteattr(one)} value="{code(one)}"/>\n' for one in choices)
+    options = "".join(f'        <option name="{escape(one)}" value="{code(one)}"/>\n' for one in choices)
     return (
         f'    <parameter name="{parameter.name}" type="uint32" default="{code(choices[0])}"{readonly}>\n'
         f"      <description>{escape(parameter.title)}</description>\n"
