@@ -27,7 +27,7 @@ def _calibrate(camera: Camera, seed: int = 0, noise: float = 0.0) -> Calibration
     )
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_stopped_down_frame_tells_all_that_is_hidden(seed: int) -> None:
     camera = Camera.hidden(seed)
     (fit,) = _calibrate(camera, seed, noise=0.4 / 50).fits

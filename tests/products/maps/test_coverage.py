@@ -159,7 +159,7 @@ def flown(plan: dict[str, Any], rng: np.random.Generator, first: int) -> list[St
     return found
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (1, 2))])
 def test_a_refly_that_is_flown_closes_every_hole_and_flies_no_more(seed: int) -> None:
     rng = np.random.default_rng(seed)
     area, frames = square(80), survey(rng, 80, lost=0.4)
