@@ -1,7 +1,7 @@
 """The flight folder: journal, ledger, recorded frames, recovery, checks, index, offload."""
 
 from dappled.flight.chain import digest
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_error, disk_errors
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import LIVE, Ledger, LedgerReader
@@ -11,5 +11,5 @@ from dappled.flight.records import Cause, Frame, Result, Shot, ShotRow, ShotStat
 __all__ = [
     "LIVE", "Cause", "FlightError", "FlightFolder", "FlightsLock", "Frame", "ImageIndex", "Ledger", "LedgerReader",
     "Recorder", "Recording", "Result", "Shot", "ShotRow", "ShotState", "Stray", "Tag", "TimeSource",
-    "digest", "disk_error",
+    "digest", "disk_error", "disk_errors",
 ]  # fmt: skip

@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import os
 import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from dappled import durable
@@ -40,6 +42,15 @@ def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
     if isinstance(error, durable.NoPlainFileError):
         why = str(error.strerror)
     return FlightError(f"cannot {doing} {path}: {why}")
+
+
+@contextmanager
+def disk_errors(doing: str, path: Path) -> Iterator[None]:
+    """Context of work on a file or folder: raises FlightError, the sentence of `disk_error`, for an OSError in it."""
+    try:
+        yield
+    except OSError as error:
+        raise disk_error(doing, path, error) from error
 
 
 _LEDGER_REASONS = {

@@ -17,7 +17,7 @@ from typing import cast
 from dappled import confined
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, log_reading
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Database, LedgerReader
 from dappled.flight.records import ShotState
@@ -206,12 +206,10 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[Finding]]:
         if not path.is_file():
             raise
         aside = path.with_name(FILE_NAME + ".damaged")
-        try:
+        with disk_errors("move away the damaged index", path):
             os.replace(path, aside)
             for suffix in ("-wal", "-shm"):
                 path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
-        except OSError as second:
-            raise disk_error("move away the damaged index", path, second) from second
         return ImageIndex(root), [finding(Code.INDEX_REBUILT, Subject("flights"), why=str(error), aside=aside.name)]
 
 

@@ -24,7 +24,7 @@ import tomli_w
 from dappled import codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_toml, read_log
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_error, disk_errors
 
 _FLIGHT_NAME = re.compile(r"(\d{8}T\d{6}Z|boot[0-9a-f]{8})-[0-9a-f]{8}")
 _FRAME_NAME = re.compile(r"(\d{6,})\.([a-z0-9]{1,8})")
@@ -161,10 +161,8 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
 
 def open_folder(path: Path) -> FlightFolder:
     """Open a recorded flight. Raises FlightError when `path` is not one, OutsideError when a part of it is a link."""
-    try:
+    with disk_errors("open the flight", path):
         wrong = not_a_flight(path)
-    except OSError as error:
-        raise disk_error("open the flight", path, error) from error
     if wrong:
         raise FlightError(wrong)
     folder = FlightFolder(path)
@@ -230,10 +228,8 @@ class DiskSpace:
 
 def disk_space(path: Path) -> DiskSpace:
     """The space of the disk of `path`. Raises FlightError."""
-    try:
+    with disk_errors("ask for the free space of", path):
         disk = os.statvfs(path)
-    except OSError as error:
-        raise disk_error("ask for the free space of", path, error) from error
     block = disk.f_frsize
     total, free, available = (count * block for count in (disk.f_blocks, disk.f_bfree, disk.f_bavail))
     return DiskSpace(total, total - free, available, disk.f_favail if disk.f_files else None)
@@ -292,11 +288,9 @@ class FlightsLock:
         Raises FlightError when another process holds it.
         """
         path = root / _LOCK
-        try:
+        with disk_errors("make the lock", path):
             durable.make_folder(root)
             self._fd = os.open(path, os.O_RDWR | os.O_CREAT | _NO_LINK, 0o644)
-        except OSError as error:
-            raise disk_error("make the lock", path, error) from error
         try:
             file_lock.lock(self._fd)
             _refuse_shared(self._fd, path)
@@ -346,14 +340,12 @@ def refuse_unfinished(folder: FlightFolder) -> None:
 
 def remove_parts(folder: FlightFolder) -> list[str]:
     """Remove what was left half-written when recording or work was killed, durably, and name it. Raises FlightError."""
-    try:
+    with disk_errors("remove what was left half-written in", folder.path):
         parts = [path for path in folder.files() if durable.is_temporary(path.name)]
         for path in parts:
             path.unlink()
         for place in {path.parent for path in parts}:
             durable.sync_folder(place)  # or they might stand there again, in a flight that is closed by then
-    except OSError as error:
-        raise disk_error("remove what was left half-written in", folder.path, error) from error
     return [path.name for path in parts]
 
 

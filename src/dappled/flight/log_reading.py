@@ -14,7 +14,7 @@ from dappled import codec, durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored, parse_json, read_log
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_error, disk_errors
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
 from dappled.flight.records import Shot
 
@@ -119,13 +119,10 @@ def split(
 def summarise(path: Path, report: Callable[[Finding], object] = lambda _: None) -> TelemetrySummary:
     """Read a whole log and summarise it. Raises FlightError."""
     packets = sum(1 for _ in read_telemetry(path, report))
-    try:
-        with open(path, "rb", opener=durable.plain_file) as file:
-            return TelemetrySummary(
-                packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
-            )
-    except OSError as error:
-        raise disk_error("read the telemetry", path, error) from error
+    with disk_errors("read the telemetry", path), open(path, "rb", opener=durable.plain_file) as file:
+        return TelemetrySummary(
+            packets, os.fstat(file.fileno()).st_size, hashlib.file_digest(file, "sha256").hexdigest()
+        )
 
 
 def _record_end(data: bytes | mmap.mmap, at: int) -> int | None:

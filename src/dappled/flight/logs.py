@@ -22,7 +22,7 @@ from pathlib import Path
 from dappled.clock import Clock, SystemClock
 from dappled.codec import canonical
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_error, disk_errors
 from dappled.flight.records import Shot
 from dappled.workers import Loop
 
@@ -40,10 +40,8 @@ class AppendedFile:
         self.path, self._what = path, what
         doing = f"{'make' if new else 'open'} {what}"
         flags = os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | (os.O_EXCL if new else 0)
-        try:
+        with disk_errors(doing, path):
             self._fd = os.open(path, flags, 0o644)
-        except OSError as error:
-            raise disk_error(doing, path, error) from error
         try:
             size = os.fstat(self._fd).st_size
             self.last = os.pread(self._fd, 1, size - 1) if size else b""  # byte, when it was opened
@@ -56,20 +54,16 @@ class AppendedFile:
     def append(self, data: bytes, doing: str) -> int:
         """Write once; returns the number of bytes written. Raises FlightError, "cannot `doing` …", when it is 0."""
         self._open_for(doing)
-        try:
+        with disk_errors(doing, self.path):
             written = os.write(self._fd, data)
-        except OSError as error:
-            raise disk_error(doing, self.path, error) from error
         self._flusher.poke()
         return written
 
     def cut(self, size: int, doing: str) -> None:
         """Truncate the file to `size`. Raises FlightError as `append` does."""
         self._open_for(doing)
-        try:
+        with disk_errors(doing, self.path):
             os.ftruncate(self._fd, size)
-        except OSError as error:
-            raise disk_error(doing, self.path, error) from error
 
     @property
     def problem(self) -> Finding | None:

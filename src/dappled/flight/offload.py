@@ -18,7 +18,7 @@ from dappled.clock import Clock
 from dappled.findings import Code, Finding, Subject, finding, text, told
 from dappled.flight import later_copy, layout, ledger_copies, places, pruning, seals
 from dappled.flight.checks import flight_check
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.later_copy import Added, Rows
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
@@ -303,10 +303,8 @@ def _open_copy(stack: ExitStack, source: Tree, destination: Path, *, prune: bool
         places.refuse_same_place(source, above, same_device=same_device)
         if prune and not os.path.lexists(top / source.path.name):  # no folder is made that would stay empty
             _refuse_unprovable(above, top / source.path.name, same_device=same_device)
-    try:
+    with disk_errors("make the folder", top):
         durable.make_folder(top)
-    except OSError as error:
-        raise disk_error("make the folder", top, error) from error
     with Tree(top) as parent:
         places.refuse_same_place(source, parent, same_device=same_device)
         parent.enter(source.path.name, make=True)
@@ -358,10 +356,8 @@ def _write_sums(there: Tree, manifest: Mapping[str, Proved]) -> None:
     """Write the manifest beside the copy, as `sha256sum --check` reads it. Raises FlightError."""
     path = there.path.with_name(f"{there.path.name}.sha256")
     lines = [_sum(one.sha256, f"{there.path.name}/{name}") for name, one in sorted(manifest.items())]
-    try:
+    with disk_errors("write", path):
         durable.write_file(path, b"".join(lines))
-    except OSError as error:
-        raise disk_error("write", path, error) from error
 
 
 def _sum(sha256: str, name: str) -> bytes:

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from dappled import durable
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.trees import Tree
 
 KEEPS_FSYNC = frozenset(
@@ -94,7 +94,7 @@ def refuse_reexport(source: Tree, there: Tree) -> None:
     nonce = durable.temporary(Path(f"dappled-{secrets.token_hex(16)}")).name
     for name, fd in there.folders.items():
         made = there.path / name / nonce
-        try:
+        with disk_errors("make and remove", made):
             for old in filter(_NONCE.fullmatch, os.listdir(fd)):
                 os.unlink(old, dir_fd=fd)  # of an attempt that was cut short
             os.close(os.open(nonce, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600, dir_fd=fd))
@@ -102,8 +102,6 @@ def refuse_reexport(source: Tree, there: Tree) -> None:
                 seen = [held for held, own in source.folders.items() if _stands(nonce, own)]
             finally:
                 os.unlink(nonce, dir_fd=fd)
-        except OSError as error:
-            raise disk_error("make and remove", made, error) from error
         if seen:
             raise FlightError(
                 f"what is written into {there.path / name} appears in {source.path / seen[0]}: they are one folder, "

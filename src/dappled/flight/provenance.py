@@ -8,7 +8,7 @@ from typing import Any
 
 from dappled import durable
 from dappled.flight import layout
-from dappled.flight.errors import disk_error
+from dappled.flight.errors import disk_errors
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger
 
@@ -18,12 +18,10 @@ _FACT = "sha256:"  # and the name relative to the flight; the value lists every 
 def note(folder: FlightFolder, ledger: Ledger, under: str) -> None:
     """Store the current hash of a file, or of every file below a folder. Raises FlightError."""
     place = folder.path / under
-    try:
+    with disk_errors("read", place):
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             if path.is_file():
                 ledger.set_fact(_FACT + str(path.relative_to(folder.path)), [durable.hash_file(path)])
-    except OSError as error:
-        raise disk_error("read", place, error) from error
 
 
 def write_facts(folder: FlightFolder, ledger: Ledger, facts: Mapping[str, Any]) -> None:
@@ -33,12 +31,10 @@ def write_facts(folder: FlightFolder, ledger: Ledger, facts: Mapping[str, Any]) 
     data = layout.facts_as_toml(facts)
     sha256 = hashlib.sha256(data).hexdigest()
     before = ledger.facts().get(key, [])
-    try:
+    with disk_errors("write", folder.settings):
         ledger.set_fact(key, [*before, sha256])
         durable.write_file(folder.settings, data)
         ledger.set_fact(key, [sha256])
-    except OSError as error:
-        raise disk_error("write", folder.settings, error) from error
 
 
 def noted(facts: Mapping[str, Any]) -> dict[str, list[str]]:

@@ -17,7 +17,7 @@ from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.codec import canonical
 from dappled.findings import Code, Subject, finding
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_error, disk_errors
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.trees import FileIdentity, Tree
@@ -105,10 +105,8 @@ def note(
             Code.FLIGHT_FILES_REMOVED, Subject("flight"), files=len(sure), which=which, there=to, sha256=sha256
         )
         ledger.add_event(EVENT, noted)
-    try:
+    with disk_errors("write", folder.path / RECORD):
         durable.write_file(folder.path / RECORD, data)
-    except OSError as error:
-        raise disk_error("write", folder.path / RECORD, error) from error
 
 
 def _refuse_other(source: Tree, name: str, fd: int, one: Proved) -> None:

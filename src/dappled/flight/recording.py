@@ -21,7 +21,7 @@ from dappled import durable, findings
 from dappled.clock import Clock
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import layout, provenance, recovery, seals
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_error, disk_errors
 from dappled.flight.index import ImageIndex, IndexEntry, open_or_rebuild
 from dappled.flight.layout import FlightFolder, FlightsLock
 from dappled.flight.ledger import Ledger
@@ -107,10 +107,8 @@ class Recorder:
     def record_stray(self, camera_name: str, blob: FileBytes, why: Finding, *, arrived_utc_ns: int) -> Stray:
         """Make a file safe that belongs to no shot: `why`. Raises FlightError."""
         taken = {PurePosixPath(stray.name).stem for stray in self._ledger.strays()}
-        try:  # one may have lost its row to a full disk
+        with disk_errors("list", self._folder.frames):  # one may have lost its row to a full disk
             taken |= {PurePosixPath(one).stem for one in self._with_reserve(partial(os.listdir, self._folder.frames))}
-        except OSError as error:
-            raise disk_error("list", self._folder.frames, error) from error
         number = next(n for n in range(len(taken) + 1) if f"stray-{n:06d}" not in taken)
         name = f"frames/stray-{number:06d}.{layout.extension(camera_name)}"
         sha256 = self._write(name, camera_name, blob)
@@ -313,7 +311,5 @@ def begin(
 
 
 def _sync_names(folder: FlightFolder) -> None:
-    try:
+    with disk_errors("make the flight folder", folder.path):
         durable.sync_folder(folder.path)
-    except OSError as error:
-        raise disk_error("make the flight folder", folder.path, error) from error

@@ -17,7 +17,7 @@ from dappled.clock import Clock
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, log_reading, logs, seals
-from dappled.flight.errors import disk_error
+from dappled.flight.errors import disk_errors
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
@@ -159,11 +159,9 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[Finding]:
         if path.is_symlink():
             report.append(finding(Code.FILE_NOT_FOLLOWED, FLIGHT, file=name))
             continue
-        try:
+        with disk_errors("adopt", path):
             stat = path.stat()
             sha256 = durable.hash_file(path)
-        except OSError as error:
-            raise disk_error("adopt", path, error) from error
         number = layout.index_of(file_name)
         row = None if number is None else ledger.shot(number)
         if number is not None and row is not None and row.state != "safe":

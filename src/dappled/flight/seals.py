@@ -22,7 +22,7 @@ from dappled.clock import Clock
 from dappled.codec import canonical
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, pruning
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.seal_key import SealKey
@@ -99,33 +99,30 @@ def seal(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None 
     The ledger says first how many seals there are, so that one cut off is missed. Frames and telemetry count with the
     digests that the ledger took when they were written. Raises FlightError.
     """
-    try:
-        with _alone(folder.path):
-            before, known = _content(folder), read(folder)
-            before += b"" if before.endswith(b"\n") or not before else b"\n"  # a torn line stays, by itself
-            with Ledger(folder.ledger, clock) as ledger:
-                facts = ledger.facts()
-                if "closed_utc_ns" not in facts:
-                    return
-                count = max([announced(facts)[0], *known.seals]) + 1
-                missing = sorted(set(range(1, count)) - known.seals.keys())
-                ledger.set_fact(FACT, {"count": count, "missing": missing})
-                ledger.fold()
-                head, recorded = ledger.last_link(), recorded_files(ledger)
-            assert head is not None, "a ledger that is open for writing has a chain"
-            files = {
-                str(path.relative_to(folder.path)): recorded.get(str(path.relative_to(folder.path)))
-                or (path.stat().st_size, durable.hash_file(path))
-                for path in sealed_paths(folder)
-            }
-            chain = (head.number, head.link, files, _last_digest(before))
-            values = (count, of_flight(facts), clock.utc_ns(), why.value, *chain)
-            made = Seal(*values, key=None if key is None else key.name)
-            if key is not None:
-                made = Seal(*values, key=key.name, mac=key.sign(made.signed_part()))
-            durable.write_file(folder.seals, before + made.line() + b"\n")
-    except OSError as error:
-        raise disk_error("seal the flight", folder.path, error) from error
+    with disk_errors("seal the flight", folder.path), _alone(folder.path):
+        before, known = _content(folder), read(folder)
+        before += b"" if before.endswith(b"\n") or not before else b"\n"  # a torn line stays, by itself
+        with Ledger(folder.ledger, clock) as ledger:
+            facts = ledger.facts()
+            if "closed_utc_ns" not in facts:
+                return
+            count = max([announced(facts)[0], *known.seals]) + 1
+            missing = sorted(set(range(1, count)) - known.seals.keys())
+            ledger.set_fact(FACT, {"count": count, "missing": missing})
+            ledger.fold()
+            head, recorded = ledger.last_link(), recorded_files(ledger)
+        assert head is not None, "a ledger that is open for writing has a chain"
+        files = {
+            str(path.relative_to(folder.path)): recorded.get(str(path.relative_to(folder.path)))
+            or (path.stat().st_size, durable.hash_file(path))
+            for path in sealed_paths(folder)
+        }
+        chain = (head.number, head.link, files, _last_digest(before))
+        values = (count, of_flight(facts), clock.utc_ns(), why.value, *chain)
+        made = Seal(*values, key=None if key is None else key.name)
+        if key is not None:
+            made = Seal(*values, key=key.name, mac=key.sign(made.signed_part()))
+        durable.write_file(folder.seals, before + made.line() + b"\n")
 
 
 @contextmanager
@@ -203,7 +200,7 @@ def changed_since(folder: FlightFolder) -> list[str]:
     with LedgerReader.open(folder.ledger) as ledger:
         recorded = recorded_files(ledger)
     found = set()
-    try:
+    with disk_errors("read the files of", folder.path):
         for name, what in differing(folder, last, recorded.keys()):
             if isinstance(what, OSError):
                 raise what
@@ -211,8 +208,6 @@ def changed_since(folder: FlightFolder) -> list[str]:
         wal = folder.ledger.with_name(folder.ledger.name + "-wal")
         if wal.is_file() and wal.stat().st_size:
             found.add(folder.ledger.name)
-    except OSError as error:
-        raise disk_error("read the files of", folder.path, error) from error
     try:
         found -= pruning.removed(folder).keys()
     except FlightError:  # `flight check` says what is wrong with it
@@ -252,10 +247,8 @@ def is_sealed(folder: FlightFolder) -> bool:
 def read(folder: FlightFolder) -> SealFile:
     """The seals of a flight; none where there is no file. A line that is no seal, or does not follow from the line
     before it, is reported. Raises FlightError when the file can't be read."""
-    try:
+    with disk_errors("read the seals", folder.seals):
         return parse(_content(folder), folder.seals.name)
-    except OSError as error:
-        raise disk_error("read the seals", folder.seals, error) from error
 
 
 def parse(content: bytes, name: str) -> SealFile:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from dappled import durable
 from dappled.flight import read_back
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.read_back import ReadBack
 from dappled.flight.trees import FileIdentity, Tree
 
@@ -59,10 +59,8 @@ def prove(goal: Tree, name: str, sha256: str, wrong: str, identity: FileIdentity
     where it has other bytes, and where it can't be read."""
     copy = copy_of(goal, name)
     folder, _, last = name.rpartition("/")
-    try:
+    with disk_errors("read back", goal.path / name):
         found, how = read_back.hash_on_disk(last, goal.folders[folder])
-    except OSError as error:
-        raise disk_error("read back", goal.path / name, error) from error
     if found != sha256 or copy is None:
         raise FlightError(wrong)
     return Proved(identity or copy, sha256, copy, how)

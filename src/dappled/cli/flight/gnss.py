@@ -16,7 +16,7 @@ from dappled.findings import Code, Finding, Subject, finding
 
 if not words_only:
     from dappled.drivers.gnss import recorded
-    from dappled.flight import FlightError, disk_error, layout, log_reading
+    from dappled.flight import FlightError, disk_errors, layout, log_reading
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +49,8 @@ class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
                     f"{flight} holds no stream of a GNSS receiver: name its port in gnss.port before the flight"
                 )
 
-        try:
+        with disk_errors("write", to):
             durable.fill_file(to, fill)
-        except OSError as error:
-            raise disk_error("write", to, error) from error
         if not kinds[RXM_RAWX]:
             doubts.append(finding(Code.GNSS_NO_RAW, Subject("file", str(to))))
         if stream.bad:

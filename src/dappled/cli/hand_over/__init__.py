@@ -16,7 +16,7 @@ from dappled.errors import DappledError, counted
 
 if not words_only:
     from dappled.daemon.stream.curve import read_private
-    from dappled.flight import disk_error
+    from dappled.flight import disk_error, disk_errors
     from dappled.products.handover import nodeodm
     from dappled.products.handover.nodeodm import NodeOdm, NodeOdmError
 
@@ -118,14 +118,12 @@ CLASSES = {"hand-over": HandOver}
 def _check_writable(path: Path) -> None:
     """Raises DappledError where results could not be put there: better before hours of work than after."""
     part = durable.temporary(path)
-    try:
+    with disk_errors("write", path):
         if path.is_dir():
             raise DappledError(f"{path} is a folder: -o names the file of the results, such as {path / 'model.zip'}")
         durable.make_folder(path.parent)
         os.close(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC, 0o644))
         part.unlink()
-    except OSError as error:
-        raise disk_error("write", path, error) from None
 
 
 def _token(file: Path | None) -> str:

@@ -15,7 +15,7 @@ from dappled import codec, durable
 from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.findings import Finding, Subject
-from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, layout
+from dappled.flight import FlightError, Frame, LedgerReader, Tag, disk_error, disk_errors, layout
 from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
@@ -173,17 +173,13 @@ def _camera(pose: Pose, mounting: Mounting, geoid: Geoid | None) -> CameraPose |
 
 
 def _make(folder: Path) -> None:
-    try:
+    with disk_errors("make the folder", folder):
         durable.make_folder(folder)
-    except OSError as error:
-        raise disk_error("make the folder", folder, error) from error
 
 
 def _write(path: Path, data: bytes) -> None:
-    try:
+    with disk_errors("write", path):
         durable.write_file(path, data)
-    except OSError as error:
-        raise disk_error("write", path, error) from error
 
 
 def odm(placed: Sequence[Placed], suffix: str | None = None) -> str:

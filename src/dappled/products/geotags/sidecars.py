@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 from dappled import codec, durable
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
-from dappled.flight import Tag, disk_error
+from dappled.flight import Tag, disk_errors
 
 _HEAD_BYTES = 1 << 16
 _MARK = "dappled"
@@ -47,15 +47,13 @@ def text(tag: Tag, camera: CameraPose | None, utc_ns: int | None) -> str:
 def write(path: Path, content: str, *, force: bool = False) -> None:
     """Write a sidecar, whole or not at all. Raises DappledError for one that another program wrote (`force` replaces
     it), and FlightError when the disk refuses."""
-    try:
+    with disk_errors("write the sidecar", path):
         if not force and path.exists() and not _ours(path):
             raise DappledError(
                 f"{path} was written by another program, and may have been edited by hand: "
                 "move it away, write elsewhere with --output, or replace it with --force"
             )
         durable.write_file(path, content.encode())
-    except OSError as error:
-        raise disk_error("write the sidecar", path, error) from error
 
 
 def _ours(path: Path) -> bool:
