@@ -75,7 +75,7 @@ import gc, importlib, json, os, signal, sys, tempfile
 from dappled import __main__ as program
 from dappled.cli import VERBS, calling
 for module, _ in VERBS.values():
-    importlib.import_module(f"dappled.cli.{module}")
+    importlib.import_module(f"dappled.cli.{module.partition(':')[0]}")
 gc.freeze()
 for line in sys.stdin:
     call = json.loads(line)

@@ -128,9 +128,6 @@ class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
         return batch.plan(folder.path, recipe, options, self.kinds, self.output, placed=by_index), placed, doubts
 
 
-CLASSES = {"batch": ProcessFlights}
-
-
 def _tell(done: Done, output: Output) -> None:
     """Say what became of a frame."""
     for text in dict.fromkeys(done.refused.values()) or ([done.error] if done.error else []):

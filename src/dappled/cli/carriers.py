@@ -209,9 +209,6 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
             )
 
 
-CLASSES = {"carriers": ShowCarriers}
-
-
 def _save(shown: Any, path: Path) -> None:
     """Write a picture, whole or not at all, in the form that its name says. Raises DappledError and OSError."""
     coded = io.BytesIO()

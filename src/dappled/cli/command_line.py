@@ -68,13 +68,13 @@ class Call:
 
 def verb_class(path: str) -> type[Verb]:
     """The class of a verb, by its words."""
-    name = f"dappled.cli.{VERBS[path][0]}"
+    name, _, made = VERBS[path][0].partition(":")
     try:
-        module = importlib.import_module(name)
+        module = importlib.import_module(f"dappled.cli.{name}")
     except NameError:  # one of its words is what was left out: with all of it the help is slow, and whole
         table.words_only = False
-        module = importlib.import_module(name)
-    found: type[Verb] = module.CLASSES[path]
+        module = importlib.import_module(f"dappled.cli.{name}")
+    found: type[Verb] = getattr(module, made)
     return found
 
 

@@ -52,9 +52,6 @@ class PrintCompletion(Verb):
         return Report({"shell": self.shell, "script": script}, script.splitlines())
 
 
-CLASSES = {"completion": PrintCompletion}
-
-
 def words() -> dict[str, list[str]]:
     """What may come after each path of words: verbs, actions, options, and the choices of arguments."""
     found: dict[str, list[str]] = {

@@ -91,6 +91,3 @@ class ListProfiles(Verb):
                 lines.append(f"{'':34} {height} × {width} px: {raw.name}")
         lines += [f"mask   {m.name:16} {len(m.mask.orders()):3} carriers {m.description}" for m in masks]
         return Report(values, lines)
-
-
-CLASSES = {"config check": CheckSettings, "config show": ShowSettings, "profiles": ListProfiles}

@@ -97,9 +97,6 @@ class _Decoding:
         return FrameMade(tuple(made.doubts), _facts(target, made), (f"{target}: {summary(made)}",))
 
 
-CLASSES = {"decode": DecodeFrames}
-
-
 def _refuse_contradicted(frame: Path, made: DecodeResult) -> None:
     """Carriers that must be visible and are not: slices cut at the prediction would hold nothing."""
     if made.contradiction:

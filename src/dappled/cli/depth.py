@@ -192,9 +192,6 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         return {"points": len(cloud.points), "withheld": cloud.withheld, "coordinates": cloud.crs or "camera axes"}
 
 
-CLASSES = {"depth": MeasureDepth}
-
-
 def summary(found: OpenedLightField, made: DepthMap, distances: DistanceMap | None) -> dict[str, Any]:
     """A depth map in a few numbers; None where nothing is known."""
     report: dict[str, Any] = {

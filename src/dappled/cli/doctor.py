@@ -63,9 +63,6 @@ class ExamineMachine(SettingsArgument, Verb):
         return _watch(output) if self.watch else _examined(self, output)
 
 
-CLASSES = {"doctor": ExamineMachine}
-
-
 def _examined(arguments: ExamineMachine, output: Output) -> Report:
     settings = settings_check.checked(configuration.examine_file(arguments.config), by_this_user=False)
     if not arguments.simulate and is_listening(endpoint := stream_endpoint(arguments.config)):

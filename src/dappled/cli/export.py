@@ -84,6 +84,3 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
             case _:
                 light_files.save(path, found.field, overwrite=self.overwrite)
         return path
-
-
-CLASSES = {"export": ExportLightField}

@@ -238,9 +238,6 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         return files
 
 
-CLASSES = {"georeference": MapFlight}
-
-
 def _camera_of(flight: Path) -> str:
     """The name of the camera's profile."""
     _, tags = photographs.recorded(flight)

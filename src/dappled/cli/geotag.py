@@ -189,9 +189,6 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
             return None, [finding(Code.FLIGHT_VEHICLE_UNDECIDED, Subject("flight"), why=str(error))]
 
 
-CLASSES = {"geotag": TagFrames}
-
-
 def _tag_late(
     flight: Path, key: SealKey | None, vehicle: int | None, output: Output, *, into_flight: bool
 ) -> list[int]:

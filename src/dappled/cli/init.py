@@ -103,9 +103,6 @@ class InitSettings(Overwriting, Verb):
         return ask(question, input, lambda said: refuse_wrong(answers | {question.flag: said}, self.file))
 
 
-CLASSES = {"init": InitSettings}
-
-
 def questions(found: Sequence[UsbBody], serial: Sequence[str]) -> list[Question]:
     """What is asked, with what is proposed by what is plugged in; "" where nothing can be proposed."""
     cameras, masks = profiles.shipped("cameras"), profiles.shipped("masks")

@@ -118,15 +118,6 @@ class MakeLinkKey(_NewFile):
         return Report({"key_file": str(self.file)}, [said])
 
 
-CLASSES = {
-    "keys make": MakeKeys,
-    "keys show": ShowKey,
-    "keys token": MakeToken,
-    "keys seal": MakeSealKey,
-    "mavlink key": MakeLinkKey,
-}
-
-
 def _passphrase() -> str:
     """Ask on a terminal, else read the first line of standard input."""
     text = getpass.getpass("passphrase: ") if sys.stdin.isatty() else sys.stdin.readline().rstrip("\n")

@@ -262,9 +262,6 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         return made.picture, Note(f"{share:.0%} of the pixels have a sharpest picture {planes_said}", facts)
 
 
-CLASSES = {"refocus": RefocusLightField}
-
-
 def through_scene(found: OpenedLightField) -> NDArray[np.float64]:
     """Disparities of planes through the scene, so close that the outermost views move by a quarter of a pixel."""
     low, high = disparity_range(replace(found.evidence, filled=None), workers=found.workers)

@@ -239,9 +239,6 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         return None if self.rate == math.inf else replay.as_recorded(self.rate)
 
 
-CLASSES = {"replay": ReplayFlight}
-
-
 def _same(writer: ReplayVerifier) -> str:
     """In which sense everything was the same."""
     if not writer.close:

@@ -107,9 +107,6 @@ class RunDaemon(SettingsArgument, Verb):
                 return serve(checked, plan, simulation)
 
 
-CLASSES = {"run": RunDaemon}
-
-
 @dataclass(frozen=True, slots=True)
 class RunPlan:
     """When a run ends, the settings file that it was started with, and how it prints frames."""

@@ -55,9 +55,6 @@ class ShowStatus(Verb):
         return Report(record, screen(record))
 
 
-CLASSES = {"status": ShowStatus}
-
-
 def unit(config: Path | None) -> str:
     """The service that has these settings: those with another name beside the service's (/etc/dappled/left.toml) are
     of `dappled@left`."""

@@ -112,9 +112,6 @@ class AskForPhotographs(Verb):
         )
 
 
-CLASSES = {"trigger": AskForPhotographs}
-
-
 def _line(one: Outcome) -> str:
     ack = "" if one.ack_ms is None else f", acknowledged after {one.ack_ms:.1f} ms"
     if one.ok:

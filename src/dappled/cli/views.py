@@ -87,9 +87,6 @@ class DrawViews(Overwriting, FieldArguments, Verb):
         )
 
 
-CLASSES = {"views": DrawViews}
-
-
 def _parallax(found: OpenedLightField) -> list[prints.Bytes]:
     """The views around the middle one, half-way to the aperture's edge, once round. Raises DecodeError for one view."""
     needs_parallax(found.stack, "an animation of parallax")

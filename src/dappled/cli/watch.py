@@ -93,9 +93,6 @@ class WatchStream(Verb):
             return Report(None, [said], failed=bool(seen.short_of(self.count) or subscriber.lost or subscriber.unsent))
 
 
-CLASSES = {"watch": WatchStream}
-
-
 def _show(message: Message, output: Output) -> None:
     header = message.header
     size = memoryview(message.body).nbytes if message.body is not None else 0

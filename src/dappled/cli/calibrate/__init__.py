@@ -127,6 +127,3 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
         if asked is not None and not self.anyway:
             raise DappledError(f"{told(asked, CALIBRATION)}; --anyway writes the calibration with this doubt in it")
         return replace(found, overridden=(*found.overridden, asked)) if able and asked is not None else found
-
-
-CLASSES = {"calibrate": CalibrateMask}

@@ -185,13 +185,3 @@ class OffloadFlight(Doubtable, FlightArgument, Verb):
                 progress=add,
             )
         return Report(codec.plain(done), list(flight_lines.of_offload(done)), findings=done.doubts)
-
-
-CLASSES: dict[str, type[Verb]] = {
-    "flight list": ListFlights,
-    "flight show": ShowFlight,
-    "flight check": CheckFlight,
-    "flight report": ReportFlight,
-    "flight seal": SealFlight,
-    "flight offload": OffloadFlight,
-}

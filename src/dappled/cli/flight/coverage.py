@@ -152,9 +152,6 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         return Report(values, [*lines, *map(str, files)], failed=bool(missed))
 
 
-CLASSES = {"flight coverage": CoverageOfFlight}
-
-
 def _median(covered: coverage.Coverage) -> float:
     found = sorted(covered.frames[covered.planned].tolist())
     return float(found[len(found) // 2])

@@ -59,6 +59,3 @@ class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
         size_mb = f"{size / 1e6:.2f} MB, {counted(kinds.total(), 'UBX message')}"
         line = f"{to}: {size_mb}, {kinds[RXM_RAWX]} of raw measurements, {kinds[TIM_TM2]} of time marks"
         return Report({"file": str(to), **values, "doubts": codec.plain(doubts)}, [line], findings=doubts)
-
-
-CLASSES = {"flight gnss": WriteReceiverStream}

@@ -79,9 +79,6 @@ class PickUpFiles(Doubtable, FlightArgument, Verb):
         )
 
 
-CLASSES = {"flight pickup": PickUpFiles}
-
-
 def _lines(flight: str, proposal: Proposal, picked: Picked | None) -> list[str]:
     word = "would be" if picked is None else "is"
     lines = []

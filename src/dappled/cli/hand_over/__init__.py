@@ -112,9 +112,6 @@ class HandOver(Overwriting, Verb):
             raise
 
 
-CLASSES = {"hand-over": HandOver}
-
-
 def _check_writable(path: Path) -> None:
     """Raises DappledError where results could not be put there: better before hours of work than after."""
     part = durable.temporary(path)

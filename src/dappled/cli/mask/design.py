@@ -101,9 +101,6 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         return Report({"law": one.law, "mask_distance_mm": one.distance_mm, **codec.plain(best)}, lines)
 
 
-CLASSES = {"mask design": DesignMask}
-
-
 def _picture(made: Design) -> Any:
     height, width = made.wanted.sensor.shape
     shrink = max(1, max(height, width) // 1200)

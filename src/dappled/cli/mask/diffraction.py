@@ -95,6 +95,3 @@ class PredictDiffraction(Overwriting, Verb):
         middle = values[top : top + reach[0], left : left + reach[1]]
         lit = middle * laser_bench.beam(middle.shape, pitch, self.beam)
         return laser_bench.far_screen(lit, pitch, self.wavelength, self.distance, samples=2048)
-
-
-CLASSES = {"mask diffraction": PredictDiffraction}

@@ -80,9 +80,6 @@ class WriteTestKit(Overwriting, Verb):
         return Report({"files": files}, files)
 
 
-CLASSES = {"mask kit": WriteTestKit}
-
-
 def _wedge(chosen: Film) -> Callable[[slice, slice], NDArray[np.uint8]]:
     levels = np.rint(film.wedge((1, chosen.shape[1]), _WEDGE_STEPS) * 255).astype(np.uint8)
     return lambda rows, columns: np.repeat(levels[:, columns], rows.stop - rows.start, axis=0)

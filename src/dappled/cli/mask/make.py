@@ -144,9 +144,6 @@ class MakeMask(Overwriting, Verb):
         return MaskImage(mask, chosen, periods, self.negative, self.bits, curve, self.drawable_only)
 
 
-CLASSES = {"mask make": MakeMask}
-
-
 def periods_on(known: MaskProfile, chosen: Film) -> tuple[float, float]:
     """The periods (y, x): whole pixels if the mask was designed for this film, else by its frequency."""
     own = known.film_px_per_mm

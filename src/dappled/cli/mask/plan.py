@@ -101,9 +101,6 @@ class PlanFlight(AltitudeArguments, Verb):
         return Report(said, lines)
 
 
-CLASSES = {"plan": PlanFlight, "mask plan": PlanFlight}
-
-
 def _depth_line(depth: SingleFrameDepth) -> str:
     """What one frame tells of heights."""
     return (

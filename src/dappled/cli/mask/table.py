@@ -70,9 +70,6 @@ class TabulateCarriers(InstallationArguments, Verb):
         return Report({**facts, "rows": codec.plain(rows), "warnings": warnings}, lines)
 
 
-CLASSES = {"mask table": TabulateCarriers}
-
-
 def _facts(one: MaskedOptics) -> dict[str, Any]:
     return {"shape": list(one.sensor.shape), "law": one.law}
 

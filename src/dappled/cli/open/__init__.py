@@ -85,9 +85,6 @@ class OpenInBrowser(Verb):
         return Report()
 
 
-CLASSES = {"open": OpenInBrowser}
-
-
 def _source(
     path: Path, given: Mapping[str, Any], stack: ExitStack
 ) -> tuple[FrameSource, Recipe | None, tuple[float, ...]]:

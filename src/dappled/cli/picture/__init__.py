@@ -159,9 +159,6 @@ class _Picturing:
         return asked.made(maker, frame, target, self.panel, self.told[frame])
 
 
-CLASSES = {"picture": MakePictures}
-
-
 def _facts(target: Path, made: MadePicture) -> dict[str, Any]:
     """What the line of a frame says, for a program."""
     shadow = made.picture.shadow

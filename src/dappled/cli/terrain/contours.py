@@ -65,6 +65,3 @@ class DrawContours(Overwriting, Verb):
                 str(self.output),
             ],
         )
-
-
-CLASSES = {"terrain contours": DrawContours}

@@ -54,9 +54,6 @@ class MeasureVolume(Verb):
         return Report(values, words(made, levelled=stable is not None))
 
 
-CLASSES = {"terrain volume": MeasureVolume}
-
-
 def words(made: VolumeChange, *, levelled: bool) -> list[str]:
     """The volumes as lines."""
     lines = [_told("net ", made.net, sign="+"), _told("fill", made.fill), _told("cut ", made.cut)]
