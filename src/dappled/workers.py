@@ -82,6 +82,20 @@ class Loop:
         return [self.name] if ended and not self.stopping.is_set() else []
 
 
+class OneThread:
+    """A part of the service whose only thread is a loop, `_loop`."""
+
+    _loop: Loop
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._loop.start()
+
+    def dead_threads(self) -> list[str]:
+        """The threads that have ended without having been stopped: never, unless there is a bug."""
+        return self._loop.dead_threads()
+
+
 class Worker(Loop, Generic[Item]):
     """One thread that does `work` on each item, in order, behind a bounded queue.
 

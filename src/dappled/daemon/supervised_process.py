@@ -19,7 +19,7 @@ from dappled.drivers.child_process import (
     start_child,
 )
 from dappled.errors import report
-from dappled.workers import Loop
+from dappled.workers import Loop, OneThread
 
 log = logging.getLogger(__name__)
 _TURN_S = 0.2
@@ -51,7 +51,7 @@ class ProcessPeer(Protocol):
         """Its next message; None where none came for 0.2 s."""
 
 
-class SupervisedProcess:
+class SupervisedProcess(OneThread):
     """Keeps a process running: when it ends it is started again, at most five times a minute."""
 
     def __init__(
@@ -63,17 +63,9 @@ class SupervisedProcess:
         self._process: subprocess.Popen[bytes] | None = None
         self._loop = Loop(name, self._run)
 
-    def start(self) -> None:
-        """Start the thread that starts the process."""
-        self._loop.start()
-
-    def stop(self, timeout_s: float) -> None:
+    def stop(self, timeout_s: float = 5.0) -> None:
         """End the process, and wait so long for the thread."""
         self._loop.stop(timeout_s)
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._loop.dead_threads()
 
     def _run(self) -> None:
         stopping, title = self._loop.stopping, self._program.title

@@ -25,7 +25,6 @@ from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 
 log = logging.getLogger(__name__)
-_STOP_S = 5.0
 _BACKLOG = 32
 _TOKEN_CHARACTERS = 12
 _ANSWER_S = 3.0
@@ -93,7 +92,7 @@ class RequestHandler(Protocol):
         """Do what is asked; the answer goes to the page, bytes as "picture" too."""
 
 
-class Console:
+class Console(SupervisedProcess):
     """Keeps the console's process running, and answers its requests by `handler`.
 
     The process has a low priority. When it ends it is started again; the listening socket stays open meanwhile, so that
@@ -117,20 +116,12 @@ class Console:
             # One thread for its arithmetic: the other cores are for the flight.
             {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
         )
-        self._process = SupervisedProcess("console", program, _PageRequests(setup, handler), clock, budget)
+        super().__init__("console", program, _PageRequests(setup, handler), clock, budget)
 
-    def start(self) -> None:
-        """Start the process."""
-        self._process.start()
-
-    def stop(self) -> None:
+    def stop(self, timeout_s: float = 5.0) -> None:
         """End the process, and close the listening socket."""
-        self._process.stop(_STOP_S)
+        super().stop(timeout_s)
         self._listener.close()
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._process.dead_threads()
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ from dappled.errors import report, sentence
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Frame, Shot, Tag
 from dappled.flight.records import DOUBT, LATER_DOUBT, LEFT, NOTICED
-from dappled.workers import Loop
+from dappled.workers import Loop, OneThread
 
 log = logging.getLogger(__name__)
 _WITHOUT_CAMERA = {
@@ -277,7 +277,7 @@ class NextStage(Protocol):
         """Queue a shot. Never waits: where the queue is full, the shot ends here."""
 
 
-class Capture:
+class Capture(OneThread):
     """Pull the camera's events in one thread: make each file safe, and give up each shot without one.
 
     `following` takes the shots that are ready to be tagged: their frame is safe, or its file stays at the camera.
@@ -294,7 +294,7 @@ class Capture:
     def start(self) -> None:
         """Start the camera, then the thread."""
         self._camera.start()
-        self._loop.start()
+        super().start()
 
     def stop(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` for what is with the camera, then release it. Shots without a file have failed."""
@@ -303,10 +303,6 @@ class Capture:
         self._ends.tell(self._camera.stop)
         if ended:
             self._last_events()
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._loop.dead_threads()
 
     def _run(self) -> None:
         while not self._loop.stopping.is_set() or self._worth_waiting():

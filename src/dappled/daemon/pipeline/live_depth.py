@@ -12,7 +12,7 @@ from dappled.daemon.pipeline.decode_process import FrameDepth
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
-from dappled.workers import Worker
+from dappled.workers import OneThread, Worker
 
 
 class DepthMaker(Protocol):
@@ -25,7 +25,7 @@ class DepthMaker(Protocol):
         """End, also in the middle of a frame."""
 
 
-class LiveDepth:
+class LiveDepth(OneThread):
     """Takes at most one finished frame in `interval_s`, the newest, and publishes its depth as topic `depth`.
 
     Owns `maker`: a decode process of its own, as depth takes longer than a frame may wait. `nearest` gets the
@@ -48,19 +48,12 @@ class LiveDepth:
         self._method, self._interval_s, self._clock, self._nearest = method, interval_s, clock, nearest
         self._last_ns: int | None = None
         self._worker: Worker[PendingShot] = Worker("depth", self._work, capacity=1, policy="drop oldest", clock=clock)
-
-    def start(self) -> None:
-        """Start the thread."""
-        self._worker.start()
+        self._loop = self._worker
 
     def stop(self) -> None:
         """Take no more frames and close the maker. A frame in hand is given up after half a second."""
         self._worker.stop(0.5)
         self._maker.close()
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._worker.dead_threads()
 
     def offer(self, pending: PendingShot) -> None:
         """Take a finished frame, if one is due and it was decoded."""

@@ -15,7 +15,7 @@ from dappled.errors import report
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Cause, FlightError, Shot
 from dappled.refusals import SHOTS_INTERVAL_S, RefusalLog
-from dappled.workers import Loop
+from dappled.workers import Loop, OneThread
 
 __all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
 
@@ -110,7 +110,7 @@ class ShotSink(Protocol):
         """Requests became no shots: the first of a source for a reason, later how many more. See `RefusalLog`."""
 
 
-class Shutter:
+class Shutter(OneThread):
     """Turn capture requests into shots.
 
     `next_index`: the image index of the next shot. At most `capacity` shots may be pending (fired, not yet settled);
@@ -133,10 +133,6 @@ class Shutter:
         self._stopped = False
         self._loop = Loop("shutter intervals", self._run, clock=clock)
 
-    def start(self) -> None:
-        """Begin to serve intervals. Single shots need no thread."""
-        self._loop.start()
-
     def stop(self) -> None:
         """End intervals and refuse from now on."""
         with self._lock:
@@ -144,10 +140,6 @@ class Shutter:
             self._interval = None
         self._wake.set()
         self._loop.stop(2.0)
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._loop.dead_threads()
 
     def request(self, request: CaptureRequest) -> ShotDecision:
         """One message that asks for one shot."""

@@ -21,7 +21,7 @@ from dappled.daemon.pipeline.shutter import IntervalEnd, Shutter
 from dappled.decode.geometry import Pose, Quaternion, Vector3, conjugate, metres_per_radian, turned
 from dappled.errors import report
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.workers import Loop
+from dappled.workers import Loop, OneThread
 
 log = logging.getLogger(__name__)
 MOST_M = 10_000.0
@@ -118,7 +118,7 @@ class _Way:
     apart_m: float = 0.0
 
 
-class DistanceTrigger:
+class DistanceTrigger(OneThread):
     """Serves one series at a time. `mount` leads from camera axes to the body's (see `look`).
 
     `configured` is the series of the settings. With `from_height_m` above 0 it begins by itself as soon as the vehicle
@@ -144,20 +144,12 @@ class DistanceTrigger:
         self._wake = threading.Event()
         self._loop = Loop("distance trigger", self._run, clock=clock)
 
-    def start(self) -> None:
-        """Begin to serve series."""
-        self._loop.start()
-
     def stop(self) -> None:
         """End the series and the thread."""
         self.end()
         self._loop.stopping.set()
         self._wake.set()
         self._loop.stop(2.0)
-
-    def dead_threads(self) -> list[str]:
-        """The threads that have ended without having been stopped."""
-        return self._loop.dead_threads()
 
     def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None:
         """Take photographs by distance from now on, in place of a running series; the first one spacing away, or

@@ -10,7 +10,7 @@ from dappled.daemon.stream.publisher import Reply
 from dappled.daemon.stream.wire import DecodedSlices, Message, WireError, frame_header, slices_header
 from dappled.errors import sentence
 from dappled.flight import Frame, Tag
-from dappled.workers import Worker
+from dappled.workers import OneThread, Worker
 
 WAITING = 32
 
@@ -45,7 +45,7 @@ class SlicesDecoder(Protocol):
         """Decode the raw file of frame `index` at `path`. Raises DappledError."""
 
 
-class Answers:
+class Answers(OneThread):
     """Answers questions one by one, behind a bounded queue; a question that finds it full is refused."""
 
     def __init__(
@@ -61,18 +61,11 @@ class Answers:
         self._worker: Worker[tuple[Mapping[str, Any], Reply]] = Worker(
             "answers", self._work, capacity=WAITING, on_failure=self._failed, clock=clock
         )
-
-    def start(self) -> None:
-        """Start the thread that answers."""
-        self._worker.start()
+        self._loop = self._worker
 
     def stop(self) -> None:
         """Answer what waits, for a second at most, and end the thread."""
         self._worker.stop(1.0)
-
-    def dead_threads(self) -> list[str]:
-        """The thread's name where it has ended without having been stopped: never, unless there is a bug."""
-        return self._worker.dead_threads()
 
     def answer(self, request: Mapping[str, Any], reply: Reply) -> None:
         """Queue a question of `Publisher`. Raises WireError when too many wait already."""

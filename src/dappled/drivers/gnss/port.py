@@ -17,7 +17,7 @@ from dappled.drivers.mavlink.channels import FORBIDDEN, Address, ByteChannel, ov
 from dappled.drivers.utc_choice import RELEASED_NS, Date, UtcBounds, rolled_over, rollovers
 from dappled.errors import DappledError, report
 from dappled.findings import Code, Finding, Level, Subject, finding, told
-from dappled.workers import Loop
+from dappled.workers import Loop, OneThread
 
 log = logging.getLogger(__name__)
 SETTING = "gnss.port"
@@ -44,7 +44,7 @@ def gnss_port(settings: GnssSettings, notebook: Notebook, clock: Clock) -> GnssP
     return GnssPort(address(settings.port), "rising" if settings.edge == "rising" else "falling", notebook, clock)
 
 
-class GnssPort:
+class GnssPort(OneThread):
     """One receiver. A device that is not there, or goes, is waited for."""
 
     def __init__(self, at: Address, edge: Edge, notebook: Notebook, clock: Clock) -> None:
@@ -58,17 +58,9 @@ class GnssPort:
         self._doubt: Finding | None = None  # of the last mark's date
         self.marks = 0
 
-    def start(self) -> None:
-        """Begin to read."""
-        self._loop.start()
-
     def stop(self) -> None:
         """End the thread and close the device."""
         self._loop.stop(2.0)
-
-    def dead_threads(self) -> list[str]:
-        """The threads that have ended without having been stopped."""
-        return self._loop.dead_threads()
 
     def problem(self) -> Finding | None:
         """Why nothing, or nothing of use, is recorded; None while the stream comes."""
