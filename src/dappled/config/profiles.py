@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
-from dataclasses import dataclass, field
+from dataclasses import MISSING, dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,12 @@ class Lens:
     """The lens at one focal length, as `dappled calibrate --lens` finds it: `v_mm` from perspective centre to sensor,
     the principal point (y, x) in mm from the sensor's middle, OpenCV's distortion (k1, k2, p1, p2, k3)."""
 
-    focal_length_mm: float
-    v_mm: float
-    principal_point_mm: tuple[float, float] = (0.0, 0.0)
-    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+    focal_length_mm: float = setting(MISSING, "as EXIF says it", unit="mm", low=0.1, high=10_000)
+    v_mm: float = setting(MISSING, "perspective centre to sensor", unit="mm", low=0.1, high=10_000)
+    principal_point_mm: tuple[float, float] = setting((0.0, 0.0), "(y, x) from the middle", unit="mm", low=-50, high=50)
+    distortion: tuple[float, float, float, float, float] = setting(
+        (0.0, 0.0, 0.0, 0.0, 0.0), "OpenCV's k1, k2, p1, p2, k3", low=-1000, high=1000
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,16 +151,6 @@ class _RawTable:
 
 
 @dataclass(frozen=True, slots=True)
-class _LensTable:
-    focal_length_mm: float = setting(0.0, "as EXIF says it", unit="mm", low=0.1, high=10_000)
-    v_mm: float = setting(0.0, "perspective centre to sensor", unit="mm", low=0.1, high=10_000)
-    principal_point_mm: tuple[float, float] = setting((0.0, 0.0), "(y, x) from the middle", unit="mm", low=-50, high=50)
-    distortion: tuple[float, float, float, float, float] = setting(
-        (0.0, 0.0, 0.0, 0.0, 0.0), "OpenCV's k1, k2, p1, p2, k3", low=-1000, high=1000
-    )
-
-
-@dataclass(frozen=True, slots=True)
 class _MaskTable:
     p: int = setting(2, "number of harmonics", low=1, high=20)
     frequency_per_mm: float | None = setting(None, "fundamental", unit="1/mm", low=0.01, high=2000)
@@ -191,12 +183,6 @@ def camera(name: str) -> CameraProfile:
                 f"{source.name}: [[raw]] {raw.name!r} names the picture {raw.picture!r}, which no [[raw]] above has"
             )
         shapes.append(RawShape(raw.name, Sensor(raw.shape, raw.row_mm, raw.column_mm, picture), raw.staggered))
-    lenses = []
-    for entry in table.lens:
-        lens = build(_LensTable, entry, source, "lens")
-        if not (lens.focal_length_mm and lens.v_mm):
-            raise ConfigError(f"{source.name}: [[lens]] needs focal_length_mm and v_mm")
-        lenses.append(Lens(lens.focal_length_mm, lens.v_mm, lens.principal_point_mm, lens.distortion))
     return CameraProfile(
         _stem(name),
         table.description,
@@ -205,7 +191,7 @@ def camera(name: str) -> CameraProfile:
         table.mask_distance_mm,
         table.focal_length_mm,
         tuple(shapes),
-        tuple(lenses),
+        tuple(build(Lens, entry, source, "lens") for entry in table.lens),
         table.least_mask_distance_mm,
         table.f_number,
         build(VerdictBounds, table.verdict or {}, source, "verdict"),
