@@ -145,7 +145,7 @@ class ReportFlight(Overwriting, FlightArgument, Verb):
             from dappled.cli.flight import books  # noqa: PLC0415  # the logs' readers take a second to load
 
             third = books.compared(flight, self.log)
-            values["log"], said, agree = third.values, [*said, *third.lines], agree and third.balanced
+            values["log"], said, agree = third.values, [*said, *third.lines], agree and not third.failed
             doubts += third.findings
         if self.page:
             from dappled.products.survey import flight_quality  # noqa: PLC0415  # only pages need the maps' libraries

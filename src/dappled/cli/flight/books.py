@@ -4,36 +4,24 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from dappled import codec
 from dappled.cli.table import words_only
+from dappled.cli.verb import Report
 from dappled.errors import counted
-from dappled.findings import Finding
 
 if not words_only:
     from dappled.daemon.replay import three_books
     from dappled.daemon.replay.three_books import ThreeBooks
 
 
-@dataclass(frozen=True, slots=True)
-class Compared:
-    """What a comparison says: as JSON values, as lines, and whether the books balance."""
-
-    values: dict[str, Any]
-    lines: tuple[str, ...]
-    balanced: bool
-    findings: tuple[Finding, ...]
-
-
-def compared(flight: Path, logs: Sequence[Path]) -> Compared:
+def compared(flight: Path, logs: Sequence[Path]) -> Report:
     """Compare a flight with logs of its autopilot. Raises DappledError."""
     found = three_books.reconcile(flight, logs)
     values = {"files_read": [str(path) for path in logs], **codec.plain(found), "balanced": found.balanced}
     values["imbalances"] = [{**codec.plain(one), "text": one.text()} for one in found.imbalances]
-    return Compared(values, tuple(_lines(found, logs)), found.balanced, found.findings)
+    return Report(values, tuple(_lines(found, logs)), found.findings, failed=not found.balanced)
 
 
 def _lines(found: ThreeBooks, logs: Sequence[Path]) -> Iterator[str]:
