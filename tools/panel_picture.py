@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 import rawpy
 import tifffile
+from first_screen import CAMERA
 from matplotlib import pyplot as plt
 from matplotlib.patches import Rectangle
 
@@ -35,14 +36,6 @@ FIELDS = (  # reflectances of red, green and blue
     (0.05, 0.12, 0.04), (0.10, 0.30, 0.08), (0.32, 0.26, 0.18), (0.08, 0.08, 0.09),
     (0.85, 0.85, 0.83), (0.55, 0.14, 0.10), (0.12, 0.22, 0.48), (0.60, 0.52, 0.12),
 )  # fmt: skip
-CAMERA = """law = "geometric"
-mask_distance_mm = 0.48
-[[raw]]
-name = "a part of the reference camera's sensor"
-shape = [{}, {}]
-row_mm = [0.01, 0.0]
-column_mm = [0.0, 0.01]
-"""
 
 
 def field_px(number: int) -> tuple[int, int, int, int]:
