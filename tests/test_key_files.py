@@ -14,6 +14,7 @@ from dappled.daemon.stream import curve
 from dappled.drivers.mavlink import make_key
 from dappled.errors import DappledError
 from dappled.flight import seal_key
+from dappled.key_files import KeyFileError
 
 MAKERS: dict[str, Callable[[Path], object]] = {
     "mavlink": lambda folder: make_key(folder / "a"),
@@ -42,21 +43,28 @@ def test_half_a_key_does_not_stop_the_next_attempt(
                 MAKERS[maker](tmp_path)
             assert list(tmp_path.iterdir()) == []
             MAKERS[maker](tmp_path)
-    assert all(key_files.read(path).own for path in tmp_path.iterdir())
+    for path in tmp_path.iterdir():
+        if path.suffix != ".key":  # a public key is for all
+            assert key_files.read(path, "a key")
 
 
-def test_what_others_can_use_is_said(tmp_path: Path) -> None:
+def test_what_others_can_use_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "key"
-    key_files.write_new(path, "ab" * 32)
-    found = key_files.read(path)
-    assert (found.own, found.private, key_files.key_in(found.data)) == (True, True, b"\xab" * 32)
-    assert "ab" not in repr(found).replace("private", "")
+    key_files.make(path, "ab" * 32)
+    assert key_files.read_key(path, "a key") == b"\xab" * 32
     path.chmod(0o604)
-    assert not key_files.read(path).private
-    os.mkfifo(tmp_path / "pipe")
-    assert not key_files.read(tmp_path / "pipe").own  # and it does not block
+    with pytest.raises(KeyFileError, match="chmod 600"):
+        key_files.read(path, "a key")
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(KeyFileError, match="no file of this user"):  # and it does not block
+        key_files.read(tmp_path / "pipe", "a key")
+    with pytest.raises(KeyFileError, match="can't be read as a key: Is a directory"):
+        key_files.read(tmp_path, "a key")
 
 
 @pytest.mark.parametrize("text", [b"", b"beef", b"\xff" * 64, b"zz" * 32, b"ab" * 33])
-def test_anything_else_is_no_key(text: bytes) -> None:
-    assert key_files.key_in(text) is None
+def test_anything_else_is_no_key(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "key").write_bytes(text)
+    (tmp_path / "key").chmod(0o600)
+    with pytest.raises(KeyFileError):
+        key_files.read_key(tmp_path / "key", "a key")

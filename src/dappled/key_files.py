@@ -1,28 +1,32 @@
-"""Files that hold a secret: made once and durably, and read with word of who else can use them."""
+"""Files that hold a secret: made once and durably, and read where nobody else can use them."""
 
 from __future__ import annotations
 
 import os
 import stat
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled import durable
+from dappled.errors import DappledError
 
 KEY_BYTES = 32
 _MOST = 1 << 16  # the largest holds a few lines
 
 
-@dataclass(frozen=True, slots=True)
-class KeyFile:
-    """What a file holds, and whether that is a secret of this user.
+class KeyFileError(DappledError):
+    """A file is not the secret that it should be, or is not a secret: whoever names it is wrong; one sentence."""
 
-    `own`: a file, and not a pipe, of this user or of root. `private`: its mode lets nobody else read or change it.
-    """
+    exit_code = 2
 
-    data: bytes = field(repr=False)
-    own: bool
-    private: bool
+
+def make(path: Path, text: str) -> None:
+    """Write a new secret file for this user alone. Raises DappledError, also where it exists already."""
+    try:
+        write_new(path, text)
+    except FileExistsError:
+        raise DappledError(f"{path} exists already; keys are not overwritten: name another file") from None
+    except OSError as error:
+        raise DappledError(f"{path} can't be written: {error.strerror or error}; check its folder") from error
 
 
 def write_new(path: Path, text: str, mode: int = 0o600) -> None:
@@ -43,20 +47,32 @@ def write_new(path: Path, text: str, mode: int = 0o600) -> None:
         raise
 
 
-def read(path: Path) -> KeyFile:
-    """Read a file that should be a secret of this user, its first 64 KiB at most. Raises OSError."""
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not block
-    with os.fdopen(fd, "rb") as file:
-        facts = os.fstat(fd)
-        data = file.read(_MOST)
-    own = stat.S_ISREG(facts.st_mode) and facts.st_uid in (0, os.geteuid())
-    return KeyFile(data, own, private=not facts.st_mode & 0o077)
+def read(path: Path, what: str) -> str:
+    """The text of a secret file, its first 64 KiB at most, that this user or root alone can read and change.
 
-
-def key_in(data: bytes) -> bytes | None:
-    """The key of 32 bytes that 64 hexadecimal digits spell; None where they are anything else."""
+    `what` says in errors what it should be. Raises KeyFileError.
+    """
     try:
-        key = bytes.fromhex(data.decode("ascii").strip())
+        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not block
+        with os.fdopen(fd, "rb") as file:
+            facts = os.fstat(fd)
+            text = file.read(_MOST).decode("ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is not text"
+        raise KeyFileError(f"{path} can't be read as {what}: {why}") from error
+    if facts.st_mode & 0o077:
+        raise KeyFileError(f"{path} can be used by others than its owner: chmod 600 {path}")
+    if not stat.S_ISREG(facts.st_mode) or facts.st_uid not in (0, os.geteuid()):
+        raise KeyFileError(f"{path} is no file of this user, and can't be {what}: give it to this one with chown")
+    return text
+
+
+def read_key(path: Path, what: str) -> bytes:
+    """The key of 32 bytes that 64 hexadecimal digits in a secret file spell. Raises KeyFileError, as `read` does."""
+    try:
+        key = bytes.fromhex(read(path, what).strip())
     except ValueError:
-        return None
-    return key if len(key) == KEY_BYTES else None
+        key = b""
+    if len(key) != KEY_BYTES:
+        raise KeyFileError(f"{path} holds no 64 hexadecimal digits: it is not {what}")
+    return key

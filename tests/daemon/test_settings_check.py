@@ -68,11 +68,11 @@ def calibration(path: Path, camera: str = CAMERA, mask: str = MASK, law: str = "
         (
             '[mavlink]\nurl = "udpin:0.0.0.0:1"\nkeys = "no.key"',
             "line 3: [mavlink] keys",
-            "cannot read the signing key",
+            "can't be read as a signing key",
         ),
         ('[mavlink]\nurl = "udpin:0.0.0.0:1"\nkeys = ["a", "b"]', "line 3: [mavlink] keys", "2 files for 1 links"),
         ('[record]\ndirectory = "d.toml/flights"', "line 2: [record] directory", "is not a folder"),
-        ('[record]\nseal_key = "no.key"', "line 2: [record] seal_key", "make one with dappled keys seal"),
+        ('[record]\nseal_key = "no.key"', "line 2: [record] seal_key", "dappled keys seal makes one"),
         (
             '[mask]\nprofile = "mask-2"\n[decode]\ncalibration = "no.toml"',
             "line 4: [decode] calibration",

@@ -17,6 +17,7 @@ import pytest
 
 from dappled import durable
 from dappled.clock import RecordedClock
+from dappled.errors import DappledError
 from dappled.findings import Code
 from dappled.flight import (
     FlightError,
@@ -29,6 +30,7 @@ from dappled.flight import (
     seals,
 )
 from dappled.flight.checks.flight_check import check
+from dappled.key_files import KeyFileError
 from tests.flight.checks.test_chain_check import attacked, fly
 from tests.flight.conftest import START_UTC_NS
 from tests.flight.makers import CARD_FULL, flip, words_of
@@ -353,16 +355,16 @@ def test_a_signature_counts_whole(tmp_path: Path) -> None:
 def test_a_key_that_others_can_read_is_refused(tmp_path: Path) -> None:
     path = key_file(tmp_path)
     assert path.stat().st_mode & 0o777 == 0o600
-    with pytest.raises(FlightError, match="exists already"):
+    with pytest.raises(DappledError, match="exists already"):
         seal_key.make(path)
     path.chmod(0o640)
-    with pytest.raises(FlightError, match="chmod 600"):
+    with pytest.raises(KeyFileError, match="chmod 600"):
         seal_key.load(path)
     path.chmod(0o600)
     path.write_text("short")
-    with pytest.raises(FlightError, match="64 hexadecimal digits"):
+    with pytest.raises(KeyFileError, match="64 hexadecimal digits"):
         seal_key.load(path)
-    with pytest.raises(FlightError, match="dappled keys seal"):
+    with pytest.raises(KeyFileError, match="dappled keys seal"):
         seal_key.load(tmp_path / "missing")
 
 

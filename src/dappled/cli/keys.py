@@ -12,7 +12,6 @@ from dappled import key_files
 from dappled.cli import paths
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option, refuse_no_folder
-from dappled.errors import DappledError
 
 if not words_only:
     from dappled.daemon.stream import curve
@@ -79,12 +78,7 @@ class MakeToken(_NewFile):
 
     def run(self, output: Output) -> Report:
         """Make a token for the console."""
-        try:
-            key_files.write_new(self.file.expanduser(), secrets.token_urlsafe(24) + "\n")
-        except FileExistsError:
-            raise DappledError(f"{self.file} is there already: choose another name, or move it away") from None
-        except OSError as error:
-            raise DappledError(f"{self.file} can't be written: {error.strerror}") from None
+        key_files.make(self.file.expanduser(), secrets.token_urlsafe(24) + "\n")
         said = f"{self.file}  name it in console.token; anyone who knows its content may use the console"
         return Report({"token_file": str(self.file)}, [said])
 

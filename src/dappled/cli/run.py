@@ -23,6 +23,7 @@ from dappled.config.schema import ConfigError, refuse
 from dappled.config.settings import Settings
 from dappled.daemon.health.systemd import Notifier
 from dappled.errors import DappledError, sentence
+from dappled.key_files import KeyFileError
 
 if not words_only:
     from dappled.cli.stop_condition import Asker, StopCondition
@@ -203,7 +204,7 @@ def _begun(make: Callable[[], Service], flown: Settings, manager: Notifier, aske
         service = make()
         try:
             service.start()
-        except (FlightError, SigningError) as error:  # signing times are kept beside the flights
+        except (FlightError, SigningError, KeyFileError) as error:  # signing times are kept beside the flights
             answered = isinstance(error, LockHeldError) and error.records  # by the daemon that records there
             if answered or not manager.listens or not flown.mavlink.url:
                 raise

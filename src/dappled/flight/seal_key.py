@@ -9,7 +9,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dappled import key_files
-from dappled.flight.errors import FlightError, disk_error
 
 _SALT = b"dappled"
 _PURPOSE, _NAME = b"dappled flight seal 1", b"dappled flight seal name 1"
@@ -32,29 +31,14 @@ class SealKey:
 
 
 def make(path: Path) -> None:
-    """Write a new key file: 64 hexadecimal digits, for this user alone. Raises FlightError, also where it exists."""
-    try:
-        key_files.write_new(path, secrets.token_hex(key_files.KEY_BYTES) + "\n")
-    except FileExistsError:
-        raise FlightError(f"{path} exists already; keys are not overwritten: name another file") from None
-    except OSError as error:
-        raise disk_error("write the key", path, error) from error
+    """Write a new key file: 64 hexadecimal digits, for this user alone. Raises DappledError, also where it exists."""
+    key_files.make(path, secrets.token_hex(key_files.KEY_BYTES) + "\n")
 
 
 def load(path: Path) -> SealKey:
     """Read a key file that only this user can read, and derive the key for seals (HKDF-SHA256, RFC 5869): a file that
-    holds another program's key too gives nothing away of it. Raises FlightError."""
-    try:
-        file = key_files.read(path)
-    except OSError as error:
-        raise FlightError(
-            f"cannot read the key for seals {path}: {error.strerror}; make one with dappled keys seal"
-        ) from error
-    if not file.own or not file.private:
-        raise FlightError(f"the key for seals {path} can be used by others; run: chown $USER {path}; chmod 600 {path}")
-    key = key_files.key_in(file.data)
-    if key is None:
-        raise FlightError(f"{path} holds no key for seals (64 hexadecimal digits); make one with dappled keys seal")
+    holds another program's key too gives nothing away of it. Raises KeyFileError."""
+    key = key_files.read_key(path, "a key for seals (dappled keys seal makes one)")
     return SealKey(_derived(key, _NAME).hex()[:8], _derived(key, _PURPOSE))
 
 

@@ -15,6 +15,8 @@ from dappled.clock import SystemClock
 from dappled.drivers.mavlink import signing
 from dappled.drivers.mavlink.links import Framer, mavlink, pack
 from dappled.drivers.mavlink.signing import SignatureGuard, SigningError, SigningTime, Unsigned, timestamp_of
+from dappled.errors import DappledError
+from dappled.key_files import KeyFileError
 
 KEY = bytes(range(32))
 NOW_NS = 1_800_000_000 * 10**9
@@ -141,7 +143,7 @@ def test_a_key_file_is_made_once_for_its_owner_alone(tmp_path: Path) -> None:
     signing.make_key(path)
     assert path.stat().st_mode & 0o777 == 0o600
     assert len(signing.read_key(path)) == 32
-    with pytest.raises(SigningError, match="exists already"):
+    with pytest.raises(DappledError, match="exists already"):
         signing.make_key(path)
     signing.make_key(tmp_path / "same.key", "swordfish")
     assert signing.read_key(tmp_path / "same.key").hex().startswith("b9f195c5")  # SHA-256, as ground stations do
@@ -178,7 +180,7 @@ def test_a_key_that_could_not_be_written_leaves_no_file(tmp_path: Path, monkeypa
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(os, "fsync", refuse)
-    with pytest.raises(SigningError, match="No space left"):
+    with pytest.raises(DappledError, match="No space left"):
         signing.make_key(tmp_path / "radio.key")
     monkeypatch.undo()
     signing.make_key(tmp_path / "radio.key")
@@ -194,13 +196,13 @@ def test_a_key_that_others_can_read_or_that_is_malformed_is_refused(tmp_path: Pa
     path = tmp_path / "radio.key"
     signing.make_key(path)
     path.chmod(0o640)
-    with pytest.raises(SigningError, match="chmod 600"):
+    with pytest.raises(KeyFileError, match="chmod 600"):
         signing.read_key(path)
     path.chmod(0o600)
     path.write_text("beef\n")
-    with pytest.raises(SigningError, match="not 64 hexadecimal digits"):
+    with pytest.raises(KeyFileError, match="holds no 64 hexadecimal digits"):
         signing.read_key(path)
-    with pytest.raises(SigningError, match="dappled mavlink key"):
+    with pytest.raises(KeyFileError, match="dappled mavlink key"):
         signing.read_key(tmp_path / "missing.key")
 
 

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dappled import durable
+from dappled import durable, key_files
 from dappled.cli.table import words_only
 from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, option
 from dappled.errors import DappledError, counted
 
 if not words_only:
-    from dappled.daemon.stream.curve import read_private
     from dappled.flight import disk_error, disk_errors
     from dappled.products.handover import nodeodm
     from dappled.products.handover.nodeodm import NodeOdm, NodeOdmError
@@ -124,7 +123,7 @@ def _check_writable(path: Path) -> None:
 
 
 def _token(file: Path | None) -> str:
-    """The server's token, "" for none. Raises DappledError for a file that others can read."""
+    """The server's token, "" for none. Raises KeyFileError for a file that others can read."""
     if file is None:
         return os.environ.get(TOKEN_VARIABLE, "")
-    return read_private(file.expanduser(), "the server's token").strip()
+    return key_files.read(file.expanduser(), "the server's token").strip()

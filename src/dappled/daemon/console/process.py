@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from dappled import codec
+from dappled import codec, key_files
 from dappled.clock import Clock
 from dappled.config import settings as configuration
 from dappled.config.settings import ConsoleSettings, Settings
 from dappled.daemon.console.requests import ConsoleRequests
-from dappled.daemon.stream.curve import read_private
 from dappled.daemon.stream.sockets import is_loopback
 from dappled.daemon.supervised_process import ChildProgram, SupervisedProcess
 from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessChannel, RestartBudget
@@ -40,7 +39,7 @@ def credentials(settings: ConsoleSettings) -> tuple[str, int, str]:
     Raises DappledError, or DappledError for a token file that others can read.
     """
     host, port = address(settings.bind)
-    token = read_private(Path(settings.token), "the console's token").strip() if settings.token else ""
+    token = key_files.read(Path(settings.token), "the console's token").strip() if settings.token else ""
     if settings.token and len(token) < _TOKEN_CHARACTERS:
         raise DappledError(
             f"{settings.token} holds no token of {_TOKEN_CHARACTERS} characters: make one with `dappled keys token`"

@@ -17,6 +17,7 @@ import zmq.utils.z85
 
 from dappled import durable, key_files
 from dappled.errors import DappledError
+from dappled.key_files import KeyFileError
 
 ZAP_ENDPOINT = "inproc://zeromq.zap.01"  # ZeroMQ's RFC 27
 _KEY = r'^\s*{}-key\s*=\s*"([^"\n]*)"\s*$'
@@ -83,34 +84,19 @@ def not_a_name(name: str) -> str:
     return f"{name!r} can't be the name of a key: use letters, digits, dot, dash and underscore, 64 at most"
 
 
-def read_private(path: Path, what: str) -> str:
-    """The text of a secret file that only its owner can read. Raises DappledError with what to do."""
-    try:
-        file = key_files.read(path)
-        text = file.data.decode("ascii")
-    except (OSError, UnicodeDecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise DappledError(f"{path} can't be read as {what}: {why}") from None
-    if not file.private:
-        raise DappledError(f"{path} can be read by others than its owner: chmod 600 {path}")
-    if not file.own:
-        raise DappledError(f"{path} belongs to another user: {what} must be your own")
-    return text
-
-
 def load_own(path: Path) -> Keys:
-    """A pair from NAME.key_secret. Raises DappledError, also where others could read it."""
-    text = read_private(path, "a secret key")
+    """A pair from NAME.key_secret. Raises KeyFileError, also where others could read it."""
+    text = key_files.read(path, "a secret key")
     return Keys(_key(text, "public", path), _key(text, "secret", path))
 
 
 def load_public(path: Path) -> bytes:
-    """A public key from NAME.key (or NAME.key_secret). Raises DappledError."""
+    """A public key from NAME.key (or NAME.key_secret). Raises KeyFileError."""
     try:
         text = durable.read_plain(path).decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else "it is not text"
-        raise DappledError(f"{path} can't be read as a public key: {why}") from None
+        raise KeyFileError(f"{path} can't be read as a public key: {why}") from None
     return _key(text, "public", path)
 
 
@@ -154,10 +140,10 @@ def judge(request: Sequence[bytes], allowed: Mapping[bytes, str]) -> tuple[list[
 def _key(text: str, which: str, path: Path) -> bytes:
     found = re.search(_KEY.format(which), text, re.MULTILINE)
     if found is None:
-        raise DappledError(f"{path} holds no {which} key: make one with `dappled keys make`")
+        raise KeyFileError(f"{path} holds no {which} key: make one with `dappled keys make`")
     key = found[1].encode()
     if not _is_key(key):
-        raise DappledError(f"{path}: its {which} key is not 40 characters of Z85")
+        raise KeyFileError(f"{path}: its {which} key is not 40 characters of Z85")
     return key
 
 

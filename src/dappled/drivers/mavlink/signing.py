@@ -61,34 +61,16 @@ class SigningError(DappledError):
 
 def make_key(path: Path, passphrase: str | None = None) -> None:
     """Write a new key file (64 hexadecimal digits, mode 0600): random, or SHA-256 of a passphrase as QGroundControl,
-    Mission Planner and MAVProxy make it. Raises SigningError, also where the file exists already."""
+    Mission Planner and MAVProxy make it. Raises DappledError, also where the file exists already."""
     key = (
         secrets.token_bytes(key_files.KEY_BYTES) if passphrase is None else hashlib.sha256(passphrase.encode()).digest()
     )
-    try:
-        key_files.write_new(path, key.hex() + "\n")
-    except FileExistsError:
-        raise SigningError(f"{path} exists already; keys are not overwritten: name another file") from None
-    except OSError as error:
-        raise SigningError(f"cannot write the key {path}: {error.strerror or error}; check its folder") from error
+    key_files.make(path, key.hex() + "\n")
 
 
 def read_key(path: Path) -> bytes:
-    """Read a key from a file that only this user can read or change. Raises SigningError."""
-    try:
-        file = key_files.read(path)
-    except OSError as error:
-        raise SigningError(
-            f"cannot read the signing key {path}: {error.strerror or error}; make one with dappled mavlink key"
-        ) from error
-    if not file.own:
-        raise SigningError(f"the signing key {path} belongs to another user; give it to this one with chown")
-    if not file.private:
-        raise SigningError(f"the signing key {path} can be used by others; run: chmod 600 {path}")
-    key = key_files.key_in(file.data)
-    if key is None:
-        raise SigningError(f"the signing key {path} is not 64 hexadecimal digits; make one with dappled mavlink key")
-    return key
+    """Read a key from a file that only this user can read or change. Raises KeyFileError."""
+    return key_files.read_key(path, "a signing key (dappled mavlink key makes one)")
 
 
 class SigningTime:
@@ -395,7 +377,7 @@ class Signing:
 def open_signing(
     key_files: Sequence[Path | None], time_file: Path, clock: Clock, unsigned: Unsigned = "refuse"
 ) -> Signing | None:
-    """Read each link's key file, where it has one; None where no link has. Raises SigningError."""
+    """Read each link's key file, where it has one; None where no link has. Raises SigningError, KeyFileError."""
     keys = [None if path is None else read_key(path) for path in key_files]
     if not any(keys):
         return None
