@@ -30,6 +30,12 @@ class DappledError(Exception):
         return [str(self)]
 
 
+class CallError(DappledError):
+    """The call itself is wrong: what it names, or asks for, can't be; one sentence."""
+
+    exit_code = 2
+
+
 def sentence(error: BaseException) -> str:
     """An error as a sentence: its own, or its kind where it was not meant for a person."""
     return str(error) if isinstance(error, DappledError) else f"unexpected {type(error).__name__}: {error}"

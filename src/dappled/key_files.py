@@ -7,16 +7,14 @@ import stat
 from pathlib import Path
 
 from dappled import durable
-from dappled.errors import DappledError
+from dappled.errors import CallError, DappledError
 
 KEY_BYTES = 32
 _MOST = 1 << 16  # the largest holds a few lines
 
 
-class KeyFileError(DappledError):
+class KeyFileError(CallError):
     """A file is not the secret that it should be, or is not a secret: whoever names it is wrong; one sentence."""
-
-    exit_code = 2
 
 
 def make(path: Path, text: str) -> None:

@@ -9,8 +9,8 @@ import pytest
 from dappled import cli, codec
 from dappled.cli import VERBS, calling
 from dappled.cli.command_line import verb_class
-from dappled.cli.verb import CallError, Doubtable, Report
-from dappled.errors import DappledError
+from dappled.cli.verb import Doubtable, Report
+from dappled.errors import CallError, DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding
 from tests.cli.test_all_verbs import CALLS
 

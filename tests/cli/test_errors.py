@@ -12,9 +12,8 @@ import pytest
 
 import dappled
 from dappled import cli
-from dappled.cli.verb import CallError
 from dappled.config.schema import ConfigError
-from dappled.errors import DappledError
+from dappled.errors import CallError, DappledError
 
 INTERNAL = {  # caught where they arise, and told as another error or as an event
     "dappled.bounds.claims.ClaimError",

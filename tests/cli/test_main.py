@@ -129,7 +129,12 @@ def test_a_wrong_call_ends_with_2(words: list[str], capsys: pytest.CaptureFixtur
         (["keys", "token", "none/token"], 2, "is no folder; make it first"),
         (["keys", "seal", "none/key"], 2, "is no folder; make it first"),
         (["mavlink", "key", "none/key"], 2, "is no folder; make it first"),
+        (["keys", "show", "there.dng"], 2, "holds no public key"),
+        (["open", "--no-browser", "notes.txt"], 2, "is no frame"),
+        (["open", "--no-browser", "empty"], 2, "holds 0 pictures"),
         (["replay", "there.dng"], 2, "neither a flight nor a folder of frames"),
+        (["replay", "empty"], 2, "no frame in empty"),
+        (["replay", "empty", "--telemetry", "empty"], 2, "is a folder; name a file"),
         (["decode", "nowhere.dng", "--mask", "mask-2", "-o", "x.npz"], 2, "nowhere.dng"),
         (["decode", "there.dng", "--mask", "mask-22", "-o", "x.npz"], 2, "did you mean mask-2"),
         (["carriers", "--mask", "mask-2", "--shape", "10", "10"], 2, "--camera"),
@@ -147,6 +152,7 @@ def test_a_failure_is_one_sentence_and_has_its_exit_code(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.dng").touch()
+    (tmp_path / "notes.txt").touch()
     (tmp_path / "empty").mkdir()
     assert main(words) == code
     err = capsys.readouterr().err

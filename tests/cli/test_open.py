@@ -90,15 +90,13 @@ def test_the_example_is_small_and_whole_or_not_there(tmp_path: Path) -> None:
         (["FIELD", "--mask", "mask-2"], "is decoded already: leave mask out"),
         (["FIELD", "--bind", "0.0.0.0:0"], "would be open to the network without a token"),
         (["FIELD", "--bind", "here"], "must be host:port"),
-        (["TEXT"], "is no frame"),
     ],
 )
 def test_what_can_t_be_opened_is_one_sentence(
     words: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     light_files.save(tmp_path / "a.npz", light_field())
-    (tmp_path / "a.txt").write_text("notes")
-    named = {"FIELD": str(tmp_path / "a.npz"), "TEXT": str(tmp_path / "a.txt")}
+    named = {"FIELD": str(tmp_path / "a.npz")}
     assert main(["open", "--no-browser", *(named.get(word, word) for word in words)]) == 1
     said = capsys.readouterr()
     assert said.err.startswith("dappled open: ")

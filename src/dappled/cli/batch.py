@@ -12,8 +12,8 @@ from dappled.cli.frame_arguments import Several
 from dappled.cli.geotag import MarkArguments, geoid_or_none
 from dappled.cli.placing import Placing
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, argument, flag, option
-from dappled.errors import DappledError, counted
+from dappled.cli.verb import Doubtable, Output, Report, Verb, argument, flag, option
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import Finding, Subject
 from dappled.products.handover import FORMS, KINDS
 

@@ -10,9 +10,8 @@ from contextlib import contextmanager
 
 from dappled.cli import rendering
 from dappled.cli.command_line import Call, check, read
-from dappled.cli.verb import CallError
 from dappled.daemon.health import systemd
-from dappled.errors import DappledError
+from dappled.errors import CallError, DappledError
 
 _FLIGHTS = ("run", "replay", "flight", "geotag")
 """Verbs that write flights, which hold pictures and where they were taken."""

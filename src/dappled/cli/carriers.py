@@ -13,8 +13,8 @@ from dappled import codec, durable
 from dappled.cli import paths
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.errors import DappledError, counted
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import FRAME, Finding, told
 
 if not words_only:

@@ -16,8 +16,8 @@ from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type
 import dappled
 from dappled.cli import table
 from dappled.cli.table import GROUPS, VERBS
-from dappled.cli.verb import Argument, CallError, Verb
-from dappled.errors import DappledError
+from dappled.cli.verb import Argument, Verb
+from dappled.errors import CallError, DappledError
 from dappled.shown import printable
 
 _LAST = {"anyway": 1, "overwrite": 2, "json": 3}

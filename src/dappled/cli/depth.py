@@ -15,9 +15,9 @@ from dappled.cli import paths
 from dappled.cli.field_arguments import doubts, opened_field
 from dappled.cli.placing import FieldOrFlight
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
+from dappled.cli.verb import Output, Overwriting, Report, Verb, flag, option
 from dappled.decode import DecodeError
-from dappled.errors import counted
+from dappled.errors import CallError, counted
 
 if not words_only:
     import numpy as np

@@ -8,8 +8,8 @@ from pathlib import Path
 from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, RangingArguments, doubts, opened_field, views_words
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
-from dappled.errors import DappledError
+from dappled.cli.verb import Output, Overwriting, Report, Verb, flag, option
+from dappled.errors import CallError, DappledError
 
 if not words_only:
     from dappled.products.exports import exports, light_files

@@ -12,9 +12,9 @@ from typing import Any
 
 from dappled import picture_order
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Report, argument, option
+from dappled.cli.verb import Output, Report, argument, option
 from dappled.config.settings import LAW_NAMES
-from dappled.errors import DappledError, counted
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import Finding, Level, first_by_name, worst
 
 if not words_only:

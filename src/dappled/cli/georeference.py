@@ -14,8 +14,8 @@ from dappled.cli import paths
 from dappled.cli.calibrate import lens
 from dappled.cli.placing import Refining
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.errors import DappledError, counted
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
+from dappled.errors import CallError, DappledError, counted
 
 if not words_only:
     from dappled.flight import layout

@@ -12,22 +12,11 @@ from dappled import codec
 from dappled.cli import paths, sealing
 from dappled.cli.placing import Mounted, check_geoid
 from dappled.cli.table import words_only
-from dappled.cli.verb import (
-    CallError,
-    Doubtable,
-    Output,
-    Report,
-    SettingsArgument,
-    Verb,
-    argument,
-    flag,
-    of_setting,
-    option,
-)
+from dappled.cli.verb import Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, of_setting, option
 from dappled.clock import TimeOfDayClock
 from dappled.config.settings import PoseSettings
 from dappled.decode.geometry import Vector3
-from dappled.errors import DappledError, counted
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.shown import few
 

@@ -11,7 +11,8 @@ from pathlib import Path
 from dappled import key_files
 from dappled.cli import paths
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option, refuse_no_folder
+from dappled.cli.verb import Output, Report, Verb, argument, flag, option, refuse_no_folder
+from dappled.errors import CallError
 
 if not words_only:
     from dappled.daemon.stream import curve

@@ -25,6 +25,13 @@ def flight(path: Path) -> str:
     return layout.not_a_flight(path)
 
 
+def opened(path: Path) -> str:
+    """A flight, a decoded light field, a folder of views, or a raw frame."""
+    from dappled.products import opened as products  # noqa: PLC0415  # as below
+
+    return products.not_opened(path)
+
+
 def light_field(path: Path) -> str:
     """A decoded light field, or a folder of views."""
     from dappled.products import opened  # noqa: PLC0415  # SciPy takes a second; verbs that read one load it anyway

@@ -13,10 +13,10 @@ from dappled.cli import paths
 from dappled.cli.field_arguments import FIELD_HELP, RangingArguments
 from dappled.cli.frame_arguments import Several
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, argument, flag, of_setting, option
+from dappled.cli.verb import Doubtable, Output, argument, flag, of_setting, option
 from dappled.config.settings import PoseSettings
 from dappled.decode.geometry import Vector3
-from dappled.errors import DappledError
+from dappled.errors import CallError, DappledError
 
 if not words_only:
     from dappled.config import profiles

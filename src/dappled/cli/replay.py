@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from dappled import codec
-from dappled.cli import sealing
+from dappled.cli import paths, sealing
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
+from dappled.cli.verb import Doubtable, Output, Report, SettingsArgument, Verb, argument, flag, option
 from dappled.clock import TimeOfDayClock
 from dappled.config import settings as configuration
-from dappled.errors import DappledError, counted
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import Finding, first_of_each, in_order, named
 
 if not words_only:
@@ -89,7 +89,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
     mask: str | None = option("--mask", "mask profile or TOML file, or lenslet", None, otherwise="the flight's")
     telemetry: Path | None = option(
         "--telemetry", "telemetry for a folder of frames: a .tlog, or the autopilot's own log (ArduPilot's .bin, "
-        "PX4's .ulg)", None, there=True, otherwise="the only one in it",
+        "PX4's .ulg)", None, there=paths.file, otherwise="the only one in it",
     )  # fmt: skip
     vehicle: int | None = option(
         "--vehicle", "system id of the vehicle that carried the camera, where a .tlog holds several", None,

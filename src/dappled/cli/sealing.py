@@ -14,6 +14,6 @@ if not words_only:
 
 def key_of(config: Path | None, given: Path | None = None) -> SealKey | None:
     """The key in the file that is `given`, else the one that a settings file names as record.seal_key; None where it
-    names none. Raises ConfigError, and FlightError where the key can't be read."""
+    names none. Raises ConfigError, and KeyFileError where the key can't be read."""
     file = given or settings.load(config).record.seal_key
     return seal_key.load(Path(file)) if file else None

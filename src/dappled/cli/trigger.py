@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Report, Verb, flag, option
+from dappled.cli.verb import Output, Report, Verb, flag, option
 from dappled.config import settings
+from dappled.errors import CallError
 
 if not words_only:
     from dappled.cli.terminal import waiting_for

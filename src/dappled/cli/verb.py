@@ -15,16 +15,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Protocol, TypeVar
 
 from dappled.config.schema import Rule
-from dappled.errors import DappledError
+from dappled.errors import CallError, DappledError
 from dappled.findings import Finding
 
 Item = TypeVar("Item")
-
-
-class CallError(DappledError):
-    """The call itself is wrong, and nothing was begun; one sentence, shown with the verb's usage."""
-
-    exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ from dappled import codec
 from dappled.cli.field_arguments import FieldArguments, doubts, opened_field, views_words
 from dappled.cli.refocus import through_scene
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
+from dappled.cli.verb import Output, Overwriting, Report, Verb, option
+from dappled.errors import CallError
 
 if not words_only:
     import numpy as np

@@ -8,9 +8,9 @@ from pathlib import Path
 
 from dappled.cli.status import stream_endpoint, to_endpoint
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Report, Verb, argument, flag, option
+from dappled.cli.verb import Output, Report, Verb, argument, flag, option
 from dappled.clock import SystemClock
-from dappled.errors import counted
+from dappled.errors import CallError, counted
 
 if not words_only:
     from dappled.cli.terminal import waiting_for

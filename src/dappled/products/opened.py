@@ -432,8 +432,8 @@ def _open(path: str | Path, focus_m: float | None, recipe: Mapping[str, Any]) ->
         _refuse(recipe, found)
         return OpenedLightField(light_files.load(found), found, focus_m)
     if not found.is_dir():
-        if found.suffix.lower() in _TEXTS:
-            raise OpenError(f"{path} is no frame: open takes a raw frame, a decoded light field or a flight")
+        if wrong := not_opened(found):
+            raise OpenError(wrong)
         given = dict(recipe)
         length, stop = given.pop("focal_length_mm", None), given.pop("f_number", None)
         darkroom = Darkroom(_recipe(Recipe("auto", "", workers=2), given, found))
@@ -447,6 +447,15 @@ def _open(path: str | Path, focus_m: float | None, recipe: Mapping[str, Any]) ->
 
 
 _TEXTS = (".toml", ".json", ".txt", ".csv", ".md", ".py", ".sqlite", ".tlog", ".ulg")  # given by mistake
+
+
+def not_opened(path: Path) -> str:
+    """Why a file or folder that is there can't be opened, by its name and what it holds; "" where it may be."""
+    if path.is_dir() and path.suffix not in _LIGHT_FIELDS and not layout.FlightFolder(path).ledger.exists():
+        return view_folders.not_square(path)
+    if path.is_file() and path.suffix.lower() in _TEXTS:
+        return f"{path} is no frame: open takes a raw frame, a decoded light field or a flight"
+    return ""
 
 
 def light_field(path: str | Path, *, focus_m: float | None = None) -> OpenedLightField:

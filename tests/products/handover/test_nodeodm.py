@@ -294,8 +294,8 @@ def test_the_token_comes_from_a_private_file_or_the_environment(
     file.write_text("from-a-file\n")
     file.chmod(0o644)
     words = ("odm", node.url, "--task", "one")
-    assert main(["hand-over", *words, "--token-file", str(file)]) == 1
-    assert "can be read by others" in capsys.readouterr().err or "chmod" in capsys.readouterr().err
+    assert main(["hand-over", *words, "--token-file", str(file)]) == 2
+    assert "can be used by others than its owner: chmod 600" in capsys.readouterr().err
     file.chmod(0o600)
     assert run(*words, "--token-file", str(file)) == 0
     monkeypatch.setenv("DAPPLED_NODEODM_TOKEN", "from-the-environment")

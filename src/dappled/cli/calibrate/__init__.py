@@ -10,8 +10,8 @@ from dappled.cli.calibrate import kit, lens, target
 from dappled.cli.calibrate.frames import CalibrationView, Given, fit_views, views_of
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments, frames
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
-from dappled.errors import DappledError, counted
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import Code, finding, told
 
 if not words_only:

@@ -9,19 +9,9 @@ from dappled import codec
 from dappled.cli import paths, sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument, folder_of_flights
 from dappled.cli.table import words_only
-from dappled.cli.verb import (
-    CallError,
-    Doubtable,
-    Output,
-    Overwriting,
-    Report,
-    SettingsArgument,
-    Verb,
-    argument,
-    flag,
-    option,
-)
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, SettingsArgument, Verb, argument, flag, option
 from dappled.clock import SystemClock
+from dappled.errors import CallError
 
 if not words_only:
     from dappled.cli.flight import lines as flight_lines

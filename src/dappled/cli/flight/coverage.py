@@ -8,8 +8,8 @@ from pathlib import Path
 from dappled import codec
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, flag, option
-from dappled.errors import counted
+from dappled.cli.verb import Output, Overwriting, Report, Verb, flag, option
+from dappled.errors import CallError, counted
 from dappled.findings import told
 
 if not words_only:

@@ -10,9 +10,9 @@ from dappled import codec, findings
 from dappled.cli import sealing
 from dappled.cli.flight.arguments import EXAMPLE, FlightArgument
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Report, Verb, flag, option
+from dappled.cli.verb import Doubtable, Output, Report, Verb, flag, option
 from dappled.clock import TimeOfDayClock
-from dappled.errors import counted
+from dappled.errors import CallError, counted
 
 if not words_only:
     from dappled.daemon.replay import pickup

@@ -11,8 +11,8 @@ from typing import Any
 
 from dappled import durable, key_files
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, option
-from dappled.errors import DappledError, counted
+from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, option
+from dappled.errors import CallError, DappledError, counted
 
 if not words_only:
     from dappled.flight import disk_error, disk_errors

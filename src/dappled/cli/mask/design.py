@@ -9,7 +9,8 @@ from typing import Any
 from dappled import codec
 from dappled.cli.mask.arguments import FILM_NAMES, AltitudeArguments, InstallationArguments, out_of_reach
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, option
+from dappled.cli.verb import Output, Overwriting, Report, Verb, option
+from dappled.errors import CallError
 from dappled.findings import told
 
 if not words_only:

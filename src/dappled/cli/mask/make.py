@@ -10,7 +10,8 @@ from typing import Any, Literal
 
 from dappled import codec
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, flag, option
+from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, flag, option
+from dappled.errors import CallError
 
 if not words_only:
     import numpy as np

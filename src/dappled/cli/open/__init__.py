@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dappled.cli import paths
 from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, argument, flag, option
 from dappled.config.settings import LAW_NAMES, ConsoleSettings
@@ -44,7 +45,7 @@ class OpenInBrowser(Verb):
 
     path: Path | None = argument(
         "FLIGHT|FILE", "recorded flight, light field (.zarr, .npz, .h5, folder of views), raw frame", default=None,
-        there=True,
+        there=paths.opened,
     )  # fmt: skip
     bind: str = option(
         "--bind", "serve the page here, on this machine only", "127.0.0.1:0", metavar="HOST:PORT",

@@ -19,8 +19,8 @@ from dappled.cli.frame_arguments import (
     refuse_same_names,
 )
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Doubtable, Output, Overwriting, Report, Verb, flag, option
-from dappled.errors import counted
+from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, flag, option
+from dappled.errors import CallError, counted
 
 if not words_only:
     from dappled.cli.picture import places

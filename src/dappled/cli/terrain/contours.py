@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled.cli.table import words_only
-from dappled.cli.verb import CallError, Output, Overwriting, Report, Verb, argument, option
-from dappled.errors import counted
+from dappled.cli.verb import Output, Overwriting, Report, Verb, argument, option
+from dappled.errors import CallError, counted
 
 if not words_only:
     import numpy as np

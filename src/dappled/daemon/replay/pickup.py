@@ -29,7 +29,7 @@ from dappled.drivers.raw.recipe import camera_name
 from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
-from dappled.errors import DappledError, counted
+from dappled.errors import CallError, DappledError, counted
 from dappled.findings import FRAME, Code, Finding, Level, Subject, finding, text
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
@@ -37,12 +37,6 @@ from dappled.flight.records import DOUBT, NOTICED
 from dappled.flight.seal_key import SealKey
 
 _ANCHORS = 64  # frames whose times tell the camera's clock
-
-
-class ChoiceError(DappledError):
-    """What a person says of files and shots contradicts the flight; one sentence."""
-
-    exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +86,7 @@ def propose(
     flight: Path, source: FileSource, choice: Choice, progress: Callable[[int], Any] = lambda _: None
 ) -> Proposal:
     """Which files belong to which shots. Changes nothing. `progress` gets the bytes that were compared. Raises
-    DappledError, ChoiceError, FlightError, CameraError."""
+    DappledError, CallError, FlightError, CameraError."""
     folder = layout.open_folder(flight)
     with LedgerReader.open(folder.ledger) as ledger:
         if "closed_utc_ns" not in ledger.facts():
@@ -279,20 +273,18 @@ def _chosen(
     for index, name in choice.pairs.items():
         row = rows.get(index)
         if row is None or row.state == "safe":
-            raise ChoiceError(
-                f"--pair {index}={name}: shot {index} {'has its frame' if row else 'is not in the flight'}"
-            )
+            raise CallError(f"--pair {index}={name}: shot {index} {'has its frame' if row else 'is not in the flight'}")
         if row.fired_called_monotonic_ns is None:
             why = "" if row.reason is None else f": {text(row.reason)}"
-            raise ChoiceError(f"--pair {index}={name}: shot {index} never fired, according to the flight{why}")
+            raise CallError(f"--pair {index}={name}: shot {index} never fired, according to the flight{why}")
         fitting = [group for group in fresh if name in (group.main.name, group.main.base)]
         frames = [frame.index for full, frame in known.items() if name in (full, full.rpartition("/")[2])]
         if frames and not fitting:
-            raise ChoiceError(f"--pair {index}={name}: its bytes are the frame of shot {frames[0]} already")
+            raise CallError(f"--pair {index}={name}: its bytes are the frame of shot {frames[0]} already")
         if len(fitting) != 1:
-            raise ChoiceError(f"--pair {index}={name}: {len(fitting)} new files have this name; give the full name")
+            raise CallError(f"--pair {index}={name}: {len(fitting)} new files have this name; give the full name")
         if (other := next((one for one, group in chosen.items() if group is fitting[0]), None)) is not None:
-            raise ChoiceError(f"--pair {index}={name}: the same file is named for shot {other}; a file has one shot")
+            raise CallError(f"--pair {index}={name}: the same file is named for shot {other}; a file has one shot")
         chosen[index] = fitting[0]
     return chosen
 
@@ -301,7 +293,7 @@ def _matched(shots: list[FiredShot], files: list[DatedFile], choice: Choice, off
     if choice.by_order:
         pairs = matching.in_order(shots, files)
         if pairs is None:
-            raise ChoiceError(
+            raise CallError(
                 f"--by-order needs as many files as shots: {counted(len(shots), 'shot')}, {counted(len(files), 'file')}"
             )
         return Matching(pairs, (), (), tuple(_against(files)))

@@ -26,7 +26,7 @@ from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot
 from dappled.drivers.utc_choice import Date, UtcBounds
 from dappled.drivers.wired.matching import seconds
-from dappled.errors import DappledError
+from dappled.errors import CallError, DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding, text
 from dappled.flight import (
     LIVE,
@@ -145,16 +145,16 @@ def of_folder(
     named. `vehicle`: the system id of the one whose telemetry counts (see `vehicle_of`). `now_ns`: no log is of a
     later time."""
     if telemetry is not None and not telemetry.is_file():
-        raise DappledError(f"{telemetry}: there is no such telemetry file; check --telemetry")
+        raise CallError(f"{telemetry}: there is no such telemetry file; check --telemetry")
     telemetry = telemetry or _only_log(folder)
     if Path(match).is_absolute():
-        raise DappledError(f"--match {match} names another folder: give a pattern of names in {folder}")
+        raise CallError(f"--match {match} names another folder: give a pattern of names in {folder}")
     named = [path for path in folder.glob(match) if path.suffix.lower() in FRAME_SUFFIXES and path.is_file()]
     taken_s = {path: _taken_s(path) for path in named}
     ordered = picture_order.by_time(named, Path.as_posix, taken_s.get)
     paths = ordered.items
     if not paths:
-        raise DappledError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
+        raise CallError(f"no frame in {folder} matches {match!r}; frames end in {', '.join(FRAME_SUFFIXES)}")
     system, told = _vehicle(telemetry, vehicle)
     times_s = [taken_s[path] for path in paths]
     bounds = _bounds(times_s, start_utc_ns, TimeOfDayClock().utc_ns() if now_ns is None else now_ns)
@@ -235,7 +235,7 @@ def _only_log(folder: Path) -> Path | None:
         named = [*folder.glob("*.[bB][iI][nN]"), *folder.glob("*.[uU][lL][gG]")]
         logs = sorted(path for path in named if path.is_file() and own_log(path))
     if len(logs) > 1:
-        raise DappledError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
+        raise CallError(f"{folder} holds {len(logs)} {kind} files: say which with --telemetry")
     return logs[0] if logs else None
 
 
