@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import vulture
 
+from dappled.cli import VERBS
 from tests.architecture.walk import GROWTH, ROOT, SOURCE, parsed
 
 MODULES = sorted(SOURCE.rglob("*.py"))
@@ -157,7 +158,8 @@ def unused_in_src() -> dict[str, set[str]]:
 
 def test_nothing_is_there_for_tests_only(unused_in_src: dict[str, set[str]]) -> None:
     unused = set[str]().union(*(unused_in_src[kind] for kind in ("function", "class", "method", "property")))
-    assert unused - set(UNUSED) == set()
+    verbs = {where.partition(":")[2] for where, _ in VERBS.values()}  # the command line loads them by name
+    assert unused - set(UNUSED) - verbs == set()
     assert set(UNUSED) - unused == set(), "these are used by now: strike them from the list"
 
 

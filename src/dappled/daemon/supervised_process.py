@@ -60,7 +60,7 @@ class SupervisedProcess(OneThread):
         """`name` is the thread's."""
         self._program, self._peer, self._clock = program, peer, clock
         self._budget = budget or RestartBudget(limit=5, window_s=60.0)
-        self._process: subprocess.Popen[bytes] | None = None
+        self.process: subprocess.Popen[bytes] | None = None
         self._loop = Loop(name, self._run)
 
     def stop(self, timeout_s: float = 5.0) -> None:
@@ -86,7 +86,7 @@ class SupervisedProcess(OneThread):
     def _keep_one(self) -> None:
         """Start the process and serve it until it ends or must. Raises ChannelError, and what the peer raises."""
         one = self._program
-        self._process, channel = start_child(
+        self.process, channel = start_child(
             one.module,
             *one.arguments,
             descriptors=one.descriptors,
@@ -99,5 +99,5 @@ class SupervisedProcess(OneThread):
                 self._peer.turn(channel, channel.receive(_TURN_S))
         finally:
             channel.close()  # this ends the process
-            process, self._process = self._process, None
+            process, self.process = self.process, None
             end_child(process, one.end_s)

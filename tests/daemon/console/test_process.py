@@ -97,7 +97,7 @@ def setup(folder: Path) -> dict[str, Any]:
 
 
 def running(console: Console) -> subprocess.Popen[bytes] | None:
-    return console._process
+    return console.process
 
 
 class Handler:

@@ -34,10 +34,10 @@ def test_a_killed_relay_costs_viewers_a_moment_and_the_publisher_nothing() -> No
                 return viewer.receive(0.05) is not None
 
             eventually(sees, "a first frame")
-            assert relay._process is not None
-            first = relay._process.pid
+            assert relay.process is not None
+            first = relay.process.pid
             os.kill(first, signal.SIGKILL)
-            eventually(lambda: relay._process is not None and relay._process.pid != first, "another process")
+            eventually(lambda: relay.process is not None and relay.process.pid != first, "another process")
             until = time.monotonic() + 0.2
             while time.monotonic() < until:  # what the dead one had passed on already
                 viewer.receive(0.01)
@@ -48,7 +48,7 @@ def test_a_killed_relay_costs_viewers_a_moment_and_the_publisher_nothing() -> No
         assert one.dead_threads() == []
     finally:
         one.stop(0.2)
-    assert relay._process is None
+    assert relay.process is None
 
 
 def test_the_last_message_arrives_when_the_publisher_ends() -> None:
