@@ -33,6 +33,16 @@ def is_temporary(name: str) -> bool:
     return name.startswith(".") and name.endswith(_PART)
 
 
+@contextlib.contextmanager
+def descriptor(path: Path | str, flags: int, dir_fd: int | None = None) -> Iterator[int]:
+    """A file's or a folder's descriptor, closed at the end. Raises OSError."""
+    fd = os.open(path, flags | _CLOEXEC, dir_fd=dir_fd)
+    try:
+        yield fd
+    finally:
+        os.close(fd)
+
+
 def sync_folder(path: Path) -> None:
     """fsync a folder: its names are durable afterwards. Windows can't open folders, and keeps names by itself.
 
@@ -40,20 +50,14 @@ def sync_folder(path: Path) -> None:
     """
     if not hasattr(os, "O_DIRECTORY"):
         return
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | _CLOEXEC)
-    try:
+    with descriptor(path, os.O_RDONLY | os.O_DIRECTORY) as fd:
         os.fsync(fd)
-    finally:
-        os.close(fd)
 
 
 def sync_file(path: Path) -> None:
     """fsync a file and its folder: its bytes and its name are durable afterwards. Raises OSError."""
-    fd = os.open(path, os.O_RDONLY | _CLOEXEC)
-    try:
+    with descriptor(path, os.O_RDONLY) as fd:
         os.fsync(fd)
-    finally:
-        os.close(fd)
     sync_folder(path.parent)
 
 

@@ -365,19 +365,15 @@ def work_lock(root: Path, doing: str, *, needed: bool = False) -> AbstractContex
 def is_locked(root: Path) -> bool:
     """Whether some process records into `root` now. Raises FlightError when the lock can't be read."""
     path = root / _LOCK
-    try:
-        fd = os.open(path, os.O_RDONLY | _NO_LINK)
-    except FileNotFoundError:
-        return False
-    except OSError as error:
-        raise disk_error("look at the lock", path, error) from error
-    try:
-        file_lock.lock(fd, shared=True)
-        return False
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(fd)
+    with disk_errors("look at the lock", path):
+        try:
+            with durable.descriptor(path, os.O_RDONLY | _NO_LINK) as fd:
+                file_lock.lock(fd, shared=True)
+        except FileNotFoundError:
+            return False
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _raise(error: OSError) -> None:

@@ -155,11 +155,8 @@ def _disks_of(device: int) -> frozenset[str]:
             return frozenset[str]().union(*(_disks_of(_number(path.read_text())) for path in below))
         image = here / "loop" / "backing_file"
         if image.exists():
-            backing = os.open(image.read_text().strip(), os.O_RDONLY | os.O_CLOEXEC)
-            try:
+            with durable.descriptor(image.read_text().strip(), os.O_RDONLY) as backing:
                 return disks(backing)
-            finally:
-                os.close(backing)
         return frozenset({here.name})
     return frozenset()
 

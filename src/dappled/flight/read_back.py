@@ -22,40 +22,31 @@ _REFUSED = {errno.EINVAL, errno.EOPNOTSUPP}
 
 def hash_on_disk(name: str, folder: int) -> tuple[str, ReadBack]:
     """fsync a file in an open folder and return its SHA-256 (hex), and how it was read. Raises OSError."""
-    fd = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC, dir_fd=folder)
     try:
-        if not stat.S_ISREG(os.fstat(fd).st_mode):
-            raise OSError(errno.ENOTSUP, "it is no file")  # a pipe would be waited for
-        os.fsync(fd)
-        os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
-        size = os.fstat(fd).st_size
-        direct = _direct(name, folder, size)
-        if direct is not None:
-            return direct, "O_DIRECT"
-        how: ReadBack = "page cache" if _in_memory(fd, size) else "dropped pages"
-        return durable.hash_descriptor(fd, size), how
+        with durable.descriptor(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK, folder) as fd:
+            if not stat.S_ISREG(os.fstat(fd).st_mode):
+                raise OSError(errno.ENOTSUP, "it is no file")  # a pipe would be waited for
+            os.fsync(fd)
+            os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
+            size = os.fstat(fd).st_size
+            direct = _direct(name, folder, size)
+            if direct is not None:
+                return direct, "O_DIRECT"
+            how: ReadBack = "page cache" if _in_memory(fd, size) else "dropped pages"
+            return durable.hash_descriptor(fd, size), how
     except EOFError as error:
         raise OSError(errno.EIO, str(error)) from error
-    finally:
-        os.close(fd)
 
 
 def _direct(name: str, folder: int, size: int) -> str | None:
     """The hash by O_DIRECT; None where the file system refuses it."""
     try:
-        fd = os.open(name, os.O_RDONLY | os.O_DIRECT | os.O_NOFOLLOW | os.O_CLOEXEC, dir_fd=folder)
+        with durable.descriptor(name, os.O_RDONLY | os.O_DIRECT | os.O_NOFOLLOW, folder) as fd:
+            return durable.hash_descriptor(fd, size)
     except OSError as error:
         if error.errno in _REFUSED:
             return None
         raise
-    try:
-        return durable.hash_descriptor(fd, size)
-    except OSError as error:
-        if error.errno in _REFUSED:
-            return None
-        raise
-    finally:
-        os.close(fd)
 
 
 def _in_memory(fd: int, size: int) -> bool:

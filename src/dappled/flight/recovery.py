@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -134,13 +135,10 @@ def _add_noted_shots(folder: FlightFolder, ledger: Ledger) -> list[Finding]:
     noted = {shot.index for shot in journal.shots}
     missing = [row.shot for row in ledger.shots() if row.shot.index not in noted]
     if missing:
-        writer = ShotJournal(folder.journal)
-        try:
+        with closing(ShotJournal(folder.journal)) as writer:
             for shot in missing:
                 writer.note(shot)
                 report.append(finding(Code.SHOT_NOTED_AGAIN, FLIGHT, shot=shot.index))
-        finally:
-            writer.close()
     return report
 
 

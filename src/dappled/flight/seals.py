@@ -348,9 +348,6 @@ def _last_digest(content: bytes) -> str:
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
     """Keep other processes from sealing the same flight meanwhile. Raises OSError."""
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
+    with durable.descriptor(path, os.O_RDONLY | os.O_DIRECTORY) as fd:
         file_lock.lock(fd, wait=True)
         yield
-    finally:
-        os.close(fd)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -249,13 +249,11 @@ def _same(
 
 
 def _sha256(source: FileSource, found: FoundFile) -> str:
-    blob = source.open(found)
-    try:
-        return durable.hash_descriptor(blob.fd, blob.size)
-    except (OSError, EOFError) as error:
-        raise CameraError(f"{found.name} can't be read: {error}") from error
-    finally:
-        blob.close()
+    with closing(source.open(found)) as blob:
+        try:
+            return durable.hash_descriptor(blob.fd, blob.size)
+        except (OSError, EOFError) as error:
+            raise CameraError(f"{found.name} can't be read: {error}") from error
 
 
 def _changed_card(found: list[FoundFile], same: Mapping[str, Frame | None], had: list[Frame]) -> list[Finding]:
@@ -314,19 +312,13 @@ def _against(files: list[DatedFile]) -> list[Finding]:
 
 
 def _record(recorder: Recorder, source: FileSource, index: int, found: FoundFile, utc_ns: int) -> Frame:
-    blob = source.open(found)
-    try:
+    with closing(source.open(found)) as blob:
         return recorder.record(index, found.base, blob, arrived_utc_ns=utc_ns)
-    finally:
-        blob.close()
 
 
 def _accompany(recorder: Recorder, source: FileSource, index: int, found: FoundFile, utc_ns: int) -> None:
-    blob = source.open(found)
-    try:
+    with closing(source.open(found)) as blob:
         recorder.record_companion(index, found.base, blob, arrived_utc_ns=utc_ns)
-    finally:
-        blob.close()
 
 
 def _settings(path: Path) -> tagging.FrameSettings:

@@ -257,11 +257,8 @@ def _sync(path: Path) -> None:
     """fsync a file, or a folder with its content."""
     files = [Path(base, name) for base, _, names in os.walk(path) for name in names] if path.is_dir() else [path]
     for name in files:
-        fd = os.open(name, os.O_RDWR)  # Windows flushes no file that is open for reading
-        try:
+        with durable.descriptor(name, os.O_RDWR) as fd:  # Windows flushes no file that is open for reading
             os.fsync(fd)
-        finally:
-            os.close(fd)
     if path.is_dir():
         for base, _, _ in os.walk(path):
             durable.sync_folder(Path(base))
