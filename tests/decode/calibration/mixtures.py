@@ -132,7 +132,7 @@ class Mixture:
             if views:
                 true.add((v, u), moved)
             if self.present:
-                y, x = (side + through * aperture_mm * at for side, at in zip(sides, (v, u), strict=True))
+                y, x = (np.asarray(side + through * aperture_mm * at) for side, at in zip(sides, (v, u), strict=True))
                 plane += image * self._shadow(y, x)
             else:
                 plane += image * np.float32(_BARE)
@@ -142,7 +142,7 @@ class Mixture:
         noise = rng.normal(size=SHAPE) * np.sqrt(np.maximum(plane, 0) * plane.mean()) / self.snr
         return np.asarray(plane + noise, dtype=np.float32), true
 
-    def _shadow(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _shadow(self, y: NDArray[np.floating], x: NDArray[np.floating]) -> NDArray[np.float32]:
         """The mask's transmittance where rays that meet the sensor's rows and columns cross it, in mm."""
         turn, wave = math.radians(self.turned_deg), 2 * np.pi * FREQUENCY_PER_MM / (1 + self.scale)
         (down, across), c, s = (1e-3 * one for one in self.moved_um), math.cos(turn), math.sin(turn)
