@@ -135,7 +135,7 @@ def until_text(page: Page, part: str, *patterns: str) -> str:
     while missing := [one for one in patterns if not re.search(one, page.inner_text(part))]:
         assert time.monotonic() < deadline, (missing, page.inner_text(part))
         page.wait_for_timeout(30)
-    return page.inner_text(part)
+    return str(page.inner_text(part))
 
 
 def shoot(page: Page) -> int:
