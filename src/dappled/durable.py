@@ -87,26 +87,56 @@ def write_all(fd: int, data: bytes | memoryview) -> None:
         view = view[os.write(fd, view) :]
 
 
-def copy_in(source_fd: int, size: int, path: Path) -> str:
-    """Put the first `size` bytes of a file or memfd under `path`, durably; return their SHA-256 (hex).
+def unnamed(folder: Path) -> int:
+    """Make a file without a name in this folder, and open it to write and read: it is gone when it is closed, unless
+    `take_in` gave it a name. Raises OSError, also where the file system has no such files."""
+    return os.open(folder, os.O_RDWR | getattr(os, "O_TMPFILE", 0) | _CLOEXEC, 0o644)
 
-    The kernel copies from file to file (sendfile) while another thread hashes. Writing from a memory map of a memfd
-    would cost a page fault for every 4 KiB. Raises OSError, and EOFError when the source is shorter; `path` is then
-    missing or complete, never torn.
+
+def take_in(source_fd: int, size: int, path: Path, sha256: str | None = None) -> str:
+    """Put the first `size` bytes of a file or memfd under `path`, durably; return their SHA-256 (hex): the one given by
+    whoever wrote them, else it is computed.
+
+    A file without a name (`unnamed`) on the same file system, with its SHA-256, gets this name. Others are copied.
+    Raises OSError, FileExistsError perhaps where something stands at `path`, and EOFError when the source is shorter;
+    `path` is then missing or complete, never torn.
     """
-
-    def fill(fd: int) -> None:
-        done = 0
-        while done < size:
-            sent = os.sendfile(fd, source_fd, done, size - done)
-            if sent == 0:
-                raise EOFError(f"only {done} of {size} bytes arrived")
-            done += sent
-
+    if sha256 is not None:
+        if not _given_name(source_fd, size, path):
+            fill_file(path, lambda fd: copy(source_fd, fd, size))
+        return sha256
     with ThreadPoolExecutor(1, "dappled-hash") as beside:
-        sha256 = beside.submit(hash_descriptor, source_fd, size)
-        fill_file(path, fill)
-        return sha256.result()
+        computed = beside.submit(hash_descriptor, source_fd, size)
+        fill_file(path, lambda fd: copy(source_fd, fd, size))
+        return computed.result()
+
+
+def _given_name(fd: int, size: int, path: Path) -> bool:
+    """Make a file without a name durable, then its name. False for any other file, and where the system refuses: a file
+    whose name was removed can't have another one, and the name is given by way of /proc."""
+    found = os.fstat(fd)
+    if found.st_nlink or found.st_size != size or found.st_dev != os.stat(path.parent).st_dev:
+        return False
+    os.fsync(fd)
+    try:
+        os.link(f"/proc/self/fd/{fd}", path, src_dir_fd=fd)  # src_dir_fd: only linkat(2) follows the link
+    except FileExistsError:
+        raise
+    except OSError:
+        return False
+    sync_folder(path.parent)
+    return True
+
+
+def copy(source_fd: int, fd: int, size: int) -> None:
+    """Append the first `size` bytes of a file or memfd, whose offset stays. The kernel copies from file to file:
+    writing from a memory map would cost a page fault for every 4 KiB. Raises OSError, EOFError."""
+    done = 0
+    while done < size:
+        sent = os.sendfile(fd, source_fd, done, size - done)
+        if sent == 0:
+            raise EOFError(f"only {done} of {size} bytes arrived")
+        done += sent
 
 
 class NoPlainFileError(OSError):

@@ -53,6 +53,7 @@ THREADS = {
     "daemon/console/__main__.py": "a timer ends the console's own process, whatever its other threads do",
     "daemon/console/app.py": "asyncio waits for the answers of two pools, in the console's own process",
     "daemon/console/offline.py": "asyncio waits for frames that one thread decodes, in the process of `dappled open`",
+    "drivers/gphoto2/intake.py": "writes a file while it comes, in the camera's own process, where a disk may be stuck",
     "durable.py": "hashes one file beside its writing; the call waits for it",
     "mocks/scene/bench.py": "the views of one picture are rendered side by side; the call waits for them",
     "mocks/scene/flyover.py": "the views of one picture are rendered side by side; the call waits for them",

@@ -114,6 +114,7 @@ class LossyDisk:
     def __init__(self, root: Path, source: Callable[[str], bytes]) -> None:
         self._root, self._source = str(root), source
         self._top = _Folder()
+        self._unnamed: dict[str, _File] = {}  # open files without a name, by the path that strace gives them
         self._number = 0
 
     def hold(self, *, sure: bool) -> None:
@@ -140,6 +141,8 @@ class LossyDisk:
             return self._top
         if not path.startswith(self._root + "/"):
             return None
+        if path.rpartition("/")[2].startswith("#"):
+            return self._unnamed.setdefault(path, _File())
         here: _File | _Folder | None = self._top
         for part in path[len(self._root) + 1 :].split("/"):
             here = _names(here, len(here.changes)).get(part) if isinstance(here, _Folder) else None
@@ -167,6 +170,8 @@ class LossyDisk:
 
     def _openat(self, call: Call) -> bool | None:
         path = call.name_in(1)
+        if "O_TMPFILE" in call.arguments[2]:
+            return None  # nothing that a power cut leaves
         if "O_CREAT" in call.arguments[2] and self._find(path) is None:
             return self._put({path: _File()})
         found = self._find(path)
@@ -227,6 +232,18 @@ class LossyDisk:
 
     def _move(self, old: str, new: str) -> bool | None:
         return self._put({old: None, new: self._find(old)})
+
+    def _linkat(self, call: Call) -> bool | None:
+        """A file without a name gets one, by its descriptor."""
+        assert call.arguments[4] == "AT_SYMLINK_FOLLOW"
+        assert call.name_at(1).startswith("/proc/self/fd/")
+        file = self._find(call.path(0))
+        self._unnamed.pop(call.path(0), None)
+        return self._put({call.name_in(3): file})
+
+    def _fallocate(self, call: Call) -> bool | None:
+        """Room for what follows: it holds zeros until that is written."""
+        return True if self._find(call.path(0)) else None
 
     def _unlink(self, call: Call) -> bool | None:
         return self._put({call.name_at(0): None})

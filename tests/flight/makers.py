@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import os
 import struct
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+from dappled.clock import SystemClock
 from dappled.decode.geometry import Pose
+from dappled.drivers.camera import Blob
+from dappled.drivers.gphoto2.intake import Intake
 from dappled.findings import Code, Finding, Subject, finding, text
 from dappled.flight import Cause, Frame, Recording, Shot, Tag, TimeSource
 
@@ -22,6 +26,7 @@ class Held:
 
     fd: int
     size: int
+    sha256: str | None = None
 
 
 @contextmanager
@@ -48,6 +53,38 @@ def request(flight: Recording, index: int) -> None:
 def deliver(flight: Recording, index: int, data: bytes, name: str = "IMG_0001.CR2") -> Frame:
     with held(data) as blob:
         return flight.recorder.record(index, name, blob, arrived_utc_ns=5)
+
+
+class PatientClock(SystemClock):
+    """Lets a busy machine take its time."""
+
+    def wait(self, event: threading.Event, timeout_s: float) -> bool:
+        return super().wait(event, 60 * timeout_s)
+
+
+def come(intake: Intake, data: bytes) -> Blob:
+    """A camera's file, as the camera's process receives it."""
+
+    def read(into: memoryview) -> int:
+        piece = data[coming.size : coming.size + len(into)]
+        into[: len(piece)] = piece
+        return len(piece)
+
+    with intake.begin(len(data)) as coming:
+        while coming.size < len(data):
+            coming.take(len(data) - coming.size, read)
+        return coming.finish()
+
+
+def deliver_straight(flight: Recording, index: int, data: bytes, name: str = "IMG_0001.CR2") -> Frame:
+    """As `deliver`, of a file that was written to the flight's disk while it came."""
+    intake = Intake(PatientClock())
+    intake.folder = flight.folder.frames
+    blob = come(intake, data)
+    try:
+        return flight.recorder.record(index, name, blob, arrived_utc_ns=5)
+    finally:
+        blob.close()
 
 
 def pose(packets: int = 3) -> Pose:

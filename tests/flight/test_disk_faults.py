@@ -23,7 +23,7 @@ from dappled.findings import told
 from dappled.flight import FlightError, Frame, Recording, layout, recording
 from dappled.flight.checks.flight_check import check
 from tests.flight.conftest import START_UTC_NS
-from tests.flight.makers import deliver, flip, request, shot, tag
+from tests.flight.makers import deliver, deliver_straight, flip, request, shot, tag
 
 LATER_UTC_NS = START_UTC_NS + 10**9
 MB = 1_000_000
@@ -54,7 +54,7 @@ from dappled.findings import text
 from dappled.flight import recording
 from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
-from tests.flight.makers import deliver, request
+from tests.flight.makers import deliver, deliver_straight, request
 mount = lambda *words: subprocess.run(["mount", *words], check=True)
 disk = Path(sys.argv[1])
 mount("-t", "tmpfs", "-o", "size=8m", "dappled", str(disk))
@@ -63,7 +63,7 @@ told, safe = [], []
 def shoot(index, size=2_500_000):
     request(flight, index)
     try:
-        safe.append(deliver(flight, index, os.urandom(size)).index)
+        safe.append({way}(flight, index, os.urandom(size)).index)
     except FlightError as error:
         told.append(str(error))
 {fault}
@@ -73,6 +73,7 @@ flight.close()
 print(json.dumps({{"told": told, "safe": safe, "frames": frames, "rows": rows,
                   "problems": [str(one) for one in check(flight.folder.path).problems]}}))
 """
+WAYS = ["deliver", "deliver_straight"]
 FULL = """
 (disk / "ballast").write_bytes(bytes(2_000_000))
 for index in range(3):
@@ -91,7 +92,7 @@ shoot(2)
 """
 
 
-def in_namespace(fault: str, disk: Path) -> dict[str, Any]:
+def in_namespace(fault: str, disk: Path, way: str) -> dict[str, Any]:
     """Record four shots on a disk of 8 MB that only the recorder sees."""
     unshare = ["unshare", "--user", "--map-root-user", "--mount"]
     if (
@@ -101,7 +102,7 @@ def in_namespace(fault: str, disk: Path) -> dict[str, Any]:
         pytest.skip("this user may not make a user namespace: no small disk can be mounted")
     disk.mkdir()
     done = subprocess.run(
-        [*unshare, sys.executable, "-c", IN_NAMESPACE.format(fault=fault), str(disk)],
+        [*unshare, sys.executable, "-c", IN_NAMESPACE.format(fault=fault, way=way), str(disk)],
         cwd=Path(__file__).parents[2], capture_output=True, text=True, check=False, timeout=60,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -109,8 +110,9 @@ def in_namespace(fault: str, disk: Path) -> dict[str, Any]:
     return said
 
 
-def test_a_disk_that_is_full_in_the_middle_of_a_frame(tmp_path: Path) -> None:
-    said = in_namespace(FULL, tmp_path / "disk")
+@pytest.mark.parametrize("way", WAYS)
+def test_a_disk_that_is_full_in_the_middle_of_a_frame(tmp_path: Path, way: str) -> None:
+    said = in_namespace(FULL, tmp_path / "disk", way)
     assert said["safe"] == [0, 1, 3]
     assert said["frames"] == ["000000.cr2", "000001.cr2", "000003.cr2"]
     (told,) = said["told"]
@@ -119,8 +121,9 @@ def test_a_disk_that_is_full_in_the_middle_of_a_frame(tmp_path: Path) -> None:
     assert said["problems"] == []
 
 
-def test_a_folder_that_turns_read_only(tmp_path: Path) -> None:
-    said = in_namespace(READ_ONLY, tmp_path / "disk")
+@pytest.mark.parametrize("way", WAYS)
+def test_a_folder_that_turns_read_only(tmp_path: Path, way: str) -> None:
+    said = in_namespace(READ_ONLY, tmp_path / "disk", way)
     assert said["safe"] == [0, 2]
     (told,) = said["told"]
     assert "the disk is mounted read-only; remount it" in told
@@ -218,13 +221,13 @@ def test_a_power_cut_on_a_real_file_system(ext4: Image, tmp_path: Path, monkeypa
         cut()
         return done
 
-    for name in ("fsync", "replace", "sendfile"):
+    for name in ("fsync", "replace", "sendfile", "link", "posix_fallocate"):
         monkeypatch.setattr(os, name, partial(watched, getattr(os, name)))
     flight = recording.begin(ext4.mounted / "flights", RecordedClock(START_UTC_NS))
     for index in range(2):
         request(flight, index)
         cut()
-        safe[index] = deliver(flight, index, os.urandom(300_000)).sha256
+        safe[index] = (deliver_straight if index else deliver)(flight, index, os.urandom(300_000)).sha256
         cut()
     monkeypatch.undo()
     flight.close()

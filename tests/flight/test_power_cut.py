@@ -27,7 +27,7 @@ import os, sys, time
 from pathlib import Path
 from dappled.clock import RecordedClock
 from dappled.flight import recording
-from tests.flight.makers import deliver, mavlink_2, shot, tag
+from tests.flight.makers import deliver, deliver_straight, mavlink_2, shot, tag
 flight = recording.begin(Path(sys.argv[1]), RecordedClock(1795256103000000000))
 for index in range(flight.next_index, flight.next_index + 3):
     flight.journal.note(shot(index))
@@ -35,7 +35,7 @@ for index in range(flight.next_index, flight.next_index + 3):
     flight.telemetry.append(index, mavlink_2(b"x"))
     flight.ledger.add_shot(shot(index))
     flight.ledger.fired(index, 1, 2)
-    frame = deliver(flight, index, bytes([index + 1]) * 20_000)
+    frame = (deliver_straight if index % 2 else deliver)(flight, index, bytes([index + 1]) * 20_000)
     flight.note_image(index)
     os.write(1, b"safe %d %s" % (index, frame.sha256.encode()))
     flight.ledger.add_tag(tag(frame))
@@ -179,7 +179,8 @@ def test_a_recorder_that_forgets_to_make_sure_is_found_out(folder: Path, forgott
 
 
 def test_the_recorded_calls_make_the_folder_that_was_made(calls: list[Call], folder: Path) -> None:
-    """The model of the disk itself: with nothing lost it holds the very files."""
+    """The model of the disk itself: with nothing lost it holds the very files. Both ways of recording are in it."""
+    assert {"linkat", "sendfile", "rename"} <= {call.name for call in calls}
     disk = LossyDisk(folder / "flights", source)
     for call in calls:
         disk.apply(call)

@@ -18,7 +18,7 @@ from dappled.clock import RecordedClock
 from dappled.flight import FlightError, Frame, Ledger, LedgerReader, Recording, Stray
 from dappled.flight.checks.flight_check import check
 from dappled.flight.recording import StrayFileError
-from tests.flight.makers import deliver, held, request
+from tests.flight.makers import deliver, deliver_straight, held, request
 from tests.standing import words
 
 DATA = b"raw bytes" * 1000
@@ -37,6 +37,38 @@ def test_a_frame_is_safe_when_record_returns(flight: Recording) -> None:
     assert (flight.folder.path / frame.name).read_bytes() == DATA
     with LedgerReader.open(flight.ledger.path) as reader:
         assert reader.frames() == [frame]
+
+
+def test_a_file_that_was_written_while_it_came_is_the_frame(flight: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    request(flight, 0)
+
+    def copied(*_: object) -> None:
+        raise AssertionError("it was copied")
+
+    monkeypatch.setattr(durable, "copy", copied)
+    frame = deliver_straight(flight, 0, DATA)
+    assert frame.sha256 == hashlib.sha256(DATA).hexdigest()
+    assert (flight.folder.path / frame.name).read_bytes() == DATA
+    assert flight.ledger.frame(0) == frame
+    assert deliver_straight(flight, 0, DATA) == frame  # the same file again
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO])
+def test_a_disk_that_fails_to_make_it_sure_fails_the_shot_and_leaves_no_file(
+    flight: Recording, monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def refuse(fd: int) -> None:
+        raise OSError(number, os.strerror(number))
+
+    request(flight, 0)
+    monkeypatch.setattr(os, "fsync", refuse)
+    with pytest.raises(FlightError, match=r"cannot record IMG_0001.CR2 as .*000000\.cr2: the disk"):
+        deliver_straight(flight, 0, DATA)
+    monkeypatch.undo()
+    assert files(flight) == []
+    row = flight.ledger.shot(0)
+    assert row is not None
+    assert row.state == "failed"
 
 
 def test_the_row_comes_after_the_file(flight: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -219,7 +251,7 @@ import sys, itertools
 from pathlib import Path
 from dappled.clock import RecordedClock
 from dappled.flight import recording
-from tests.flight.makers import deliver, mavlink_2, shot
+from tests.flight.makers import deliver, deliver_straight, mavlink_2, shot
 flight = recording.begin(Path(sys.argv[1]), RecordedClock(1795256103000000000))
 for index in itertools.count(flight.next_index):
     flight.journal.note(shot(index))
@@ -227,7 +259,7 @@ for index in itertools.count(flight.next_index):
     flight.telemetry.append(index, mavlink_2(b"x"))
     flight.ledger.add_shot(shot(index))
     flight.ledger.fired(index, 1, 2)
-    frame = deliver(flight, index, bytes([index % 251]) * 300_000)
+    frame = (deliver_straight if index % 2 else deliver)(flight, index, bytes([index % 251]) * 300_000)
     flight.note_image(index)
     print("safe", index, frame.sha256, flush=True)
 """

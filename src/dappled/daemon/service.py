@@ -58,7 +58,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher, Stream
 from dappled.daemon.survey_facts import LiveSurvey, distance_trigger
-from dappled.drivers.camera import Camera
+from dappled.drivers.camera import Camera, WritesFiles
 from dappled.drivers.gnss.port import GnssPort, gnss_port
 from dappled.drivers.gnss.recorded import TelemetryNotebook
 from dappled.drivers.mavlink import MavlinkLinks, Transport
@@ -255,6 +255,8 @@ class Service:
         autopilot = OwnAutopilot(sender, clock, on_gimbal=on_gimbal, cam_idx=cam_idx)
         if isinstance(camera, UsesAutopilot):
             camera.use_autopilot(autopilot.command)
+        if isinstance(camera, WritesFiles):
+            camera.receive_into(recording.folder.frames)
         survey = LiveSurvey(navigation, reported, shots)
         distance = distance_trigger(shutter, survey, clock, settings)
         overlap = OverlapWatch(survey, settings.pose.mount, settings.trigger.overlap)

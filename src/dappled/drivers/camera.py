@@ -16,6 +16,7 @@ import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
 
 from dappled.clock import Clock, SystemClock
@@ -41,10 +42,15 @@ class Identity:
 
 @dataclass(frozen=True, slots=True)
 class Blob:
-    """A file's bytes behind a descriptor (a memfd or an open file), which can pass between processes without a copy."""
+    """A file's bytes behind a descriptor (a memfd or an open file), which can pass between processes without a copy.
+
+    `sha256` (hex) where they were hashed as they came; else None. With it, a file that has no name yet (O_TMPFILE) and
+    stands on the flight's own disk is not copied: the recorder gives it its name. Nobody may write to it any more.
+    """
 
     fd: int
     size: int
+    sha256: str | None = None
 
     @classmethod
     def of(cls, data: bytes | memoryview, name: str = "dappled") -> Blob:
@@ -316,6 +322,14 @@ class LiveView(Protocol):
         Shots go first. The camera ends live view before a shot, and when nobody has asked for 3 s. Raises CameraError
         where the body has none, or can't show it now.
         """
+
+
+@runtime_checkable
+class WritesFiles(Protocol):
+    """A camera that can write its files to the flight's own disk while they come. A driver may have it."""
+
+    def receive_into(self, folder: Path) -> None:
+        """Files may be made without a name (O_TMPFILE) in this folder. Called before `start`."""
 
 
 class QueuedCamera:

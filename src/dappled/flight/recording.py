@@ -1,7 +1,8 @@
 """Record one flight: begin it, make the camera's files safe, end it.
 
-A frame is written under a temporary name, fsynced, renamed, and the folder fsynced; then the ledger gets its row. Only
-then does `Recorder.record` return; only then may the frame be announced and the camera's own copy be deleted.
+A frame is written into a file without a name, or under a temporary one; it is fsynced, gets its name, and the folder is
+fsynced; then the ledger gets its row. Only then does `Recorder.record` return; only then may the frame be announced and
+the camera's own copy be deleted.
 """
 
 from __future__ import annotations
@@ -42,6 +43,10 @@ class FileBytes(Protocol):
 
     @property
     def size(self) -> int: ...
+
+    @property
+    def sha256(self) -> str | None:
+        """Where whoever wrote them has hashed them."""
 
 
 class StrayFileError(FlightError):
@@ -117,7 +122,7 @@ class Recorder:
         return stray
 
     def _again(self, first: Frame, camera_name: str, blob: FileBytes, arrived_utc_ns: int) -> Frame:
-        if blob.size == first.size and durable.hash_descriptor(blob.fd, blob.size) == first.sha256:
+        if blob.size == first.size and _sha256(blob) == first.sha256:
             self._ledger.add_event("double", finding(Code.FILE_CAME_AGAIN, FRAME, file=camera_name), first.index)
             return first
         why = finding(Code.FILE_SECOND, Subject("file", camera_name), shot=first.index, frame=first.name)
@@ -148,7 +153,7 @@ class Recorder:
             self._take_reserve()
 
     def _put(self, path: Path, blob: FileBytes) -> str:
-        return self._left_over(path, blob) if path.exists() else durable.copy_in(blob.fd, blob.size, path)
+        return self._left_over(path, blob) if path.exists() else durable.take_in(blob.fd, blob.size, path, blob.sha256)
 
     def _take_reserve(self) -> None:
         """Hold a reserve again, as far as there are descriptors for it."""
@@ -161,7 +166,7 @@ class Recorder:
 
         Raises FlightError where it holds other bytes than the camera's file.
         """
-        sha256 = durable.hash_descriptor(blob.fd, blob.size)
+        sha256 = _sha256(blob)
         if path.stat().st_size != blob.size or durable.hash_file(path) != sha256:
             raise FlightError(f"{path} already exists without a ledger row; start a new flight to have it adopted")
         durable.sync_file(path)
@@ -172,6 +177,10 @@ class Recorder:
             self._ledger.failed(index, finding(Code.SHOT_UNRECORDED, Subject("shot", index), reason=str(error)))
         except FlightError as second:
             raise FlightError(f"{error}; and this could not be noted either: {second}") from error
+
+
+def _sha256(blob: FileBytes) -> str:
+    return blob.sha256 or durable.hash_descriptor(blob.fd, blob.size)
 
 
 @dataclass(frozen=True, slots=True)

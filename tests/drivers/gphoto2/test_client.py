@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import hashlib
 import io
 import itertools
 import math
@@ -22,6 +23,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from dappled import durable
 from dappled.clock import SystemClock
 from dappled.drivers import usb_bus
 from dappled.drivers.camera import (
@@ -54,6 +56,7 @@ from dappled.testing import (
     until_shot_ends,
     until_state,
 )
+from tests.waiting import eventually
 
 SIZE = 3_000_001
 
@@ -347,6 +350,57 @@ def test_a_link_dropped_in_mid_transfer_loses_no_file_on_the_card(ready: Make, b
     assert content(arrival) == pattern(1, SIZE)
     assert any(isinstance(event, StateChanged) and event.state == "faulted" for event in events)
     assert body.releases == 1
+
+
+def open_in(folder: Path, process: int) -> list[str]:
+    """Files without a name that a process has open in a folder."""
+    found = [os.readlink(fd) for fd in Path(f"/proc/{process}/fd").iterdir() if fd.is_symlink()]
+    return [name for name in found if name.startswith(f"{folder}/#")]
+
+
+def test_a_file_comes_into_the_flight_s_folder_and_a_part_of_one_leaves_nothing(
+    body: SimulatedBody, tmp_path: Path
+) -> None:
+    """The link breaks in its middle, then the process is killed there."""
+    started: list[subprocess.Popen[bytes]] = []
+    camera = GPhoto2Camera(parse_settings({"port": body.port}), spawn=_recorded(started))
+    camera.receive_into(tmp_path)
+    with running(camera):
+        until_state(camera, "ready")
+        body.fault("drop-transfer")
+        camera.fire(1)
+        arrival = arrived(camera, 1)
+        assert (os.fstat(arrival.blob.fd).st_nlink, os.fstat(arrival.blob.fd).st_dev) == (0, tmp_path.stat().st_dev)
+        assert arrival.blob.sha256 == hashlib.sha256(pattern(1, SIZE)).hexdigest()
+        assert content(arrival) == pattern(1, SIZE)
+        body.fault("crawl")
+        camera.fire(2)
+        eventually(lambda: open_in(tmp_path, started[0].pid), "the file is on its way")
+        started[0].kill()
+        until(camera, lambda event: isinstance(event, ShotFailed) and event.shot == 2)
+        body.fault("clear")
+        assert content(arrived(camera, 2)) == pattern(2, SIZE)  # by the next process, on the disk too
+        assert os.listdir(tmp_path) == []
+        assert open_in(tmp_path, os.getpid()) == []
+
+
+def test_a_folder_that_takes_no_file_without_a_name_is_not_used(
+    body: SimulatedBody, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(folder: Path) -> int:
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    monkeypatch.setattr(durable, "unnamed", refuse)
+    caplog.set_level("INFO")
+    camera = open_camera({"port": body.port})
+    camera.receive_into(tmp_path)
+    assert f"{tmp_path} has none without a name" in caplog.text
+    with running(camera):
+        until_state(camera, "ready")
+        camera.fire(1)
+        arrival = arrived(camera, 1)
+        assert os.fstat(arrival.blob.fd).st_dev != tmp_path.stat().st_dev
+        assert content(arrival) == pattern(1, SIZE)
 
 
 def test_a_link_dropped_in_mid_exposure_loses_no_file_on_the_card() -> None:

@@ -25,6 +25,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.drivers.child_process import ChannelError, ProcessChannel
+from dappled.drivers.gphoto2.intake import Intake
 from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, message_event
 from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
@@ -90,7 +91,7 @@ class FakeCamera:
         news, self.coming = self.coming, []
         return news
 
-    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
+    def fetch(self, file: CameraFile, _intake: Intake, alive: Callable[[], None]) -> Fetched:
         self._stumble("fetch")
         for _ in range(self.pieces):
             alive()

@@ -30,6 +30,7 @@ from dappled.drivers.camera import (
     ShotFailed,
 )
 from dappled.drivers.child_process import ChannelMessage, ProcessChannel
+from dappled.drivers.gphoto2.intake import Intake
 from dappled.drivers.gphoto2.messages import CUT_OFF, Carryover, message_event
 from dappled.drivers.gphoto2.process import CameraLoop
 from dappled.drivers.gphoto2.protocol import (
@@ -187,7 +188,7 @@ class Body:
                 self._cache.setdefault(news.file, (picture.card, (len(data), taken_s)))
         return [news for _, news, _ in due]
 
-    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
+    def fetch(self, file: CameraFile, _intake: Intake, alive: Callable[[], None]) -> Fetched:
         self._check()
         if self.cuts_transfer:
             self.cuts_transfer = False

@@ -11,6 +11,7 @@ import gphoto2 as gp
 import pytest
 
 from dappled.drivers.gphoto2 import session as opening
+from dappled.drivers.gphoto2.intake import Intake
 from dappled.drivers.gphoto2.protocol import CameraFile, RefusedError, SettingTurned
 from dappled.drivers.gphoto2.session import GPhoto2Session
 from dappled.drivers.gphoto2.settings import parse_settings
@@ -92,7 +93,7 @@ def session(library: FakeLibrary) -> GPhoto2Session:
 def test_a_file_without_bytes_is_refused_in_a_sentence(library: FakeLibrary, session: GPhoto2Session) -> None:
     library.card["IMG_0001.CR2"] = b""
     with pytest.raises(RefusedError, match=r"announced 0 bytes of IMG_0001\.CR2"):
-        session.fetch(CameraFile(FOLDER, "IMG_0001.CR2"), lambda: None)
+        session.fetch(CameraFile(FOLDER, "IMG_0001.CR2"), Intake(), lambda: None)
 
 
 @pytest.mark.parametrize("name", ["IMG_0001.CR2", "Ä" * 200 + ".CR2"])
@@ -101,7 +102,7 @@ def test_a_file_is_read_in_pieces_whatever_it_is_called(
 ) -> None:
     library.card[name] = bytes(range(256)) * 5000  # more than a piece
     told: list[int] = []
-    fetched = session.fetch(CameraFile(FOLDER, name), lambda: told.append(1))
+    fetched = session.fetch(CameraFile(FOLDER, name), Intake(), lambda: told.append(1))
     assert len(told) == 2  # each piece, so that a slow cable is not taken for a dead body
     assert os.pread(fetched.blob.fd, fetched.blob.size + 1, 0) == library.card[name]
     assert fetched.taken_s == 1_700_000_000

@@ -13,9 +13,10 @@ import subprocess
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
-from dappled import codec
+from dappled import codec, durable
 from dappled.clock import Clock, SystemClock
 from dappled.drivers import usb_bus
 from dappled.drivers.attribution import Claim
@@ -114,7 +115,17 @@ class GPhoto2Camera(QueuedCamera):
         self._live = _Live()  # guarded by the lock
         self._identity: Identity | None = None
         self._known_settings: tuple[Setting, ...] = ()
+        self._folder: Path | None = None  # files are written in it while they come; None: to memory
         self._looked_last = False  # the process ended by itself when it was asked to: it has named what stays
+
+    def receive_into(self, folder: Path) -> None:
+        """Have files written in this folder while they come, where its file system has files without a name."""
+        try:
+            os.close(durable.unnamed(folder))
+        except OSError as error:
+            log.info("the camera's files go to memory first: %s has none without a name (%s)", folder, error.strerror)
+        else:
+            self._folder = folder.absolute()
 
     def start(self) -> None:
         """Start the camera's process. Raises CameraError when called twice."""
@@ -219,6 +230,8 @@ class GPhoto2Camera(QueuedCamera):
                 continue
             with self._lock:
                 self._process, self._channel = process, channel
+                if self._folder is not None:
+                    _tell(channel, "receive", folder=str(self._folder))
             reason = self._serve(process, channel)
             with self._lock:
                 self._process = self._channel = None
@@ -330,7 +343,7 @@ class GPhoto2Camera(QueuedCamera):
         self._budget.spend(self._clock.monotonic_ns())
 
 
-def _tell(channel: ProcessChannel, what: str) -> None:
+def _tell(channel: ProcessChannel, what: str, **more: str) -> None:
     """Send a command. Where the process is gone, `receive` says so, after all that it had said before."""
     with contextlib.suppress(ChannelError):
-        channel.send({"do": what})
+        channel.send({"do": what, **more})

@@ -4,7 +4,8 @@ libgphoto2 blocks for seconds, with the GIL held, when a camera goes silent. In 
 and the parent can always kill it.
 
 Commands: {"do": "fire", "shot": n}, {"do": "delete", "folder", "name"}, {"do": "change", "name", "value"},
-{"do": "look"} (through the viewfinder), {"do": "ping"}, {"do": "stop"}. Answers are the camera's events (`messages`),
+{"do": "look"} (through the viewfinder), {"do": "receive", "folder"} (on the disk of this folder, from now on),
+{"do": "ping"}, {"do": "stop"}. Answers are the camera's events (`messages`),
 {"is": "live"} with a JPEG or a reason, {"is": "cut off"} with the files that were announced and not brought when the
 link broke, and {"is": "pong"}. One shot is at the camera at a time; further ones wait in order.
 """
@@ -17,6 +18,7 @@ import signal
 import socket
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, cast
 
 from dappled import codec
@@ -30,6 +32,7 @@ from dappled.drivers.child_process import (
     raise_priority,
     usual_priority,
 )
+from dappled.drivers.gphoto2.intake import Intake
 from dappled.drivers.gphoto2.messages import Carryover, EventSender
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
@@ -76,6 +79,7 @@ class CameraLoop:
         carryover: Carryover | None = None,
         *,
         bus: Callable[[], object] = bus_nodes,
+        intake: Intake | None = None,
     ) -> None:
         """`bus` tells what is on USB: while that is the same, a camera that was not there is rarely looked for."""
         self._channel = channel
@@ -85,6 +89,7 @@ class CameraLoop:
         self._sender = EventSender(channel)
         self._state = CameraState(settings.timeouts, carryover or Carryover())
         self._viewfinder = Viewfinder(channel)
+        self._intake = intake or Intake(self._clock)
         self._session: Session | None = None
         self._keeps_files = settings.capture_target == "card"
         self._open_at_ns = self._sure_until_ns = self._settled_ns = 0
@@ -165,6 +170,8 @@ class CameraLoop:
                 self._change(cast(SettingName, name), value)
             case {"do": "look"}:
                 self._viewfinder.ask()
+            case {"do": "receive", "folder": str(folder)}:
+                self._intake.folder = Path(folder)
             case {"do": "ping"}:
                 self._sender.pong()
             case {"do": "stop"}:
@@ -324,7 +331,7 @@ class CameraLoop:
         while (file := self._state.next_file()) is not None:
             began_ns = self._now_ns()
             try:
-                fetched = session.fetch(file, self._sender.pong)
+                fetched = session.fetch(file, self._intake, self._sender.pong)
             except (BusyError, RefusedError) as error:
                 self._sender.send(*self._state.not_fetched(file, str(error), self._now_ns()))
                 break
@@ -355,7 +362,10 @@ def main() -> None:
     guard_output()
     channel = ProcessChannel(socket.socket(fileno=int(fd)))
     loop = CameraLoop(
-        channel, codec.read_json(GPhoto2Settings, settings), carryover=codec.read_json(Carryover, carryover)
+        channel,
+        codec.read_json(GPhoto2Settings, settings),
+        carryover=codec.read_json(Carryover, carryover),
+        intake=Intake(begin_thread=raise_priority),
     )
     try:
         loop.run()

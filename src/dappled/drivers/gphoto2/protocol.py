@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Protocol, TypeAlias
 
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
+from dappled.drivers.gphoto2.intake import Intake
 
 _MEMORY_FOLDER = "/"
 FileFacts: TypeAlias = tuple[int, int | None]
@@ -123,9 +124,9 @@ class Session(Protocol):
     def news(self) -> list[CameraNews]:
         """Return what happened since the last call. Raises LostError."""
 
-    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
+    def fetch(self, file: CameraFile, intake: Intake, alive: Callable[[], None]) -> Fetched:
         """Fetch a file's bytes; `alive` is called whenever some have come. Raises BusyError, RefusedError, LostError,
-        and what `alive` raises."""
+        OSError where there is no room in memory either, and what `alive` raises."""
 
     def about(self, file: CameraFile) -> FileFacts:
         """Return size and time of a file on the card. Raises SessionError."""

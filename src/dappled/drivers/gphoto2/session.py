@@ -6,16 +6,17 @@ Every call may block for as long as libgphoto2 waits for a silent camera (up to 
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gphoto2 as gp
 
-from dappled import durable
 from dappled.drivers.camera import Blob, Identity, Setting, SettingName
+from dappled.drivers.gphoto2.intake import PIECE_BYTES, Incoming, Intake
 from dappled.drivers.gphoto2.protocol import (
     AbsentError,
     BusyError,
@@ -35,7 +36,6 @@ from dappled.drivers.gphoto2.protocol import (
 )
 from dappled.drivers.gphoto2.settings import CaptureTarget, GPhoto2Settings
 
-_CHUNK_BYTES = 1 << 20
 _DEVICES = Path("/sys/bus/usb/devices")
 _FOLDERS = 256
 """More folders than a card has: bounds the walk."""
@@ -182,7 +182,6 @@ class GPhoto2Session:
             port=port,
         )
         self._in_pieces = True
-        self._buffer = memoryview(bytearray(_CHUNK_BYTES))
         self._read: dict[SettingName, Setting | None] = {}
         self.keeps_files = not (_set_target(camera, target) and target == "ram")
 
@@ -212,64 +211,64 @@ class GPhoto2Session:
                 raise LostError(_sentence(error, "report what happens")) from error
         return news
 
-    def fetch(self, file: CameraFile, alive: Callable[[], None]) -> Fetched:
-        """Fetch a file's bytes; from the card in pieces of 1 MiB into a memory file, each of which is told."""
-        fd = os.memfd_create("camera file", os.MFD_CLOEXEC)  # the camera's own name may be too long for one
+    def fetch(self, file: CameraFile, intake: Intake, alive: Callable[[], None]) -> Fetched:
+        """Fetch a file's bytes; from the card in pieces of at most 1 MiB, each of which is told."""
         try:
-            size, taken_s = self._fill(fd, file, alive)
+            return self._fetch(file, intake, alive)
         except gp.GPhoto2Error as error:
-            os.close(fd)
             raise _translated(error, f"send {file.name}") from error
-        except SessionError:
-            os.close(fd)
-            raise
-        return Fetched(Blob(fd, size), taken_s)
 
-    def _fill(self, fd: int, file: CameraFile, alive: Callable[[], None]) -> tuple[int, int | None]:
+    def _fetch(self, file: CameraFile, intake: Intake, alive: Callable[[], None]) -> Fetched:
         if file.in_memory:
             # libgphoto2 fetched it whole with the event, and keeps it until it is deleted.
-            size = self._whole(fd, file)
-            self._camera.file_delete(file.folder, file.name)
-            return size, None
+            with self._whole(file, intake) as coming:
+                blob = coming.finish()
+            try:
+                self._camera.file_delete(file.folder, file.name)
+            except gp.GPhoto2Error:
+                blob.close()
+                raise
+            return Fetched(blob)
         info = self._camera.file_get_info(file.folder, file.name).file
         announced: int = info.size
-        taken_s = _time(info)
         if not announced:
             raise RefusedError(f"the camera announced 0 bytes of {file.name}")
-        got = self._pieces(fd, file, announced, alive) if self._in_pieces else None
-        if got is None:
-            self._in_pieces = False
-            got = self._whole(fd, file)
-        if got != announced:
-            raise RefusedError(f"the camera announced {announced} bytes of {file.name} and sent {got}")
-        return got, taken_s
+        pieces = self._pieces(file, announced, intake, alive) if self._in_pieces else None
+        self._in_pieces = pieces is not None
+        with pieces or self._whole(file, intake) as coming:
+            if coming.size != announced:
+                raise RefusedError(f"the camera announced {announced} bytes of {file.name} and sent {coming.size}")
+            return Fetched(coming.finish(), _time(info))
 
-    def _pieces(self, fd: int, file: CameraFile, size: int, alive: Callable[[], None]) -> int | None:
-        """Read piece by piece; None where the body doesn't support that. The buffer is the same for all: a map of the
-        file would cost a page fault for every 4 KiB."""
-        offset = 0
-        while offset < size:
-            piece = self._buffer[: size - offset]
-            try:
-                got = self._camera.file_read(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL, offset, piece)
-            except gp.GPhoto2Error as error:
-                if error.code == gp.GP_ERROR_NOT_SUPPORTED and offset == 0:
-                    return None
-                raise
-            durable.write_all(fd, piece[:got])
-            offset += got
-            alive()
-            if got != len(piece):
-                break
-        return offset
+    def _pieces(self, file: CameraFile, size: int, intake: Intake, alive: Callable[[], None]) -> Incoming | None:
+        """Read piece by piece; None where the body doesn't support that."""
+        with ExitStack() as stack:
+            coming = stack.enter_context(intake.begin(size))
+            while asked := min(size - coming.size, PIECE_BYTES):
+                try:
+                    got = coming.take(asked, partial(self._piece, file, coming.size))
+                except gp.GPhoto2Error as error:
+                    if error.code == gp.GP_ERROR_NOT_SUPPORTED and coming.size == 0:
+                        return None
+                    raise
+                alive()
+                if got != asked:
+                    break
+            stack.pop_all()
+        return coming
 
-    def _whole(self, fd: int, file: CameraFile) -> int:
+    def _piece(self, file: CameraFile, offset: int, into: memoryview) -> int:
+        got: int = self._camera.file_read(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL, offset, into)
+        return got
+
+    def _whole(self, file: CameraFile, intake: Intake) -> Incoming:
         held = self._camera.file_get(file.folder, file.name, gp.GP_FILE_TYPE_NORMAL)
-        with memoryview(held.get_data_and_size()) as view:
-            offset = 0
-            while offset < len(view):
-                offset += os.pwrite(fd, view[offset:], offset)
-            return len(view)
+        with ExitStack() as stack, memoryview(held.get_data_and_size()) as view:
+            coming = stack.enter_context(intake.begin(len(view)))
+            while coming.size < len(view):
+                coming.take(len(view) - coming.size, partial(_copied, view[coming.size :]))
+            stack.pop_all()
+        return coming
 
     def about(self, file: CameraFile) -> FileFacts:
         """Return size and time of a file on the card."""
@@ -353,11 +352,7 @@ class GPhoto2Session:
                 raise RefusedError("this body has no live view") from error
             raise _translated(error, "show its viewfinder") from error
         with memoryview(held.get_data_and_size()) as view:
-            fd = os.memfd_create("viewfinder", os.MFD_CLOEXEC)
-            offset = 0
-            while offset < len(view):
-                offset += os.pwrite(fd, view[offset:], offset)
-            return Blob(fd, len(view))
+            return Blob.of(view, "viewfinder")
 
     def end_preview(self) -> None:
         """Switch live view off, where the body has a setting for that; others end it with the next shot."""
@@ -386,6 +381,11 @@ def _place(port: str) -> str:
             if found is not None and numbers == [int(found[1]), int(found[2])]:
                 return f"usb {device.name}"
     return ""
+
+
+def _copied(view: memoryview, into: memoryview) -> int:
+    into[:] = view[: len(into)]
+    return len(into)
 
 
 def _time(info: Any) -> int | None:

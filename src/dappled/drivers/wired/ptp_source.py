@@ -24,6 +24,7 @@ from dappled.drivers.child_process import (
     end_child,
     start_child,
 )
+from dappled.drivers.gphoto2.intake import Intake
 from dappled.drivers.gphoto2.protocol import CameraFile, Session, SessionError
 from dappled.drivers.gphoto2.settings import NO_HOME, GPhoto2Settings
 from dappled.drivers.wired.sources import SUFFIXES, FoundFile
@@ -61,7 +62,7 @@ class PtpSource:
     def open(self, found: FoundFile) -> Blob:
         """Open its bytes."""
         answer = self._ask({"do": "fetch", "name": found.name})
-        return Blob(answer.fds[0], answer.body["size"])
+        return Blob(answer.fds[0], answer.body["size"], answer.body["sha256"])
 
     def close(self) -> None:
         """Close the source."""
@@ -111,6 +112,7 @@ class _Files:
         self._open = open_session
         self._settings = GPhoto2Settings(port=None if port == "usb:" else port)
         self._session: Session | None = None
+        self._intake = Intake()
 
     def answer(self, question: Mapping[str, Any], alive: Callable[[], None]) -> Blob | str:
         """Return what was requested, or a sentence why it is not available. `alive` is called as bytes come."""
@@ -139,7 +141,7 @@ class _Files:
     def _fetch(self, path: str, alive: Callable[[], None]) -> Blob:
         session = self._session = self._session or self._open(self._settings)
         folder, _, name = path.rpartition("/")
-        return session.fetch(CameraFile(folder, name), alive).blob
+        return session.fetch(CameraFile(folder, name), self._intake, alive).blob
 
 
 def _serve(channel: ProcessChannel, files: _Files) -> None:
@@ -155,7 +157,7 @@ def _serve(channel: ProcessChannel, files: _Files) -> None:
         if isinstance(answer, str):
             channel.send({"error": answer}, timeout_s=_SEND_S)
             continue
-        channel.send({"size": answer.size}, (answer.fd,), timeout_s=_SEND_S)
+        channel.send({"size": answer.size, "sha256": answer.sha256}, (answer.fd,), timeout_s=_SEND_S)
         answer.close()
 
 
