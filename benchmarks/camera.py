@@ -6,7 +6,8 @@ Trigger: from the shutter's `fire` to libgphoto2's trigger call, while processes
 priorities are the service's own (Nice=-5 in its unit, the camera's process before it), and the body, which stands for
 hardware, goes before all; where this user may not have them, it says so.
 File: a 17.6 MB raw file from the body to safe on disk, against a plain copy of it with fsync, taken in turns; what
-share of that the transfer is (a body that is itself a program on these cores; USB 2 would take half a second); and what
+share of that passes until the camera's process has the whole file (from a body that is itself a program on these cores;
+USB 2 would take half a second), written and hashed while it came; and what
 the driver's process holds in memory at most, above what it holds before. Stall: the longest time for which the daemon
 side doesn't answer while the body is silent.
 """
@@ -47,9 +48,11 @@ while True:
 
 
 @contextlib.contextmanager
-def camera_at(body: SimulatedBody, **settings: Any) -> Iterator[GPhoto2Camera]:
-    """A driver that is ready."""
+def camera_at(body: SimulatedBody, folder: Path | None = None, **settings: Any) -> Iterator[GPhoto2Camera]:
+    """A driver that is ready, whose files may come into a folder."""
     camera = open_camera({"port": body.port, **settings})
+    if folder is not None:
+        camera.receive_into(folder)
     camera.start()
     try:
         until(camera, lambda event: isinstance(event, StateChanged) and event.state == "ready")
@@ -117,7 +120,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
     plain: list[float] = []
     with (
         SimulatedBody.start(BodyOptions(picture=str(source))) as body,
-        camera_at(body, delete_after_download=True) as camera,
+        camera_at(body, flight.folder.frames, delete_after_download=True) as camera,
     ):
         before = peak = _memory(camera)
         for shot in range(repeats):

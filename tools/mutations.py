@@ -42,6 +42,20 @@ MUTATIONS = (
         ("test_durable.py", "flight/test_power_cut.py"),
     ),
     Mutation(
+        "a file without a name gets one before its bytes are sure",
+        "durable.py",
+        "    os.fsync(fd)\n    try:\n        os.link(",
+        "    try:\n        os.link(",
+        ("test_durable.py", "flight/test_power_cut.py"),
+    ),
+    Mutation(
+        "a disk that refuses a piece of a file loses it",
+        "drivers/gphoto2/intake.py",
+        "            for _, buffer, size in self._pieces:\n",
+        "            for _, buffer, size in list(self._pieces)[1:]:\n",
+        ("drivers/gphoto2/test_intake.py",),
+    ),
+    Mutation(
         "a folder is not made sure of after a rename",
         "durable.py",
         "        if folder is None:\n            sync_folder(path.parent)\n",

@@ -10,7 +10,7 @@ from pathlib import Path
 from dappled.findings import Code, Finding, Subject, finding
 
 FEWEST_DESCRIPTORS = 16  # a frame on its way, its companion, temporary files and folders
-LEAST_MEMORY_BYTES = 48_000_000  # a raw file in the camera's process and in its memfd
+LEAST_MEMORY_BYTES = 48_000_000  # a raw file in the camera's process, and in a memfd where the disk refuses it
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +43,7 @@ def shortage(left: ResourcesLeft) -> Finding | None:
 
 
 def _memory_bytes(proc: Path) -> int | None:
-    """MemAvailable, of which the memfd of a file is taken."""
+    """MemAvailable, of which memory for a file is taken."""
     try:
         for line in (proc / "meminfo").read_text(encoding="ascii").splitlines():
             name, _, value = line.partition(":")
