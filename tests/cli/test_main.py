@@ -137,6 +137,7 @@ def test_a_wrong_call_ends_with_2(words: list[str], capsys: pytest.CaptureFixtur
         (["replay", "empty", "--telemetry", "empty"], 2, "is a folder; name a file"),
         (["decode", "nowhere.dng", "--mask", "mask-2", "-o", "x.npz"], 2, "nowhere.dng"),
         (["decode", "there.dng", "--mask", "mask-22", "-o", "x.npz"], 2, "did you mean mask-2"),
+        (["decode", "there.dng", "--black", "300", "--white-level", "255", "-o", "x.npz"], 2, "is not below"),
         (["carriers", "--mask", "mask-2", "--shape", "10", "10"], 2, "--camera"),
         (["carriers", "--mask", "mask-2", "--shape", "10", "10", "--camera", "fujifilm-s5200"], 2, "--focal-length"),
     ],

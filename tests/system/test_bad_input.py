@@ -427,19 +427,6 @@ def no_file_above(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
-def test_a_frame_that_the_disk_does_not_take_fails_its_shot_only(here: Path) -> None:
-    with SimulatedBody.start(BodyOptions(picture="pattern:3000000:dng")) as body, flying(before(body, here)) as daemon:
-        daemon.until_ready()
-        with no_file_above(2_000_000):
-            failed = daemon.shoot()
-        assert failed.frame is None
-        assert "cannot record IMG_0001.DNG as" in words(failed.problem)
-        assert "file size limit" in words(failed.problem)
-        assert daemon.shoot().frame is not None
-        assert os.listdir(daemon.service.folder / "frames") == ["000001.dng"]
-        assert body.card == ["IMG_0001.DNG", "IMG_0002.DNG"]
-
-
 @pytest.fixture
 def small_disk(here: Path) -> Iterator[Path]:
     """A disk of 8 MB, where this user may make one."""
@@ -457,12 +444,21 @@ def small_disk(here: Path) -> Iterator[Path]:
     subprocess.run([umount, "-l", str(folder)], check=True)
 
 
-def test_a_disk_that_fills_up_keeps_what_is_safe(small_disk: Path, here: Path) -> None:
+def test_a_frame_that_the_disk_does_not_take_fails_its_shot_only(small_disk: Path, here: Path) -> None:
+    flights, ballast = small_disk / "flights", small_disk / "ballast"
+    flights.mkdir()
     with SimulatedBody.start(BodyOptions(picture="pattern:3000000:dng")) as body:
-        with flying(before(body, here, record={"directory": str(small_disk)})) as daemon:
-            shots = [daemon.shoot() for _ in range(3)]
-            assert [pending.frame is not None for pending in shots] == [True, True, False]
-            assert "the disk is full" in words(shots[2].problem)
+        with flying(before(body, here, record={"directory": str(flights)})) as daemon:
+            daemon.until_ready()
+            ballast.write_bytes(bytes(2_500_000))
+            shots = [daemon.shoot() for _ in range(2)]
+            ballast.unlink()
+            shots.append(daemon.shoot())
+            assert [pending.frame is not None for pending in shots] == [True, False, True]
+            assert "cannot record IMG_0002.DNG as" in words(shots[1].problem)
+            assert "the disk is full" in words(shots[1].problem)
+            assert sorted(os.listdir(daemon.service.folder / "frames")) == ["000000.dng", "000002.dng"]
+            assert body.card == ["IMG_0001.DNG", "IMG_0002.DNG", "IMG_0003.DNG"]
         assert len(flight_check.check(daemon.service.folder).problems) == 0
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from dappled.decode.calibration.calibration import Calibration, _shift
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
-from dappled.decode.decoder import MaskDecoder
+from dappled.decode.decoder import DecodeReport, MaskDecoder
 from dappled.decode.optics import MaskedOptics
 from dappled.findings import Code, Finding
 from tests.decode.rays import FOCAL_MM, FULL_F, MASK, SENSOR, STATED_DISTANCE_MM, STOPPED_F, Camera, Texture
@@ -28,7 +28,7 @@ def calibrated() -> tuple[Camera, Calibration]:
     return camera, found
 
 
-def _doubt(camera: Camera, known: Calibration, seed: int = 7, f_number: float = FLOWN_F) -> list[Finding]:
+def _reported(camera: Camera, known: Calibration, seed: int = 7, f_number: float = FLOWN_F) -> DecodeReport:
     rng = np.random.default_rng(seed)
     layers = [(Texture.random(rng, waves=60), 1.4), (Texture.random(rng, waves=60), -0.6)]
     plane = camera.expose(layers, f_number)
@@ -36,7 +36,11 @@ def _doubt(camera: Camera, known: Calibration, seed: int = 7, f_number: float = 
     decoder = MaskDecoder(
         MaskedOptics(SENSOR, MASK, "geometric", STATED_DISTANCE_MM), calibration=known, joint_views=False
     )
-    _, report = decoder.decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=f_number)
+    return decoder.decode_reported(plane, focal_length_mm=FOCAL_MM, f_number=f_number)[1]
+
+
+def _doubt(camera: Camera, known: Calibration, seed: int = 7, f_number: float = FLOWN_F) -> list[Finding]:
+    report = _reported(camera, known, seed, f_number)
     return [one for one in report.doubts if one.code in (Code.MASK_SHIFTED, Code.MASK_TURNED, Code.MASK_TURNED_FARTHER)]
 
 
@@ -60,11 +64,19 @@ def test_a_turn_at_the_edge_of_the_search_is_told_as_the_least(calibrated: tuple
     assert told.facts["by_deg"] == pytest.approx(0.4, abs=0.02)
 
 
-def test_a_mask_that_turned_is_doubted_with_its_angle(calibrated: tuple[Camera, Calibration]) -> None:
+@pytest.mark.parametrize("turned_deg", [0.2, 0.3])
+def test_a_mask_that_turned_is_decoded_where_its_carriers_stand(
+    calibrated: tuple[Camera, Calibration], turned_deg: float
+) -> None:
     camera, known = calibrated
-    (told,) = _doubt(replace(camera, rotation_rad=camera.rotation_rad + np.radians(0.3)), known)
-    assert told.code is Code.MASK_TURNED
-    assert told.facts["by_deg"] == pytest.approx(0.3, abs=0.015)
+    still, turned = (
+        _reported(replace(camera, rotation_rad=camera.rotation_rad + np.radians(deg)), known) for deg in (0, turned_deg)
+    )
+    assert (still.carriers_from, turned.carriers_from) == ("calibrated", "measured")
+    assert turned.doubts == ()
+    order = next(k for k, one in enumerate(still.used) if (one.ky, one.kx) == (0, 1))
+    angles = [np.degrees(np.arctan2(one.used[order].fy, one.used[order].fx)) for one in (still, turned)]
+    assert angles[0] - angles[1] == pytest.approx(turned_deg, abs=0.015)
 
 
 @pytest.mark.parametrize("moved", [(0.05, 0.05), (0.06, 0.03), (-0.05, 0.1)])
