@@ -47,7 +47,9 @@ class RecipeArguments:
     f_number: float | None = option("--f-number", "f-number of the exposure, if the file doesn't say", None, above=0.0)
 
     def recipe(self, *, colour: bool = False, taper: float = 0.0) -> Recipe:
-        """The recipe that these arguments name."""
+        """The recipe that these arguments name. Raises CallError where black is not below white."""
+        if self.black is not None and self.white_level is not None and self.black >= self.white_level:
+            raise CallError(f"--black {self.black:g} is not below --white-level {self.white_level:g}")
         return Recipe(
             camera=self.camera,
             mask=self.mask or "",
