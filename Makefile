@@ -2,7 +2,7 @@
 PYTHON ?= $(firstword $(foreach p,python3 python3.13 python3.12 python3.11,$(shell command -v $(p) >/dev/null 2>&1 && $(p) -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $(p))))
 BIN := .venv/bin
 .DEFAULT_GOAL := help
-.PHONY: help setup everything peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow slow-tests test-long long-tests long machine mutations soak faults bench lock deb deb-trial arm64 install uninstall clean
+.PHONY: help setup everything peers walk docs notebooks clean-room wheel demo test checked-tests check test-fast coverage test-slow test-long tier long machine mutations soak faults bench lock deb deb-trial arm64 install uninstall clean
 PREFIX ?= /usr/local
 # Tests start hundreds of processes: where no bytecode may be kept, each of them compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
@@ -57,33 +57,21 @@ coverage: setup ## run the default tests and report which lines they reach (a th
 	@$(BIN)/coverage erase
 	@$(BIN)/pytest -q --no-header -n auto --dist worksteal -m "not slow" --cov --cov-report=term
 
-# Tests of a tier, and where they stand: a process that need not read all other files begins a quarter of a minute sooner.
+# The files where tests of a tier stand: a process that need not read all others begins a quarter of a minute sooner.
 MARKED = $$(grep -rlE "mark\.($(1))\b" --include="test_*.py" tests)
-TIER = $(BIN)/pytest -q --no-header -m "$(1) and not alone" --durations=25 $(BESIDE) $(call MARKED,slow|long)
-# Those that watch a clock, one by one.
-ALONE = $(BIN)/pytest -q --no-header -m "$(1) and alone" --durations=15 $(call MARKED,alone)
 
-test-slow: everything ## types of all else, and the tests at real seams; those that watch a clock are served before others
-	@$(BUDGET) "make test-slow" 700 1300 $(MAKE) -s slow-tests
-
-# Tests that watch a clock mostly wait. They run one by one, and the others beside them give way: they are nice.
-slow-tests:
-	@failed=0; log=$$(mktemp); \
-	$(call ALONE,slow and not long) >$$log 2>&1 & alone=$$!; \
-	nice -n 10 $(BIN)/mypy || failed=1; \
-	nice -n 10 $(call TIER,slow and not long) || failed=1; \
-	wait $$alone || failed=1; \
-	cat $$log; rm $$log; exit $$failed
+test-slow: everything ## types of all else, and the tests at real seams; those that watch a clock run with no other beside them
+	@$(BUDGET) "make test-slow" 700 1300 $(MAKE) -s tier OF="slow and not long"
 
 test-long: everything peers ## soaks, sweeps, matrices and benchmarks, and properties over many examples
-	@$(BUDGET) "make test-long" 2400 4800 $(MAKE) -s long-tests
+	@$(BUDGET) "make test-long" 2400 4800 $(MAKE) -s tier OF=long PROPERTIES=many
 
-long-tests:
+tier:
 	@failed=0; \
 	$(BIN)/mypy || failed=1; \
-	$(call TIER,long) || failed=1; \
-	$(call ALONE,long) || failed=1; \
-	$(BIN)/pytest -q --no-header -m "hypothesis and not slow" --hypothesis-profile many $(BESIDE) || failed=1; \
+	$(BIN)/pytest -q --no-header -m "$(OF) and not alone" --durations=25 $(BESIDE) $(call MARKED,slow|long) || failed=1; \
+	$(BIN)/pytest -q --no-header -m "$(OF) and alone" --durations=15 $(call MARKED,alone) || failed=1; \
+	[ -z "$(PROPERTIES)" ] || $(BIN)/pytest -q --no-header -m "hypothesis and not slow" --hypothesis-profile $(PROPERTIES) $(BESIDE) || failed=1; \
 	exit $$failed
 
 long: ## what is too long for each change: the long tests, arm64, the README in both bare roots; as root
