@@ -59,7 +59,7 @@ class Parts:
         """Kernel and disk."""
         return machine_part(f"--suite={suite}", *([] if self.builds else ["--cached"]))
 
-    @cache  # noqa: B019
+    @cache  # noqa: B019 (as above)
     def package(self, suite: str = SUITE) -> Path:
         """The package of this state of the source."""
         built = self.built(suite)
@@ -74,7 +74,7 @@ class Parts:
             copy(found, made)
         return made
 
-    @cache  # noqa: B019
+    @cache  # noqa: B019 (as above)
     def installed(self, suite: str = SUITE) -> Path:
         """A disk on which the package was installed while the machine ran; where nothing is built, of any state."""
         built = self.built(suite)
