@@ -102,7 +102,7 @@ notebooks: everything ## run the notebooks of docs/notebooks, and keep what they
 	@$(BIN)/python tools/notebooks.py --write
 
 soak: setup ## fly half an hour in which something goes wrong every few seconds; MINUTES=n for another time
-	@$(BIN)/python -m dappled.mocks.soak --minutes $(or $(MINUTES),30)
+	@$(BIN)/python -m tests.soak --minutes $(or $(MINUTES),30)
 
 faults: setup ## run every camera fault against the daemon in 20 rounds; ROUNDS=n for another number
 	@for round in $$(seq $(or $(ROUNDS),20)); do echo "== round $$round"; \

@@ -25,10 +25,10 @@ from pathlib import Path
 
 import tomli_w
 from limits import show
+from tests.soak.supervised import children_of
 
 from dappled.config import settings as configuration
 from dappled.mocks.simulation import Simulation, World
-from dappled.mocks.soak.supervised import children_of
 
 REPEATS = 5
 

@@ -19,6 +19,7 @@ import pytest
 
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from tests.machine.uml import HERE, Machine, Network, Station, copy, station
+from tests.simulated.usbip import UsbBody
 
 ROOT = Path(__file__).parents[2]
 PACKAGED = ("src", "systemd", "tools/deb.py", "tools/install.py", "requirements-onboard.lock")
@@ -268,7 +269,8 @@ def scene(parts: Parts, shared: _Shared, request: pytest.FixtureRequest) -> Iter
             stack.enter_context(shared.network.inside())
             machine = shared.machine(memory_mb, disks, usb, suite=suite)
             options = body or BodyOptions(picture=f"pattern:{SIZE}:cr2", bind=HERE)
-            return Scene(machine, stack.enter_context(SimulatedBody.start(options)), stack.enter_context(station()))
+            kind = SimulatedBody if usb is None else UsbBody
+            return Scene(machine, stack.enter_context(kind.start(options)), stack.enter_context(station()))
 
         yield made
     broken = request.session.testsfailed > failed

@@ -14,16 +14,17 @@ from pathlib import Path
 
 import pytest
 
-from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
+from dappled.mocks.body.body import BodyOptions, pattern
 from tests.machine.conftest import FLIGHTS, SUITE, Scene, machine_part
 from tests.machine.uml import HERE
+from tests.simulated.usbip import UsbBody
 from tests.waiting import eventually
 
 pytestmark = [pytest.mark.long, pytest.mark.machine, pytest.mark.alone, pytest.mark.timeout(3600)]
 SMALL = 300_000
 SLOW = 8_000_000  # 16 s at the rate of "crawl"; a silent body is given up after 12
 OLD = 130
-BODY = BodyOptions(picture=f"pattern:{SMALL}:cr2", bind=HERE, usbip=True)
+BODY = BodyOptions(picture=f"pattern:{SMALL}:cr2", bind=HERE)
 CGROUP = "/sys/fs/cgroup/system.slice/dappled.service/cgroup.procs"
 ACM, USB_SERIAL = 166, 188
 PLACE = "/sys/bus/usb/devices/1-1/devnum"
@@ -176,7 +177,7 @@ def test_a_shutter_line_is_closed_from_inside_the_service(on_usb: Scene) -> None
 @pytest.mark.parametrize("on_usb", [{"serial": ""}], indirect=True)
 def test_of_two_bodies_without_a_serial_number_one_stays_the_camera_when_the_bus_counts_anew(on_usb: Scene) -> None:
     flown = on_usb
-    with SimulatedBody.start(replace(BODY, serial="")) as other:
+    with UsbBody.start(replace(BODY, serial="")) as other:
         attach = f"usbip --tcp-port {{}} attach -r {HERE} -b 1-1"
         plug_in(flown)
         flown.begin()

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from dappled.mocks.soak import soak
-from dappled.mocks.soak.supervised import Resources
+from tests.soak import soak
+from tests.soak.supervised import Resources
 
 
 @pytest.mark.long

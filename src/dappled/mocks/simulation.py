@@ -122,7 +122,7 @@ class Simulation:
                     mask=rig.mask if rig.profile == EOS_450D else "",
                     f_number=stop,
                     start_monotonic_ns=self.start_monotonic_ns,
-                    truth=world.truth,
+                    truth=str(world.truth or ""),
                     real=world.real,
                     speed_m_s=self._speed_m_s,
                 )
@@ -169,11 +169,6 @@ class Simulation:
     def ground_url(self) -> str:
         """The URL at which a ground station finds the daemon."""
         return f"udpout:127.0.0.1:{self._ground_port}"
-
-    def reboot_autopilot(self) -> None:
-        """Restart the autopilot: its time since boot starts again, and the flight goes on."""
-        self._autopilot.stop()
-        self._autopilot = self._start_autopilot(-(time.monotonic_ns() - self.start_monotonic_ns) / 1e9)
 
     def _start_autopilot(self, booted_s: float = BootTime().offset_s) -> Autopilot:
         return Autopilot.start(

@@ -40,7 +40,7 @@ def test_a_wire_fires_a_body_that_nobody_is_connected_to_and_not_while_it_works(
 
 
 def test_a_body_ends_with_its_input() -> None:
-    command = [sys.executable, "-m", "dappled.mocks.body.body", "--picture", "pattern:1000:jpg"]
+    command = [sys.executable, "-m", "dappled.mocks.body.body", '{"picture": "pattern:1000:jpg"}']
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
         assert process.stdin is not None
@@ -54,15 +54,6 @@ def test_a_body_that_can_not_start_says_so(options: BodyOptions, capfd: pytest.C
     with pytest.raises(BodyError, match="did not start"):
         SimulatedBody.start(options)
     assert "body: " in capfd.readouterr().err
-
-
-def test_options_reach_the_command_line() -> None:
-    options = BodyOptions(scale=0.5, scene="bench", truth=Path("/t"), faults=("busy 1", "short"))
-    words = options.arguments()
-    assert words[words.index("--scale") + 1] == "0.5"
-    assert words[words.index("--truth") + 1] == "/t"
-    assert words.count("--fault") == 2
-    assert "--start-monotonic-ns" not in words
 
 
 def test_patterns_differ_in_every_page_and_shot() -> None:
@@ -98,7 +89,7 @@ def test_the_simulated_camera_is_asked_in_its_own_time_and_its_truth_is_kept(
     renderer = ModuleType("dappled.mocks.scene.masked_camera")
     renderer.__dict__["reference_camera"] = Camera
     monkeypatch.setitem(sys.modules, "dappled.mocks.scene.masked_camera", renderer)
-    options = BodyOptions(seed=9, scale=0.5, start_monotonic_ns=1_000_000_000, truth=tmp_path, speed_m_s=0.8)
+    options = BodyOptions(seed=9, scale=0.5, start_monotonic_ns=1_000_000_000, truth=str(tmp_path), speed_m_s=0.8)
     assert pictures(replace(options, f_number=14.8)).exposure_s == 0.02
     asked.clear()
     source = pictures(options)

@@ -1,16 +1,15 @@
 """A simulated camera body in a process of its own: its options, its pictures, its client and its process.
 
-    python -m dappled.mocks.body.body --seed 1 --scale 0.25
+    python -m dappled.mocks.body.body '{"seed": 1, "scale": 0.25}'
 
-prints `port N` once it listens, then obeys lines on standard input: a fault of `faults` ("busy 2"), "releases",
-"contact", "card", "move", "change card", or what a hand turns or runs low: "turn dial 2", "turn clock -3600" (see
-`eos450d`). It answers every line with one line, `ok …` or `error …`. It ends when its input ends, so it never outlives
-the process that started it.
+takes `BodyOptions` as JSON and prints `port N` once it listens, then obeys lines on standard input: a fault of `faults`
+("busy 2"), "releases", "contact", "card", "move", "change card", or what a hand turns or runs low: "turn dial 2", "turn
+clock -3600" (see `eos450d`). It answers every line with one line, `ok …` or `error …`. It ends when its input ends, so
+it never outlives the process that started it.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import select
@@ -18,10 +17,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar, Protocol
 
+from dappled import codec
 from dappled.clock import SystemClock
 from dappled.drivers.python_command import python_module
 from dappled.errors import DappledError
@@ -29,7 +30,6 @@ from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
 from dappled.mocks.body.eos_card import CARD_BYTES
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
-from dappled.mocks.body.usbip import UsbIpResponder
 
 _START_S = 300.0  # a process that emulates another processor takes minutes
 _ANSWER_S = 5.0
@@ -53,7 +53,7 @@ class BodyOptions:
     file takes to expose. `card_bytes`: the card's size; a full one refuses to shoot. `clock_offset_s`: how far the
     body's own clock is wrong. `pairs`: raw and JPEG of each picture. `addresses`: how many ports it has. `real`: as
     `reference_camera` has it. `speed_m_s`: of the vehicle (None: the path's own). `bind`: where on this
-    machine it answers; `usbip`: over USB/IP, not PTP/IP.
+    machine it answers. `faults`: in force from the start.
     """
 
     picture: str = "simulated"
@@ -64,7 +64,7 @@ class BodyOptions:
     mask: str = ""
     f_number: float | None = None
     start_monotonic_ns: int | None = None
-    truth: Path | None = None
+    truth: str = ""
     delay_s: float = 0.0
     serial: str = SERIAL
     card_bytes: int = CARD_BYTES
@@ -74,36 +74,13 @@ class BodyOptions:
     real: bool = False
     speed_m_s: float | None = None
     bind: str = "127.0.0.1"
-    usbip: bool = False
     faults: tuple[str, ...] = ()
-
-    def arguments(self) -> list[str]:
-        """These options as command-line arguments."""
-        named = {
-            "--picture": self.picture,
-            "--seed": self.seed,
-            "--scale": self.scale,
-            "--scene": self.scene,
-            "--law": self.law,
-            "--mask": self.mask or None,
-            "--f-number": self.f_number,
-            "--start-monotonic-ns": self.start_monotonic_ns,
-            "--truth": self.truth,
-            "--delay": self.delay_s,
-            "--serial": self.serial,
-            "--card-bytes": self.card_bytes,
-            "--clock-offset": self.clock_offset_s,
-            "--addresses": self.addresses,
-            "--speed": self.speed_m_s,
-            "--bind": self.bind,
-        }
-        given = [text for name, value in named.items() if value is not None for text in (name, str(value))]
-        given += ["--pairs"] * self.pairs + ["--real"] * self.real + ["--usbip"] * self.usbip
-        return [*given, *(text for fault in self.faults for text in ("--fault", fault))]
 
 
 class SimulatedBody:
     """A running body. `start` returns once it listens; use it as a context manager or call `stop`."""
+
+    COMMAND: ClassVar = python_module("dappled.mocks.body.body")
 
     def __init__(self, process: subprocess.Popen[bytes], lines: _Lines, ports: list[int], host: str) -> None:
         self._process = process
@@ -114,7 +91,8 @@ class SimulatedBody:
     @classmethod
     def start(cls, options: BodyOptions | None = None) -> SimulatedBody:
         """Start a body's process. Raises BodyError where it ends, or doesn't listen within five minutes."""
-        command = python_module("dappled.mocks.body.body", *(options or BodyOptions()).arguments())
+        options = options or BodyOptions()
+        command = [*cls.COMMAND, json.dumps(codec.plain(options))]
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, process_group=0)
         assert process.stdout is not None  # asked for above
         lines = _Lines(process.stdout.fileno())
@@ -126,7 +104,7 @@ class SimulatedBody:
         except BaseException:  # interrupted: the process must not be left behind
             _end(process)
             raise
-        return cls(process, lines, ports, (options or BodyOptions()).bind)
+        return cls(process, lines, ports, options.bind)
 
     @property
     def port(self) -> str:
@@ -278,26 +256,46 @@ def _simulated(options: BodyOptions) -> Pictures:
             real=options.real,
         )
 
+    truth = Path(options.truth) if options.truth else None
     exposure_s, _ = camera.metered(camera.optics.f_number if options.f_number is None else options.f_number)
 
     def expose(trigger_monotonic_ns: int, shot_number: int) -> tuple[bytes, str]:
         trigger_t_s = (trigger_monotonic_ns - start_ns) / 1e9
-        if options.truth is not None:  # told when the shutter opens, as a contact does: making the picture takes longer
+        if truth is not None:  # told when the shutter opens, as a contact does: making the picture takes longer
             latency_s = camera.latency_s(shot_number)
             # The body's own latency, which the renderer has no need to wait for: no contact closes before it is over.
             time.sleep(max(0.0, latency_s - (time.monotonic_ns() - trigger_monotonic_ns) / 1e9))
             middle_t_s = trigger_t_s + latency_s + exposure_s / 2
             times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": middle_t_s, "latency_s": latency_s}
-            (options.truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
+            (truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
         made = camera.expose(trigger_t_s, shot_number, f_number=options.f_number)
-        if options.truth is not None:
-            made.truth.save(options.truth / f"{shot_number:06d}.npz")
+        if truth is not None:
+            made.truth.save(truth / f"{shot_number:06d}.npz")
         return made.file, made.name_suffix.lstrip(".")
 
     return Pictures(expose, exposure_s)
 
 
-def _obey(line: str, eos: Eos450d, responder: Responder | UsbIpResponder, faults: BodyFaults) -> str:
+class Answering(Protocol):
+    """A body's side of the cable. `ports`: of TCP, that it listens on."""
+
+    ports: list[int]
+
+    def move(self) -> None:
+        """Go on at the next address."""
+
+    def close(self) -> None:
+        """End all links."""
+
+
+Answerer = Callable[[Eos450d, BodyFaults, BodyOptions], Answering]
+
+
+def _over_network(eos: Eos450d, faults: BodyFaults, options: BodyOptions) -> Responder:
+    return Responder(eos, faults, options.bind, addresses=options.addresses)
+
+
+def _obey(line: str, eos: Eos450d, responder: Answering, faults: BodyFaults) -> str:
     if line == "releases":
         return f"ok {eos.releases}"
     if line == "contact":
@@ -319,38 +317,12 @@ def _obey(line: str, eos: Eos450d, responder: Responder | UsbIpResponder, faults
     return "ok"
 
 
-def _options(arguments: Sequence[str] | None) -> BodyOptions:
-    parser = argparse.ArgumentParser(prog="python -m dappled.mocks.body.body", description=__doc__.partition("\n")[0])
-    parser.add_argument("--picture", default="simulated", help="simulated, pattern:SIZE:EXT, or a file")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--scale", type=float, default=1.0, help="share of the reference sensor's side")
-    parser.add_argument("--scene", default="terrain", help="terrain, bench, white, or a folder of views")
-    parser.add_argument("--law", default="geometric", help="geometric or fd: where the carriers stand")
-    parser.add_argument("--mask", default="", help="a 450D with this mask, in place of the reference camera")
-    parser.add_argument("--f-number", type=float, help="the simulated lens' aperture; open without it")
-    parser.add_argument("--start-monotonic-ns", type=int, help="CLOCK_MONOTONIC at the simulation's start")
-    parser.add_argument("--truth", type=Path, help="folder for what the simulation knows of each shot")
-    parser.add_argument("--delay", dest="delay_s", type=float, default=0.0, help="seconds that a pattern or file takes")
-    parser.add_argument("--serial", default=SERIAL)
-    parser.add_argument("--card-bytes", type=int, default=CARD_BYTES, help="the card lies in memory")
-    parser.add_argument("--clock-offset", dest="clock_offset_s", type=float, default=0.0, help="s the body is wrong by")
-    parser.add_argument("--pairs", action="store_true", help="raw and JPEG of each picture")
-    parser.add_argument("--addresses", type=int, default=1, help="ports that it can be moved between")
-    parser.add_argument("--bind", default="127.0.0.1", help="address of this machine at which it answers")
-    parser.add_argument("--usbip", action="store_true", help="answer over USB/IP, not PTP/IP")
-    parser.add_argument("--real", action="store_true", help="a round stop, a print error, detail beyond a slice's band")
-    parser.add_argument("--speed", dest="speed_m_s", type=float, help="m/s over ground")
-    parser.add_argument("--fault", dest="faults", action="append", default=[], help='in force from the start: "busy 2"')
-    found = vars(parser.parse_args(arguments))
-    return BodyOptions(**{**found, "faults": tuple(found["faults"])})
-
-
 def _say(text: str) -> None:
     sys.stdout.write(text + "\n")
     sys.stdout.flush()
 
 
-def serve(options: BodyOptions, lines: Iterable[str]) -> None:
+def serve(options: BodyOptions, lines: Iterable[str], answerer: Answerer = _over_network) -> None:
     """Serve a body until the lines end."""
     machine = SystemClock()
     clock = SystemClock(machine.utc_minus_monotonic_ns + round(options.clock_offset_s * 1e9))
@@ -368,22 +340,18 @@ def serve(options: BodyOptions, lines: Iterable[str]) -> None:
         f_number=options.f_number,
         exposure_s=source.exposure_s,
     )
-    responder = (
-        UsbIpResponder(eos, faults, (options.bind, 0))
-        if options.usbip
-        else Responder(eos, faults, options.bind, addresses=options.addresses)
-    )
+    responder = answerer(eos, faults, options)
     _say(f"port {' '.join(map(str, responder.ports))}")
     for line in lines:
         _say(_obey(line.strip(), eos, responder, faults))
     responder.close()
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(answerer: Answerer = _over_network) -> None:
     """The process' entry point."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # ctrl-C reaches the whole group; the starter ends us by our input
     try:
-        serve(_options(arguments), sys.stdin)
+        serve(codec.read_json(BodyOptions, sys.argv[1]), sys.stdin, answerer)
     except ValueError as error:
         sys.exit(f"body: {error}")
     except BrokenPipeError:

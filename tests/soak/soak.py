@@ -25,10 +25,10 @@ from dappled.drivers.mavlink import mavlink
 from dappled.findings import text
 from dappled.flight import flight_report
 from dappled.flight.checks import flight_check
-from dappled.mocks.simulation import Simulation, World, free_port
-from dappled.mocks.soak.supervised import Resources, Supervised
-from dappled.mocks.soak.troubles import Troubles
+from dappled.mocks.simulation import World, free_port
 from dappled.workers import Loop
+from tests.soak.supervised import Resources, Supervised
+from tests.soak.troubles import RebootingSimulation, Troubles
 
 SETTLE_S = 8.0
 START_S = 60.0
@@ -72,7 +72,7 @@ def soak(plan: SoakPlan, folder: Path, tell: Callable[[str], None] = lambda _: N
     config = folder / "dappled.toml"
     answers: dict[int, int | None] = {}
     with ExitStack() as stack:
-        simulation = Simulation(World(seed=plan.seed, scale=plan.scale), settings, folder)
+        simulation = RebootingSimulation(World(seed=plan.seed, scale=plan.scale), settings, folder)
         simulated = stack.enter_context(simulation)
         tables = configuration.to_tables(simulated)
         tables["record"]["directory"] = str(root)

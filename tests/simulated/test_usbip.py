@@ -15,7 +15,7 @@ from dappled.clock import SystemClock
 from dappled.mocks.body.body import pattern
 from dappled.mocks.body.eos450d import Eos450d
 from dappled.mocks.body.faults import BodyFaults
-from dappled.mocks.body.usbip import UsbIpResponder
+from tests.simulated.usbip import UsbIpResponder
 
 OK = 0x2001
 SIZE = 300_000

@@ -12,12 +12,14 @@ import errno
 import queue
 import socket
 import struct
+import sys
 import threading
 from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
+from typing import ClassVar
 
-from dappled.mocks.body import ptp
+from dappled.mocks.body import body, ptp
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Transactions, exactly
 from dappled.workers import Loop
@@ -352,3 +354,13 @@ class _Bus:
             self._waiting = [urb for urb in self._waiting if urb.endpoint != endpoint]
             for urb in halted:
                 self._done(urb, urb.got, -errno.EPIPE)
+
+
+class UsbBody(body.SimulatedBody):
+    """A body on a USB bus, in a process of its own."""
+
+    COMMAND: ClassVar = [sys.executable, __file__]
+
+
+if __name__ == "__main__":
+    body.main(lambda eos, faults, options: UsbIpResponder(eos, faults, (options.bind, 0)))

@@ -1,6 +1,6 @@
 """Run a soak: a long simulated flight in which something goes wrong every few seconds.
 
-python -m dappled.mocks.soak --minutes 30 --seed 1
+python -m tests.soak --minutes 30 --seed 1
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from pathlib import Path
 
 from dappled import codec
 from dappled.flight import FlightError
-from dappled.mocks.soak.soak import SoakPlan, SoakReport, soak
+from tests.soak.soak import SoakPlan, SoakReport, soak
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The process' entry point: exit code 1 where a shot is missing or the daemon has grown."""
-    parser = argparse.ArgumentParser(prog="python -m dappled.mocks.soak", description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(prog="python -m tests.soak", description=__doc__.partition("\n")[0])
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--keep", type=Path, help="folder for flights and the daemon's log (default: a temporary one)")

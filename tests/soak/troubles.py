@@ -9,6 +9,7 @@ import select
 import signal
 import socket
 import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
@@ -17,16 +18,27 @@ from pathlib import Path
 from dappled.config import settings as configuration
 from dappled.drivers.python_command import python_module
 from dappled.mocks.simulation import Simulation
-from dappled.mocks.soak.supervised import Supervised
+from tests.soak.supervised import Supervised
 
 CAMERA = ("busy 2", "silence 3", "error", "no-event", "short", "drop", "drop-transfer", "refuse 3")
 HEAR_S = 5.0
 
 
+class RebootingSimulation(Simulation):
+    """One whose autopilot can be restarted."""
+
+    def reboot_autopilot(self) -> None:
+        """Restart the autopilot: its time since boot starts again, and the flight goes on."""
+        self._autopilot.stop()
+        self._autopilot = self._start_autopilot(-(time.monotonic_ns() - self.start_monotonic_ns) / 1e9)
+
+
 class Troubles:
     """Faults of camera, link, disk, subscribers, console, and processes. Use as a context manager."""
 
-    def __init__(self, simulation: Simulation, daemon: Supervised, config: Path, chance: random.Random) -> None:
+    def __init__(
+        self, simulation: RebootingSimulation, daemon: Supervised, config: Path, chance: random.Random
+    ) -> None:
         """`config` is the daemon's: it names the stream and the console, and is rewritten to fill the disk."""
         self._simulation, self._daemon, self._config = simulation, daemon, config
         settings = configuration.load(config)
