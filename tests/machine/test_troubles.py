@@ -6,6 +6,7 @@ import json
 import re
 import shutil
 import subprocess
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -55,6 +56,26 @@ def test_a_network_that_comes_late_is_found(scene: Make) -> None:
     flown.photograph()
     assert flown.shown("NRestarts") == "0"
     assert flown.kept() >= len(flown.station.captured) >= 1
+
+
+def test_a_disk_that_stands_still_ends_no_flight(scene: Make) -> None:
+    """As a memory card does that tidies up: for longer than the service's watchdog waits."""
+    flown = scene()
+    flown.configure()
+    flown.begin()
+    flown.station.request(every_s=1, count=0)
+    flown.station.until(lambda it: len(it.captured) >= 3, "three images")
+    main = flown.shown("MainPID")
+    with flown.machine.halted(disks_only=True):
+        time.sleep(25)  # how long is what is tried
+    known = len(flown.station.captured)
+    flown.station.until(lambda it: len(it.captured) >= known + 3, "three more images")
+    assert (flown.shown("NRestarts"), flown.shown("MainPID")) == ("0", main)
+    assert "the disk did not answer for" in flown.machine.run("journalctl -u dappled --no-pager")
+    flown.machine.run("systemctl stop dappled")
+    assert flown.kept() >= len(flown.station.captured)
+    (folder,) = flown.machine.run(f"ls -d {FLIGHTS}/*/").split()
+    assert json.loads(flown.machine.run(f"dappled flight report --json {folder}", check=False))["balanced"] is True
 
 
 # What gpsd tells chrony of a fix: the system's time, how far it is behind, no pulse, no leap second, a magic number.

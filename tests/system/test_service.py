@@ -163,6 +163,18 @@ def test_a_loop_that_hangs_is_not_fed_by_other_threads(manager: socket.socket, t
 
 
 @pytest.mark.slow
+def test_what_the_watchdog_kills_tells_where_its_threads_stood(
+    manager: socket.socket, served: subprocess.Popen[str]
+) -> None:
+    until(manager, "WATCHDOG=1".__eq__)
+    served.send_signal(signal.SIGABRT)
+    said = served.communicate()[1]
+    assert served.returncode == -signal.SIGABRT
+    assert "Current thread" in said
+    assert "daemon/service.py" in said
+
+
+@pytest.mark.slow
 def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: Path) -> None:
     """systemd's status line, MAVLink's heartbeat and text, the stream and `dappled status`, and the console."""
     links, pages = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)

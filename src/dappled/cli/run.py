@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import signal
 import sys
@@ -31,6 +32,7 @@ if not words_only:
     from dappled.daemon import settings_check
     from dappled.daemon.flight_handover import FlightHandover, flights
     from dappled.daemon.grounded import answer_meanwhile
+    from dappled.daemon.health.patience import Patience
     from dappled.daemon.service import Service
     from dappled.drivers.mavlink import SigningError
     from dappled.flight import FlightError
@@ -182,6 +184,13 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
         # now stays, and is left out: 7 ms.
         gc.freeze()
         stack.callback(gc.unfreeze)
+        if manager.listens:
+            faulthandler.enable()  # what the watchdog kills (SIGABRT) tells the journal where each thread stood
+            stack.callback(faulthandler.disable)
+        if manager.watchdog_ns:
+            patience = Patience(manager)
+            stack.callback(patience.stop)
+            patience.start()
         stack.callback(sys.setswitchinterval, sys.getswitchinterval())
         sys.setswitchinterval(_SWITCH_S)
         stack.callback(signal.signal, signal.SIGHUP, signal.signal(signal.SIGHUP, lambda *_: hung_up.set()))
