@@ -10,7 +10,6 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,10 +22,10 @@ from dappled.findings import told
 from dappled.flight import FlightError, Frame, Recording, layout, recording
 from dappled.flight.checks.flight_check import check
 from tests.flight.conftest import START_UTC_NS
+from tests.flight.ext4 import MB, Image, an_image, mount, run, unmount
 from tests.flight.makers import deliver, deliver_straight, flip, request, shot, tag
 
 LATER_UTC_NS = START_UTC_NS + 10**9
-MB = 1_000_000
 
 
 def whole(flights: Path, safe: dict[int, str]) -> None:
@@ -54,6 +53,7 @@ from dappled.findings import text
 from dappled.flight import recording
 from dappled.flight.checks.flight_check import check
 from dappled.flight.errors import FlightError
+from tests.flight.ext4 import MB, Image, an_image, mount, run, unmount
 from tests.flight.makers import deliver, deliver_straight, request
 mount = lambda *words: subprocess.run(["mount", *words], check=True)
 disk = Path(sys.argv[1])
@@ -134,54 +134,10 @@ def test_a_folder_that_turns_read_only(tmp_path: Path, way: str) -> None:
 # --- as root: a real ext4 in an image
 
 
-@dataclass
-class Image:
-    """An ext4 in a file, mounted; `cut` is what its block device holds at this moment."""
-
-    file: Path
-    mounted: Path
-
-    def cut(self, name: str) -> Path:
-        copy = self.file.with_name(name)
-        run("cp", "--sparse=always", str(self.file), str(copy))
-        return copy
-
-    def break_down(self) -> None:
-        """The kernel finds an error on it and makes it read-only."""
-        mounts = [line.split() for line in Path("/proc/mounts").read_text().splitlines()]
-        device = next(words[0] for words in mounts if words[1] == str(self.mounted))
-        Path("/sys/fs/ext4", Path(device).name, "trigger_fs_error").write_text("1")
-
-
-def run(*words: str, good: tuple[int, ...] = (0,)) -> None:
-    done = subprocess.run(words, capture_output=True, text=True, check=False)
-    if done.returncode not in good:
-        raise OSError(f"{' '.join(words)}: {done.stderr.strip()}")
-
-
-def mount(image: Path, place: Path) -> None:
-    place.mkdir(exist_ok=True)
-    run("mount", "-o", "loop,errors=remount-ro", str(image), str(place))
-
-
-def unmount(place: Path) -> None:
-    run("umount", str(place))
-
-
 @pytest.fixture
 def ext4(tmp_path: Path) -> Iterator[Image]:
-    if os.geteuid() != 0 or shutil.which("mkfs.ext4") is None:
-        pytest.skip("only root may mount an ext4 image")
-    image = Image(tmp_path / "image", tmp_path / "mounted")
-    with image.file.open("wb") as file:
-        file.truncate(32 * MB)
-    run("mkfs.ext4", "-q", "-F", str(image.file))
-    try:
-        mount(image.file, image.mounted)
-    except OSError as error:
-        pytest.skip(f"no image can be mounted here: {error}")
-    yield image
-    unmount(image.mounted)
+    with an_image(tmp_path) as made:
+        yield made
 
 
 def test_a_disk_that_the_kernel_makes_read_only(ext4: Image) -> None:

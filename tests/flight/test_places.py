@@ -21,8 +21,9 @@ from dappled.flight import FlightError, Recording, offload, places, read_back
 from dappled.flight.checks.flight_check import check
 from dappled.flight.trees import Tree
 from tests.flight.conftest import START_UTC_NS
+from tests.flight.ext4 import Image
 from tests.flight.makers import deliver, request
-from tests.flight.test_disk_faults import Image, ext4
+from tests.flight.test_disk_faults import ext4
 
 __all__ = ["ext4"]
 MEMORY = Path("/dev/shm")

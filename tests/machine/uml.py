@@ -205,10 +205,11 @@ class Station:
     camera: tuple[int, int] | None = None
     heartbeats: int = 0
     texts: list[str] = field(default_factory=list)
+    place: tuple[str, int] = HERE, STATION_PORT
 
     def __post_init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.bind((HERE, STATION_PORT))
+        self._socket.bind(self.place)
         self._socket.settimeout(0.2)
         self._mav = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         self._mav.robust_parsing = True
@@ -260,7 +261,7 @@ class Station:
     def catch_up(self) -> None:
         """Return when all that was sent by now has been heard."""
         marks = self._marks
-        self._socket.sendto(_MARK, (HERE, STATION_PORT))
+        self._socket.sendto(_MARK, self.place)
         self.until(lambda it: it._marks > marks, "its own mark")
 
     def request(self, *, every_s: float = 0, count: int = 1, repeat: int = 0) -> None:
@@ -289,9 +290,9 @@ class Station:
 
 
 @contextlib.contextmanager
-def station() -> Iterator[Station]:
+def station(place: tuple[str, int] = (HERE, STATION_PORT)) -> Iterator[Station]:
     """A ground station."""
-    made = Station()
+    made = Station(place=place)
     try:
         yield made
     finally:
