@@ -52,7 +52,8 @@ def open_camera(settings: Mapping[str, Any]) -> ComposedCamera:
         wanted = asdict(build(_Options, given, TomlSource("camera.options"), ""))
     except ConfigError as error:
         raise CameraError(str(error)) from None
-    options = BodyOptions(**wanted, truth=wanted.pop("folder") or "")
+    truth = wanted.pop("folder") or ""
+    options = BodyOptions(**wanted, truth=truth)
     card = Path(tempfile.gettempdir()) / f"dappled-card-{secrets.token_hex(8)}"
     plan = ComposedSettings(file_s=seconds_option(settings, "file_s", 30.0), hold_s=_HOLD_S, poll_s=0.02)
     identity = Identity("dappled", "Simulated Masked Camera", f"SIM{options.seed:08d}", "simulated")
