@@ -63,6 +63,7 @@ THREADS = {
 PAST_THE_CLOCK = {
     "daemon/console/feed.py": "the console's own process: asyncio waits there",
     "daemon/health/host_checks.py": "`doctor` looks at the machine's own camera, without a flight",
+    "daemon/health/patience.py": "systemd's watchdog, whose time is the machine's",
     "daemon/pipeline/decode_process.py": "the turns of a process",
     "daemon/pipeline/decode_worker.py": "the decoder's own process: how long it computed",
     "daemon/replay/replay.py": "a replay's patience with processes that decode",
