@@ -18,15 +18,16 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 
 from autopilot_daemon import EXPOSURE_S, LATENCY_MS, LATENCY_SIGMA_MS, START_NS, Daemon
+from tests.simulated.personality import CameraPort, CameraTriggers
+from tests.simulated.vehicle import heartbeat
 
 from dappled.config.settings import PoseSettings
 from dappled.daemon.navigation import ExposureTime
 from dappled.decode.geometry import Pose, Vector3, metres_per_radian, multiply, turn_rad
 from dappled.drivers.mavlink import MavlinkMessage, mavlink, pack
 from dappled.flight import Shot
-from dappled.mocks.autopilot.autopilot import BootTime, heartbeat, telemetry_message
+from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
-from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 
 GPS_MINUS_UTC_US = 370_000  # this machine's clock is so much behind the satellites'
 PATH = FlightPath(3, speed_m_s=10.0, radius_m=60.0)

@@ -18,11 +18,12 @@ from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.checks.flight_check import check
-from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.autopilot import BootTime
 from dappled.mocks.autopilot.path import FlightPath
 from tests.daemon.fakes import rig
 from tests.daemon.replay.test_replay import again
 from tests.flight.makers import held
+from tests.simulated.vehicle import flight
 
 START_NS = 1_790_000_000 * 10**9
 PATH = FlightPath(3, speed_m_s=8.0)

@@ -27,15 +27,16 @@ from dappled.drivers.wired.composed import ComposedCamera, ComposedSettings
 from dappled.drivers.wired.sources import FolderSource
 from dappled.flight import layout
 from dappled.flight.layout import DiskSpace
-from dappled.mocks.autopilot.autopilot import RATES_HZ, BootTime, Flyer
-from dappled.mocks.autopilot.on_request import OnRequest
+from dappled.mocks.autopilot.autopilot import RATES_HZ, BootTime
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.dng import Exif
 from dappled.workers import Loop, Worker
 from tests.simulated.bad_link import LinkFaults
 from tests.simulated.memory_links import MemoryNetwork
+from tests.simulated.on_request import OnRequest
 from tests.simulated.switching import switching
+from tests.simulated.vehicle import Vehicle
 from tests.simulated.virtual_clock import VirtualClock
 
 AUTOPILOT, GROUND = 14550, 14551
@@ -163,7 +164,7 @@ class VirtualAutopilot:
         rates = dict.fromkeys(RATES_HZ, min(plan.hz, _OTHERS_HZ))
         rates[mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION] = plan.hz
         has = OnRequest(ground_m=plan.ground_m)
-        self._flyer = Flyer(path, clock.monotonic_ns(), plan.boot, send, has=has, clock=clock, fastest_hz=rates)
+        self._flyer = Vehicle(path, clock.monotonic_ns(), plan.boot, send, clock, request=has, fastest_hz=rates)
         self._loop = Loop("autopilot", self._run, clock=clock)
 
     def start(self) -> None:

@@ -20,10 +20,10 @@ from dappled.drivers.mavlink import signing as mavlink_signing
 from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
 from dappled.findings import Code, Subject
 from dappled.flight import LedgerReader
-from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import Simulation, World, free_port
 from tests.daemon.camera_protocol.rig import Peer
+from tests.simulated.vehicle import VehicleProcess
 from tests.system.conftest import dappled
 from tests.system.flying import Flying, flying, settings_of, told
 from tests.waiting import eventually
@@ -126,7 +126,7 @@ def test_a_station_behind_a_vehicle_on_two_ports_has_each_report_once(tmp_path: 
         daemon.until_ready()
         first, second = (f"udpout:127.0.0.1:{daemon.service.parts.links.port(link)}" for link in (0, 1))
         radio = free_port()
-        autopilot = Autopilot.start(
+        autopilot = VehicleProcess.start(
             first,
             seed=1,
             start_monotonic_ns=time.monotonic_ns(),

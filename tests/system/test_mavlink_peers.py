@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from dappled.flight import flight_report
-from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
+from tests.simulated.vehicle import VehicleProcess
 from tests.system.flying import Flying, flying, settings_of
 from tests.system.peers.mavproxy import PYTHON, MavProxy
 from tests.waiting import eventually
@@ -70,7 +70,7 @@ def test_mavsdk_as_client(camera: Camera, tmp_path: Path, through_the_autopilot:
     """On a link of its own, and through the autopilot, which forwards between its ports as ArduPilot does."""
     earlier = [camera.flying.shoot().shot.index for _ in range(2)]
     radio = free_port()
-    autopilot = Autopilot.start(
+    autopilot = VehicleProcess.start(
         f"udpout:127.0.0.1:{camera.port(0)}",
         seed=1,
         start_monotonic_ns=time.monotonic_ns(),

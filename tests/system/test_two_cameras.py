@@ -21,6 +21,7 @@ from dappled.flight import LedgerReader, flight_report
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 from tests.daemon.camera_protocol.rig import Peer
+from tests.simulated.vehicle import VehicleProcess
 from tests.standing import codes
 from tests.waiting import eventually
 
@@ -81,7 +82,7 @@ def test_each_trigger_is_one_frame_of_the_camera_that_it_is_for(
 
     ports = {name: free_port(socket.SOCK_DGRAM) for name in ("left", "right", "ground")}
     urls = [f"--url=udpout:127.0.0.1:{ports[name]}" for name in BYTES] + [f"--url=udpin:127.0.0.1:{ports['ground']}"]
-    autopilot = [sys.executable, "-m", "dappled.mocks.autopilot.autopilot", "--with-parent", *urls]
+    autopilot = [*VehicleProcess.COMMAND, *urls]
     with ExitStack() as stack:
         daemons = [
             stack.enter_context(serving(name, 100 + number, tmp_path, sockets / f"dappled-{name}", ports[name]))

@@ -9,9 +9,9 @@ import pytest
 from dappled.daemon.vehicle_battery import VehicleBattery, battery_of
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink, pack
 from dappled.findings import Code, text
-from dappled.mocks.autopilot.autopilot import heartbeat
-from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 from tests.daemon.camera_protocol.test_component import GCS, Rig
+from tests.simulated.personality import CameraPort, CameraTriggers
+from tests.simulated.vehicle import heartbeat
 
 AUTOPILOT = (1, 1)
 BOOT_US = 300_000_000

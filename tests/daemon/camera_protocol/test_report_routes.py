@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 
 from dappled.daemon.camera_protocol.camera_status import Captured
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
-from dappled.mocks.autopilot.autopilot import Forwarded, PortRelay
 from tests.daemon.camera_protocol.test_component import Rig
+from tests.simulated.vehicle import Forwarded, PortRelay
 
 STEP_S, WARM_UP_S, LAST_S = 0.1, 4.0, 16.0
 SETTLED_S = 6.5  # so long after an outage both ports have the same heartbeats again

@@ -20,9 +20,10 @@ from dappled.daemon.navigation.samples import Feedback
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.findings import FRAME, Code, finding
 from dappled.flight import TimeSource
-from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.autopilot import BootTime
 from dappled.mocks.autopilot.path import FlightPath
 from tests.benchmarks import program
+from tests.simulated.vehicle import flight
 
 MS = 10**6
 START_NS = 1_790_000_000 * 10**9

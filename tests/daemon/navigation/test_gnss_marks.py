@@ -10,8 +10,8 @@ from dappled.drivers.gnss.ubx import TimeMark
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import TimeSource
 from dappled.mocks.autopilot.autopilot import BootTime
-from dappled.mocks.autopilot.personality import CameraPort
 from tests.daemon.navigation.test_owned_triggers import MS, START_NS, Vehicle
+from tests.simulated.personality import CameraPort
 
 EXPOSED_S, HALF_MS = 10.2, 1.0
 

@@ -11,7 +11,7 @@ from dappled.findings import Code
 from dappled.flight import Cause, Shot, TimeSource
 from dappled.mocks.autopilot.autopilot import BootTime, telemetry_message
 from dappled.mocks.autopilot.path import FlightPath
-from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
+from tests.simulated.personality import CameraPort, CameraTriggers
 
 START_NS = 1_790_000_000 * 10**9
 MS = 10**6

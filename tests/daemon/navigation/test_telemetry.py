@@ -22,8 +22,9 @@ from dappled.decode.geometry import Pose, from_euler, hermite, metres_per_radian
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
 from dappled.findings import Code
 from dappled.flight import digest
-from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.autopilot import BootTime
 from dappled.mocks.autopilot.path import FlightPath, TruePose
+from tests.simulated.vehicle import flight
 
 START_NS = 1_790_000_000 * 10**9
 BOOT = BootTime()

@@ -14,8 +14,9 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.utc_choice import RELEASED_NS, ROLLOVER_NS
 from dappled.errors import DappledError
 from dappled.findings import Code
-from dappled.mocks.autopilot.autopilot import BootTime, flight
+from dappled.mocks.autopilot.autopilot import BootTime
 from dappled.mocks.autopilot.path import FlightPath
+from tests.simulated.vehicle import flight
 
 NOW_NS = RELEASED_NS + 10**16
 

@@ -12,8 +12,8 @@ from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.repeats import FORWARDED_NS
 from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
 from dappled.drivers.mavlink import mavlink
-from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
 from tests.daemon.fakes import FakeSink
+from tests.simulated.personality import CameraPort, CameraTriggers
 
 WINDOW_S = FORWARDED_NS / 1e9
 START, DIGICAM = "IMAGE_START_CAPTURE", "DO_DIGICAM_CONTROL"

@@ -9,6 +9,7 @@ import pytest
 from dappled.mocks.autopilot.ground_station import GroundStation
 from tests.daemon.camera_protocol.rig import Camera
 from tests.simulated.bad_link import BadLink, LinkFaults
+from tests.simulated.rude_station import station
 from tests.waiting import eventually
 
 
@@ -33,7 +34,7 @@ def test_a_bad_radio_makes_no_photograph_twice_and_loses_no_report(faults: LinkF
 @pytest.mark.parametrize("manners", [["deaf"], ["nan"], ["deaf", "nan"]])
 def test_a_ground_station_without_manners_gets_one_photograph_a_wish(manners: Sequence[str]) -> None:
     with Camera() as camera:
-        ground = GroundStation.start(camera.url, 3, timeout_s=60, manners=manners)
+        ground = station(manners).start(camera.url, 3)
         code, lines = ground.wait(100)
         assert (code, [line["index"] for line in lines]) == (0, [0, 1, 2])
         assert len({cause.sequence for cause in camera.causes}) == len(camera.causes) == 3
@@ -42,7 +43,7 @@ def test_a_ground_station_without_manners_gets_one_photograph_a_wish(manners: Se
 
 def test_a_ground_station_that_dies_leaves_the_camera_to_the_next() -> None:
     with Camera() as camera:
-        dying = GroundStation.start(camera.url, 3, timeout_s=60, manners=["dies"])
+        dying = station(["dies"]).start(camera.url, 3)
         assert dying.wait(100)[0] != 0
         eventually(lambda: len(camera.causes) == 1, "its wish")
         camera.idle()

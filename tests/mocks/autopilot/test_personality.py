@@ -9,10 +9,11 @@ import pytest
 
 from dappled.daemon.camera_protocol.own_autopilot import TargetedTimesync
 from dappled.drivers.mavlink import MavlinkMessage, Packet, PacketParser, mavlink, pack
-from dappled.mocks.autopilot.autopilot import BootTime, Flyer
-from dappled.mocks.autopilot.on_request import OnRequest, distance
+from dappled.mocks.autopilot.autopilot import BootTime
 from dappled.mocks.autopilot.path import FlightPath
-from dappled.mocks.autopilot.personality import CameraPort, CameraTriggers
+from tests.simulated.on_request import OnRequest, distance
+from tests.simulated.personality import CameraPort, CameraTriggers
+from tests.simulated.vehicle import Vehicle
 
 BOOT_US, UNIX_US = 300_000_000, 1_790_000_000 * 10**6
 WIRED = CameraPort("wire", pin=True)
@@ -74,8 +75,8 @@ def test_a_request_for_one_camera_of_two_triggers_that_one() -> None:
         assert targets == ([99 + camera] if camera else [100, 101])
 
 
-def flyer(sent: list[MavlinkMessage], has: OnRequest | None = None) -> Flyer:
-    return Flyer(FlightPath(1), 0, BootTime(), sent.append, has=has or OnRequest())
+def flyer(sent: list[MavlinkMessage], has: OnRequest | None = None) -> Vehicle:
+    return Vehicle(FlightPath(1), 0, BootTime(), sent.append, request=has or OnRequest())
 
 
 def heard(message: MavlinkMessage) -> Packet:

@@ -8,25 +8,21 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import random
 import select
 import socket
 import subprocess
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import ClassVar
 
 from dappled.clock import Clock, SystemClock, TimeOfDayClock
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.drivers.python_command import python_module
-from dappled.mocks.autopilot.on_request import OnRequest
 from dappled.mocks.autopilot.path import SPEED_M_S, FlightPath, TruePose
-from dappled.mocks.autopilot.personality import PERSONALITIES, CameraPort, CameraTriggers
 from dappled.workers import Loop
 
 RATES_HZ: dict[int, float] = {
@@ -37,8 +33,9 @@ RATES_HZ: dict[int, float] = {
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
     mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
 }
+BATTERY = mavlink.MAVLINK_MSG_ID_SYS_STATUS
 _FASTEST_HZ = 100.0
-_LATENCY_NS = 60_000_000  # from a trigger over a wire to the contact
+_CELLS, _CHARGED_PERCENT, _DRAIN_S = 6, 96.0, 20.0  # of a lithium polymer battery; a percent each so many seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,12 +53,6 @@ class BootTime:
         """Time since boot at simulation time `t_s`."""
         gained_s = sum(by_s for at_s, by_s in self.jumps if t_s >= at_s)
         return round(((self.offset_s + t_s) * (1 + self.drift) + gained_s) * 1e9)
-
-
-def _jump(text: str) -> tuple[float, float]:
-    """From "AT:BY", both in seconds. Raises ValueError."""
-    at_s, _, by_s = text.partition(":")
-    return float(at_s), float(by_s)
 
 
 def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: int = 0) -> MavlinkMessage:
@@ -89,103 +80,63 @@ def telemetry_message(message_id: int, pose: TruePose, boot_ns: int, unix_us: in
     if message_id == mavlink.MAVLINK_MSG_ID_SYSTEM_TIME:
         return mavlink.MAVLink_system_time_message(unix_us, boot_ms)
     if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-        return heartbeat(armed=True)
+        kind, mode = mavlink.MAV_TYPE_QUADROTOR, 81 | mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+        return mavlink.MAVLink_heartbeat_message(
+            kind, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA, mode, 3, mavlink.MAV_STATE_ACTIVE, 3
+        )
     raise ValueError(f"the simulated autopilot has no message {message_id}")
 
 
-def heartbeat(*, armed: bool, personality: str = "ardupilot") -> MavlinkMessage:
-    """The autopilot's heartbeat, in flight (armed) or on the ground."""
-    make = mavlink.MAV_AUTOPILOT_PX4 if personality == "px4" else mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
-    mode = 81 | (mavlink.MAV_MODE_FLAG_SAFETY_ARMED if armed else 0)
-    state = mavlink.MAV_STATE_ACTIVE if armed else mavlink.MAV_STATE_STANDBY
-    return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, make, mode, 3, state, 3)
-
-
-def flight(path: FlightPath, boot: BootTime, start_s: float, stop_s: float) -> Iterator[tuple[float, MavlinkMessage]]:
-    """All telemetry of a stretch of flight, (simulation time, message) in order, without a link."""
-    events = sorted(
-        (start_s + step / rate, message_id)
-        for message_id, rate in RATES_HZ.items()
-        for step in range(int((stop_s - start_s) * rate))
+def battery_status(percent: int) -> MavlinkMessage:
+    """SYS_STATUS of a vehicle with this much left; below 10 percent the battery is not healthy."""
+    watched = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
+    voltage_mv = _CELLS * (3300 + 9 * percent)
+    health = watched if percent >= 10 else 0
+    return mavlink.MAVLink_sys_status_message(
+        watched, watched, health, 300, voltage_mv, 1800, percent, 0, 0, 0, 0, 0, 0
     )
-    for t_s, message_id in events:
-        yield t_s, telemetry_message(message_id, path.pose(t_s), boot.ns(t_s))
-
-
-class Forwarded:
-    """A packet of another component's, which is sent on as it came."""
-
-    def __init__(self, packet: Packet) -> None:
-        self._packet = packet
-
-    @property
-    def source(self) -> tuple[int, int]:
-        """System and component of its sender."""
-        return self._packet.message.get_srcSystem(), self._packet.message.get_srcComponent()
-
-    def __getattr__(self, name: str) -> Any:
-        """What pymavlink's message of the packet has."""
-        return getattr(self._packet.message, name)
-
-    def pack(self, _packer: object, force_mavlink1: bool = False) -> bytes:
-        """Its bytes."""
-        return self._packet.raw
-
-
-@dataclass(slots=True)
-class PortRelay:
-    """Forwards between ports as ArduPilot does (MAVLink_routing): never to the port that a packet came on, and no
-    heartbeat to a port that is known as a source of its sender."""
-
-    ports: int
-    send: Callable[[MavlinkMessage, int], object]
-    sources: set[tuple[int, int, int]] = field(default_factory=set)  # system, component, port
-
-    def __call__(self, message: Forwarded, link: int) -> None:
-        self.sources.add((*message.source, link))
-        for port in range(self.ports):
-            known = message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT and (*message.source, port) in self.sources
-            if port != link and not known:
-                self.send(message, port)
 
 
 @dataclass(slots=True)
 class Flyer:
-    """The running autopilot: sends what is due, answers TIMESYNC and message interval requests, delays telemetry.
-
-    `cameras` are those that it triggers itself, on command; none: it leaves these commands to cameras. `relay` sends
-    what is not for it alone on its other ports, as ArduPilot does; None: it forwards nothing. `has` is what it sends
-    on request alone. It is armed from `arms_s` after the flight's beginning on, and sends a message no
-    more often than `fastest_hz` says.
-    """
+    """The running autopilot: sends what is due, answers TIMESYNC and requests for message intervals. On request it
+    sends the state of its battery."""
 
     path: FlightPath
     start_monotonic_ns: int
     boot: BootTime
     send: Callable[[MavlinkMessage], object]
-    jitter_s: float = 0.0
-    system_id: int = 1
-    cameras: CameraTriggers | None = None
-    relay: Callable[[Forwarded, int], object] | None = None
-    has: OnRequest = field(default_factory=OnRequest)
-    arms_s: float = 0.0
+    clock: Clock = field(default_factory=TimeOfDayClock)
     due_ns: dict[int, int] = field(default_factory=dict)
     interval_ns: dict[int, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
-    delayed: deque[tuple[int, MavlinkMessage]] = field(default_factory=deque)
-    contacts: deque[int] = field(default_factory=deque)
-    random: random.Random = field(default_factory=lambda: random.Random(0))  # noqa: S311 (a simulation)
-    clock: Clock = field(default_factory=TimeOfDayClock)
-    fastest_hz: Mapping[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for message_id, rate in RATES_HZ.items():
-            self.interval_ns[message_id] = round(1e9 / min(rate, self.fastest_hz.get(message_id, rate)))
+            self.interval_ns[message_id] = round(1e9 / min(rate, self.most_hz(message_id)))
             self.due_ns[message_id] = 0
+
+    def most_hz(self, _number: int) -> float:
+        """How often it can send a message."""
+        return _FASTEST_HZ
+
+    def has(self, number: float) -> bool:
+        """Whether it can send this message."""
+        return number in RATES_HZ or number == BATTERY
+
+    def message(self, number: int, pose: TruePose, now_ns: int) -> MavlinkMessage:
+        """One that it has, of this moment."""
+        if number == BATTERY:
+            return battery_status(max(0, round(_CHARGED_PERCENT - self.flown_s(now_ns) / _DRAIN_S)))
+        return telemetry_message(number, pose, self.boot_ns(now_ns), self.unix_us(now_ns))
+
+    def flown_s(self, monotonic_ns: int) -> float:
+        """Simulation time at a moment of this machine's."""
+        return (monotonic_ns - self.start_monotonic_ns) / 1e9
 
     def boot_ns(self, monotonic_ns: int) -> int:
         """The boot clock at a moment of this machine's."""
-        return self.boot.ns((monotonic_ns - self.start_monotonic_ns) / 1e9)
+        return self.boot.ns(self.flown_s(monotonic_ns))
 
     def unix_us(self, monotonic_ns: int) -> int:
         """UTC at a moment of this machine's: UTC and boot time of one message are of one moment."""
@@ -193,41 +144,17 @@ class Flyer:
 
     def step(self, now_ns: int) -> float:
         """Send what is due; returns the seconds until the next message."""
-        pose: TruePose | None = None
         with self.lock:
             due = [number for number, at_ns in self.due_ns.items() if now_ns >= at_ns]
             for number in due:
                 on_time_ns = self.due_ns[number] + self.interval_ns[number]
                 self.due_ns[number] = on_time_ns if on_time_ns > now_ns else now_ns + self.interval_ns[number]
-        for number in due:
-            if pose is None:
-                pose = self.path.pose((now_ns - self.start_monotonic_ns) / 1e9)
-            boot_ns = self.boot_ns(now_ns)
-            flown_s = (now_ns - self.start_monotonic_ns) / 1e9
-            if self.has.has(number):
-                message = self.has.message(number, pose, boot_ns, flown_s)
-            elif number == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
-                armed = flown_s >= self.arms_s
-                message = heartbeat(
-                    armed=armed, personality="ardupilot" if self.cameras is None else self.cameras.personality
-                )
-            else:
-                message = telemetry_message(number, pose, boot_ns, self.unix_us(now_ns))
-            self._later(message, now_ns)
-        if self.cameras is not None:
-            with self.lock:
-                triggered = self.cameras.due(self.boot_ns(now_ns) // 1000, self.unix_us(now_ns))
-            self._triggered(triggered, now_ns)
-        while self.contacts and self.contacts[0] <= now_ns:
-            assert self.cameras is not None
-            for message in self.cameras.contact(self.boot_ns(self.contacts.popleft()) // 1000):
-                self.send(message)
-        while self.delayed and self.delayed[0][0] <= now_ns:
-            self.send(self.delayed.popleft()[1])
+        if due:
+            pose = self.path.pose(self.flown_s(now_ns))
+            for number in due:
+                self.send(self.message(number, pose, now_ns))
         with self.lock:
             next_ns = min(self.due_ns.values())
-        if self.delayed:
-            next_ns = min(next_ns, self.delayed[0][0])
         return max(0.0, (next_ns - self.clock.monotonic_ns()) / 1e9)
 
     def log_packet(self, _stamp_us: int, _raw: bytes) -> None:
@@ -238,17 +165,9 @@ class Flyer:
         message = packet.message
         if packet.sent:
             return
-        target = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if self.relay is not None and target != (self.system_id, 1) and message.get_type() != "TIMESYNC":
-            self.relay(Forwarded(packet), packet.link)
         if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self._asks_us(packet.raw):
             self.send(mavlink.MAVLink_timesync_message(self.boot_ns(self.clock.monotonic_ns()), message.ts1))
-        if message.get_type() == "COMMAND_LONG" and message.target_system in (0, self.system_id):
-            if self.cameras is not None:
-                now_ns = self.clock.monotonic_ns()
-                with self.lock:
-                    triggered = self.cameras.command(message, self.boot_ns(now_ns) // 1000, self.unix_us(now_ns))
-                self._triggered(triggered, now_ns)
+        if message.get_type() == "COMMAND_LONG" and message.target_system in (0, 1):
             if message.command != mavlink.MAV_CMD_SET_MESSAGE_INTERVAL or message.target_component not in (0, 1):
                 return
             result = self._set_interval(message.param1, message.param2)
@@ -260,39 +179,23 @@ class Flyer:
         out."""
         payload = request[10 : 10 + request[1]] if request[0] == 0xFD else b""
         system, component = (*payload[16:18], 0, 0)[:2]
-        return system in (0, self.system_id) and component in (0, 1)
+        return system in (0, 1) and component in (0, 1)
 
     def _set_interval(self, number: float, interval_us: float) -> int:
-        if number not in RATES_HZ and not self.has.has(number):
+        if not self.has(number):
             return int(mavlink.MAV_RESULT_UNSUPPORTED)
         if not (math.isfinite(interval_us) and interval_us > 0):
             return int(mavlink.MAV_RESULT_DENIED)
         with self.lock:
-            self.interval_ns[int(number)] = max(
-                round(interval_us * 1e3), round(1e9 / self.fastest_hz.get(int(number), _FASTEST_HZ))
-            )
+            self.interval_ns[int(number)] = max(round(interval_us * 1e3), round(1e9 / self.most_hz(int(number))))
             self.due_ns.setdefault(int(number), 0)
         return int(mavlink.MAV_RESULT_ACCEPTED)
-
-    def _triggered(self, messages: list[MavlinkMessage], now_ns: int) -> None:
-        """Send what a trigger makes it send; the hot shoe of the first camera closes a little later."""
-        for message in messages:
-            self.send(message)
-        if messages and self.cameras is not None and self.cameras.cameras[0].pin:
-            self.contacts.append(now_ns + _LATENCY_NS)
-
-    def _later(self, message: MavlinkMessage, now_ns: int) -> None:
-        if self.jitter_s <= 0 and not self.delayed:
-            self.send(message)
-            return
-        at_ns = now_ns + round(self.random.uniform(0, self.jitter_s) * 1e9)
-        if self.delayed:
-            at_ns = max(at_ns, self.delayed[-1][0])
-        self.delayed.append((at_ns, message))
 
 
 class Autopilot:
     """The autopilot as a process of its own, which ends with this one."""
+
+    COMMAND: ClassVar = python_module("dappled.mocks.autopilot.autopilot")
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self._process = process
@@ -304,16 +207,14 @@ class Autopilot:
         *,
         seed: int,
         start_monotonic_ns: int,
-        jitter_s: float = 0.0,
         booted_s: float = BootTime().offset_s,
         more: Sequence[str] = (),
     ) -> Autopilot:
         """Start one that flies `FlightPath(seed)` since `start_monotonic_ns` and speaks on `url` (udpout:HOST:PORT).
 
         It was booted `booted_s` before the flight began; less than zero: in flight. `more` are options of the
-        process, such as `--forward` and further ports (`--url=…`)."""
-        command = python_module("dappled.mocks.autopilot.autopilot", "--with-parent", "--url", url, "--seed", str(seed))
-        command += ["--start-monotonic-ns", str(start_monotonic_ns), "--jitter", str(jitter_s)]
+        process."""
+        command = [*cls.COMMAND, f"--url={url}", f"--seed={seed}", f"--start-monotonic-ns={start_monotonic_ns}"]
         command += [f"--booted={booted_s}", *more]
         return cls(subprocess.Popen(command, stdin=subprocess.PIPE, process_group=0))
 
@@ -339,62 +240,38 @@ def _euler(pose: TruePose) -> tuple[float, float, float]:
     return roll, pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the process."""
+def options() -> argparse.ArgumentParser:
+    """The options of the process."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--url", required=True, action="append", help="a port of it; several: it sends on each")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--start-monotonic-ns", type=int, default=None, help="when the flight began; default now")
-    parser.add_argument("--system-id", type=int, default=1)
-    parser.add_argument("--jitter", type=float, default=0.0, help="seconds that telemetry may be late")
+    parser.add_argument("--start-monotonic-ns", type=int, default=time.monotonic_ns(), help="when the flight began")
     parser.add_argument("--booted", type=float, default=BootTime().offset_s, help="seconds before the flight began")
-    parser.add_argument("--personality", choices=PERSONALITIES, default="ardupilot", help="whose messages it sends")
-    parser.add_argument(
-        "--camera",
-        action="append",
-        type=CameraPort.of,
-        default=[],
-        help="a camera that it triggers on command: mavlink, broadcast or wire, and :pin for a wired hot shoe",
-    )
-    parser.add_argument("--drift", type=float, default=BootTime().drift, help="share by which its clock runs fast")
-    parser.add_argument("--jump", action="append", type=_jump, default=[], help="AT:BY, seconds its clock gains at AT")
-    parser.add_argument("--arms", type=float, default=0.0, help="seconds from the flight's beginning until it is armed")
-    parser.add_argument("--battery", type=float, default=96.0, help="percent left at the flight's beginning")
-    parser.add_argument("--gimbal", action="store_true", help="it has a gimbal, and sends its attitude on request")
-    parser.add_argument("--ground", type=float, help="ground above the take-off place, m, for a rangefinder")
     parser.add_argument("--speed", type=float, default=SPEED_M_S, help="m/s over ground")
-    parser.add_argument("--forward", action="store_true", help="forward between its ports, as ArduPilot does")
-    parser.add_argument("--with-parent", action="store_true", help="end when standard input is closed")
-    wanted = parser.parse_args(arguments)
-    start_ns = time.monotonic_ns() if wanted.start_monotonic_ns is None else wanted.start_monotonic_ns
-    links = MavlinkLinks(wanted.url, system_id=wanted.system_id, component_id=1, clock=SystemClock())
-    boot = BootTime(wanted.booted, wanted.drift, tuple(wanted.jump))
-    cameras = CameraTriggers(wanted.personality, tuple(wanted.camera), wanted.system_id) if wanted.camera else None
+    return parser
+
+
+def main(
+    wanted: argparse.Namespace, flyer: Callable[[FlightPath, int, BootTime, Callable[..., object]], Flyer] = Flyer
+) -> int:
+    """Run the process until its input is closed."""
+    links = MavlinkLinks(wanted.url, system_id=1, component_id=1, clock=SystemClock())
     path = FlightPath(wanted.seed, speed_m_s=wanted.speed)
-    flyer = Flyer(path, start_ns, boot, links.sender.send, wanted.jitter, wanted.system_id, cameras)
-    flyer.has, flyer.arms_s = OnRequest(wanted.gimbal, wanted.battery, wanted.ground), wanted.arms
-    if wanted.forward:
-        flyer.relay = PortRelay(len(wanted.url), links.sender.send)
+    flying = flyer(path, wanted.start_monotonic_ns, BootTime(wanted.booted), links.sender.send)
     try:
-        links.start(flyer)
+        links.start(flying)
     except LinkError as error:
         print(f"autopilot: {error}", file=sys.stderr)  # noqa: T201 (a process that speaks to a person)
         return 1
-    watched = [sys.stdin] if wanted.with_parent else []
     try:
         while True:
-            wait_s = flyer.step(time.monotonic_ns())
-            readable, _, _ = select.select(watched, [], [], wait_s)
+            readable, _, _ = select.select([sys.stdin], [], [], flying.step(time.monotonic_ns()))
             if readable and not sys.stdin.buffer.read(1):
                 return 0
     except KeyboardInterrupt:
         return 0
     finally:
         links.stop()
-
-
-if __name__ == "__main__":
-    sys.exit(main())
 
 
 _LOOK_S = 0.005
@@ -433,3 +310,7 @@ class HotShoe:
         boot_us = BootTime().ns(opened_t_s) // 1000
         message = mavlink.MAVLink_camera_feedback_message(boot_us, 1, 0, number, 0, 0, 0.0, 0.0, 0, 0, 0, 0, 0, number)
         self._socket.send(message.pack(self._speech))
+
+
+if __name__ == "__main__":
+    sys.exit(main(options().parse_args()))

@@ -2,65 +2,37 @@
 
     python -m dappled.mocks.autopilot.ground_station --url udpout:127.0.0.1:14550 --count 8
 
-exits 0 if all photographs were taken. It can misbehave: see `MANNERS`.
+exits 0 if all photographs were taken.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import math
-import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
+from typing import ClassVar, Self
 
-from dappled.daemon.camera_protocol.ground_client import ACK_TRIES, GroundClient, GroundStationError, Outcome
-from dappled.drivers.mavlink import LinkError, MavlinkMessage, mavlink
+from dappled.daemon.camera_protocol.ground_client import GroundClient, GroundStationError, Outcome
+from dappled.drivers.mavlink import LinkError
 from dappled.drivers.python_command import python_module
-
-MANNERS = {
-    "deaf": "hears no answer: it sends each command four times, always with confirmation 0",
-    "nan": "sets parameters that a command doesn't need to NaN",
-    "dies": "ends as soon as it has requested a photograph",
-}
-
-
-class RudeClient(GroundClient):
-    """A ground station with these manners."""
-
-    def __init__(self, url: str, manners: Sequence[str]) -> None:
-        super().__init__(url)
-        self._manners = manners
-
-    def send_command(self, message: MavlinkMessage) -> None:
-        """Send a command, spoilt by these manners (`MANNERS`)."""
-        if "nan" in self._manners:
-            for name in ("param5", "param6", "param7"):
-                setattr(message, name, math.nan)
-        if "deaf" in self._manners:
-            message.confirmation = 0
-        for _ in range(ACK_TRIES if "deaf" in self._manners else 1):
-            super().send_command(message)
-        if "dies" in self._manners and message.command == mavlink.MAV_CMD_IMAGE_START_CAPTURE:
-            os._exit(9)
 
 
 class GroundStation:
     """The ground station as a process; `wait` returns the results."""
 
+    COMMAND: ClassVar = python_module("dappled.mocks.autopilot.ground_station")
+
     def __init__(self, process: subprocess.Popen[str]) -> None:
         self._process = process
 
     @classmethod
-    def start(
-        cls, url: str, count: int, interval_s: float = 0.0, timeout_s: float = 60.0, manners: Sequence[str] = ()
-    ) -> GroundStation:
-        """Start one that asks for `count` photographs; its lines (JSON) are read by `wait`. See MANNERS."""
-        command = python_module("dappled.mocks.autopilot.ground_station", "--url", url, "--count", str(count))
+    def start(cls, url: str, count: int, interval_s: float = 0.0, timeout_s: float = 60.0) -> Self:
+        """Start one that asks for `count` photographs; its lines (JSON) are read by `wait`."""
+        command = [*cls.COMMAND, "--url", url, "--count", str(count)]
         command += ["--interval", str(interval_s), "--timeout", str(timeout_s)]
-        command += [text for one in manners for text in ("--manners", one)]
         return cls(
             subprocess.Popen(command, stdout=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True, process_group=0)
         )
@@ -86,7 +58,7 @@ def _line(outcome: Outcome) -> str:
     return json.dumps(facts | {"reason": outcome.reason, "ack_ms": outcome.ack_ms})
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, client: Callable[[str], GroundClient] = GroundClient) -> int:
     """The process."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--url", required=True)
@@ -95,13 +67,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument(
         "--timeout", type=float, default=60.0, help="seconds to wait for the camera, and for each photo"
     )
-    parser.add_argument("--manners", action="append", choices=list(MANNERS), default=[], help="how it misbehaves")
     wanted = parser.parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C reaches the whole group; the starter ends us
     try:
-        with RudeClient(wanted.url, wanted.manners) as client:
-            client.find_camera(wanted.timeout)
-            outcomes = client.capture(
+        with client(wanted.url) as asking:
+            asking.find_camera(wanted.timeout)
+            outcomes = asking.capture(
                 wanted.count,
                 wanted.interval,
                 timeout_s=wanted.timeout,

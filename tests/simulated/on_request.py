@@ -1,4 +1,4 @@
-"""What the simulated autopilot sends on request alone, as ArduPilot does: gimbal, battery, height above ground."""
+"""What a simulated vehicle sends on request alone, as ArduPilot does: gimbal and height above ground."""
 
 from __future__ import annotations
 
@@ -8,34 +8,29 @@ from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.mocks.autopilot.path import TruePose
 
 GIMBAL = mavlink.MAVLINK_MSG_ID_GIMBAL_DEVICE_ATTITUDE_STATUS
-BATTERY = mavlink.MAVLINK_MSG_ID_SYS_STATUS
 RANGEFINDER = mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR
 TERRAIN = mavlink.MAVLINK_MSG_ID_TERRAIN_REPORT
-_CELLS, _DRAIN_S = 6, 20.0  # of a lithium polymer battery; a percent each so many seconds
 _LEAST_CM, _MOST_CM = 20, 5000  # of the rangefinder
 _SIGMA_CM = 5
 
 
 @dataclass(frozen=True, slots=True)
 class OnRequest:
-    """What the vehicle has: a `gimbal`, a battery with `battery_percent` at the flight's beginning, a rangefinder and
-    terrain over ground `ground_m` above the take-off place (None: neither)."""
+    """What the vehicle has: a `gimbal`, a rangefinder and terrain over ground `ground_m` above the take-off place
+    (None: neither)."""
 
     gimbal: bool = False
-    battery_percent: float = 96.0
     ground_m: float | None = None
 
     def has(self, number: float) -> bool:
         """Whether it can send this message."""
         ground = self.ground_m is not None and number in (RANGEFINDER, TERRAIN)
-        return number == BATTERY or ground or (self.gimbal and number == GIMBAL)
+        return ground or (self.gimbal and number == GIMBAL)
 
-    def message(self, number: int, pose: TruePose, boot_ns: int, flown_s: float) -> MavlinkMessage:
+    def message(self, number: int, pose: TruePose, boot_ns: int) -> MavlinkMessage:
         """The message now. Raises ValueError for one that it hasn't."""
         if number == GIMBAL:
             return _gimbal_ahead(boot_ns)
-        if number == BATTERY:
-            return battery_status(max(0, round(self.battery_percent - flown_s / _DRAIN_S)))
         if self.ground_m is None or number not in (RANGEFINDER, TERRAIN):
             raise ValueError(f"the simulated vehicle has nothing for message {number}")
         height_m = -pose.position_ned_m[2] - self.ground_m
@@ -67,14 +62,3 @@ def _gimbal_ahead(boot_ns: int) -> MavlinkMessage:
     flags = mavlink.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
     level = [1.0, 0.0, 0.0, 0.0]
     return mavlink.MAVLink_gimbal_device_attitude_status_message(0, 0, boot_ns // 10**6, flags, level, 0, 0, 0, 0)
-
-
-def battery_status(percent: int) -> MavlinkMessage:
-    """SYS_STATUS: what is left in the battery. Below a tenth the autopilot calls it not healthy, as ArduPilot
-    does by its failsafe."""
-    watched = mavlink.MAV_SYS_STATUS_SENSOR_BATTERY
-    voltage_mv = _CELLS * (3300 + 9 * percent)
-    health = watched if percent >= 10 else 0
-    return mavlink.MAVLink_sys_status_message(
-        watched, watched, health, 300, voltage_mv, 1800, percent, 0, 0, 0, 0, 0, 0
-    )

@@ -13,7 +13,6 @@ from typing import Literal, cast, get_args
 
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
-PERSONALITIES = ("ardupilot", "px4")
 _START, _STOP, _DIGICAM = (
     mavlink.MAV_CMD_IMAGE_START_CAPTURE,
     mavlink.MAV_CMD_IMAGE_STOP_CAPTURE,
