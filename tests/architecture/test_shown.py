@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import ast
+import re
 
 from tests.architecture.walk import SOURCE, parsed
 
 OWN = {"shown.py"}
+PRINTS = re.compile(r"\bprint\(|std(out|err)\.write")  # without it a module is not walked
 ANSWERS = {"drivers/reader_process.py"}  # JSON to the process that started it
 
 
 def printing(source: str) -> list[str]:
     """The calls that print, or write to a standard stream."""
-    called = [node.func for node in ast.walk(parsed(source)) if isinstance(node, ast.Call)]
+    nodes = ast.walk(parsed(source)) if PRINTS.search(source) else ()
+    called = [node.func for node in nodes if isinstance(node, ast.Call)]
     names = [ast.unparse(one) for one in called]
     return [one for one in names if one == "print" or one.removeprefix("sys.") in ("stdout.write", "stderr.write")]
 
