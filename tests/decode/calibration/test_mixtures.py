@@ -9,7 +9,6 @@ import os
 from functools import cache
 
 import pytest
-from scipy import stats
 
 from dappled.decode.calibration.fit import CalibrationFrame, calibrate
 from dappled.decode.decoder import MaskDecoder
@@ -39,6 +38,13 @@ def _doubted(one: Mixture) -> bool:
     return bool(report.doubts)
 
 
+def _at_most(count: int, share: float) -> int:
+    """How many of `count` it may be by chance, in 99 of 100 cases, where each is one with this probability."""
+    from scipy import stats  # noqa: PLC0415  half a second, which each collection of tests would take
+
+    return int(stats.binom.ppf(0.99, count, share))
+
+
 @pytest.mark.parametrize(
     "count", [pytest.param(5, marks=pytest.mark.slow), pytest.param(_LONG, marks=pytest.mark.long)]
 )
@@ -50,7 +56,7 @@ def test_no_mask_is_always_in_doubt_and_right_frames_hardly_ever(count: int) -> 
     unsaid = [seed for seed in without if not doubted[seed]]
     wrongly = [seed for seed in right if doubted[seed]]
     assert unsaid == [], f"without a doubt, of {len(without)} without a mask"
-    most = int(stats.binom.ppf(0.99, len(right), _SHARE))
+    most = _at_most(len(right), _SHARE)
     assert len(wrongly) <= most, f"seeds {wrongly} are doubted, of {len(right)} with their mask"
 
 
@@ -81,4 +87,4 @@ def test_what_changed_since_the_calibration_spoils_no_views_without_a_doubt() ->
     views = {one.seed: _views(one) for one in changed}
     undoubted = [one for one in changed if not views[one.seed][2]]
     spoilt = [one.seed for one in undoubted if views[one.seed][0] < _views(one.unchanged())[0] - 3]
-    assert len(spoilt) <= int(stats.binom.ppf(0.99, len(changed), 0.01)), f"seeds {spoilt} of {len(changed)}"
+    assert len(spoilt) <= _at_most(len(changed), 0.01), f"seeds {spoilt} of {len(changed)}"
