@@ -39,9 +39,12 @@ SEED = 20261122
 LATER = RecordedClock(START_UTC_NS + 10**12)
 
 
-@pytest.fixture
-def sealed(flight: Recording) -> FlightFolder:
-    """A closed flight with rows in every table, a journal, telemetry, inputs and sidecars; seals 1 and 2."""
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> FlightFolder:
+    """A closed flight with rows in every table, a journal, telemetry, inputs and sidecars; seals 1 and 2. Not to be
+    written to."""
+    flights = tmp_path_factory.mktemp("sealed") / "flights"
+    flight = recording.begin(flights, RecordedClock(START_UTC_NS), {"camera": {"driver": "none"}})
     (inputs := flight.folder.path / "inputs").mkdir()
     (inputs / "white.npy").write_bytes(b"what frames were decoded with" * 10)
     flight.note_inputs("inputs")
@@ -51,6 +54,13 @@ def sealed(flight: Recording) -> FlightFolder:
         (folder.path / "geotags").mkdir()
         (folder.path / "geotags/geo.txt").write_bytes(b"EPSG:4326\n")
     return folder
+
+
+@pytest.fixture
+def sealed(made: FlightFolder, flights: Path) -> FlightFolder:
+    """A copy of it, in a flights folder of its own."""
+    shutil.copytree(made.path.parent, flights)
+    return FlightFolder(flights / made.path.name)
 
 
 def key_file(folder: Path, name: str = "seal.key") -> Path:
