@@ -1,7 +1,6 @@
 """The machine is built once; dappled is installed in it from its own package, once for each state of the source.
 
-Scenes that want the same machine, and leave it whole, share it. Where none of the chosen scenes is a long one nothing
-is built: they run on what an earlier run left, with this state of the source put over its package, or not at all.
+Scenes that want the same machine, and leave it whole, share it.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ PACKAGED = ("src", "systemd", "tools/deb.py", "tools/install.py", "requirements-
 SUITE = "bookworm"
 SIZE = 2_000_000
 FLIGHTS = "/var/lib/dappled/flights"
-SOON_S = 30.0  # it takes 10 to 20 on two calm cores; one that takes longer is no machine for what has to be done soon
 
 
 # The machine as it was when the package had been installed: nothing of an earlier scene.
@@ -43,22 +41,16 @@ date -s @$now
 """
 
 
-@pytest.fixture(scope="session")
-def builds(request: pytest.FixtureRequest) -> bool:
-    """Whether what is missing is made."""
-    return any(item.get_closest_marker("long") for item in request.session.items)
-
-
 class Parts:
     """What a machine is made of, for each of Debian's releases; made when first asked for, where it is missing."""
 
-    def __init__(self, folder: Callable[[], Path], *, builds: bool) -> None:
-        self._folder, self.builds = folder, builds
+    def __init__(self, folder: Callable[[], Path]) -> None:
+        self._folder = folder
 
     @cache  # noqa: B019 (it lives as long as the session)
     def built(self, suite: str = SUITE) -> Path:
         """Kernel and disk."""
-        return machine_part(f"--suite={suite}", *([] if self.builds else ["--cached"]))
+        return machine_part(f"--suite={suite}")
 
     @cache  # noqa: B019 (as above)
     def package(self, suite: str = SUITE) -> Path:
@@ -77,14 +69,11 @@ class Parts:
 
     @cache  # noqa: B019 (as above)
     def installed(self, suite: str = SUITE) -> Path:
-        """A disk on which the package was installed while the machine ran; where nothing is built, of any state."""
+        """A disk on which the package was installed while the machine ran."""
         built = self.built(suite)
         disk = built / f"installed-{_state()}"
-        older = list(built.glob("installed-*"))
-        if disk in older:
+        if disk.exists():
             return disk
-        if not self.builds:
-            return older[0] if older else pytest.skip("no package was installed in a machine here: run make machine")
         package, folder = self.package(suite), self._folder()
         with Network().inside():
             machine = Machine(built, [copy(built / "disk", folder / "disk")], folder / "console")
@@ -95,15 +84,15 @@ class Parts:
                 machine.off()
             finally:
                 machine.cut()
-        for one in older:
-            one.unlink()
+        for older in built.glob("installed-*"):
+            older.unlink()
         copy(folder / "disk", disk)
         return disk
 
 
 @pytest.fixture(scope="session")
-def parts(builds: bool, tmp_path_factory: pytest.TempPathFactory) -> Parts:
-    return Parts(lambda: tmp_path_factory.mktemp("part"), builds=builds)
+def parts(tmp_path_factory: pytest.TempPathFactory) -> Parts:
+    return Parts(lambda: tmp_path_factory.mktemp("part"))
 
 
 def machine_part(*words: str) -> Path:
@@ -175,10 +164,10 @@ class Scene:
 
 
 class _Shared:
-    """The machine that is on. Where parts are built, one that does not start is a failure."""
+    """The machine that is on."""
 
     def __init__(self, parts: Parts, network: Network, folder: Callable[[], Path]) -> None:
-        self._parts, self._folder, self._must = parts, folder, parts.builds
+        self._parts, self._folder = parts, folder
         self.network = network
         self._on: Machine | None = None
         self._kind: object = None
@@ -193,20 +182,10 @@ class _Shared:
             made = Machine(self._parts.built(suite), [root, *disks], folder / "console", memory_mb, usb)
             self._on, self._kind = made, kind
             try:
-                self._on.start() if self._must else self._on.start(SOON_S)
-            except (OSError, AssertionError) as error:
+                self._on.start()
+            except (OSError, AssertionError):
                 self.cut()
-                if self._must:
-                    raise
-                pytest.skip(f"no machine starts here within {SOON_S:g} s ({type(error).__name__})")
-            if disk.name.rpartition("-")[2] != _state():
-                source = ["/bin/tar", "-C", "src", "-c", *(name.removeprefix("src/") for name in _files("src"))]
-                packed = subprocess.run(source, cwd=ROOT, stdout=subprocess.PIPE, check=True).stdout
-                self._on.put("/root/source.tar", packed)
-                self._on.run(
-                    "cd /usr/lib/dappled && rm -r dappled && tar --no-same-owner -xf /root/source.tar && "
-                    "sh /var/lib/dpkg/info/dappled.postinst configure 2>&1"
-                )
+                raise
             if usb is not None:
                 self._on.put("/root/modules.tar", (usb / "modules.tar").read_bytes())
                 self._on.run("tar -C /usr --no-same-owner -xf /root/modules.tar && depmod")
@@ -235,13 +214,7 @@ class _Shared:
 
 @pytest.fixture(scope="package")
 def shared(parts: Parts, tmp_path_factory: pytest.TempPathFactory) -> Iterator[_Shared]:
-    try:
-        network = Network()
-    except (OSError, subprocess.SubprocessError) as error:
-        if parts.builds:
-            raise
-        pytest.skip(f"no machine can have a network here: {error}")
-    made = _Shared(parts, network, lambda: tmp_path_factory.mktemp("machine"))
+    made = _Shared(parts, Network(), lambda: tmp_path_factory.mktemp("machine"))
     yield made
     made.cut()
 
