@@ -421,7 +421,6 @@ class Code(StrEnum):
     VIEWS_BEYOND_MODEL = "views.beyond_model"
     VIEWS_CONTRADICTED = "views.contradicted"
     VIEWS_FEW_CARRIERS = "views.few_carriers"
-    VIEWS_LITTLE_NOISE = "views.little_noise"
     VIEWS_OUT_OF_REACH = "views.out_of_reach"
     VIEWS_SLICES_SMALL = "views.slices_small"
     VIEWS_TOO_MANY = "views.too_many"

@@ -32,13 +32,13 @@ class Reached:
 
 
 @cache
-def _reached(scene: RaySum, model: str = "joint") -> Reached:
+def _reached(scene: RaySum) -> Reached:
     plane, true = scene.expose()
     fields = [
         scene.decoder(joint_views=joint).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
         for joint in (True, False)
     ]
-    assert [field.attributes["views_model"] for field in fields] == [model, "independent"]
+    assert [field.attributes["views_model"] for field in fields] == ["joint", "independent"]
     np.testing.assert_array_equal(fields[0].slices, fields[1].slices)
     truth = on_slices(true, fields[0].grid, fields[0].slices.shape[1:])
     mean = np.broadcast_to(np.nanmean(truth, axis=(0, 1)), truth.shape)
@@ -89,37 +89,23 @@ def test_two_thirds_of_errors_are_within_the_standard_error(scene: RaySum, least
 
 
 @pytest.mark.parametrize(
-    ("scene", "model"),
+    ("scene", "least"),
     [
-        (RaySum(finest=BAND, snr=500, shape=(220, 260), covers="apart"), "independent"),
-        pytest.param(RaySum(finest=BAND, snr=100, shape=(220, 260), covers="apart"), "joint", marks=pytest.mark.slow),
-        pytest.param(
-            RaySum(finest=BAND, snr=300, shape=(440, 520), covers="apart"), "independent", marks=pytest.mark.long
-        ),
-        pytest.param(RaySum(finest=BAND, snr=200, shape=(440, 520), covers="apart"), "joint", marks=pytest.mark.long),
-        pytest.param(RaySum(exponent=1.5, shape=(220, 260), covers="apart"), "joint", marks=pytest.mark.long),
-        pytest.param(RaySum(snr=1000, shape=(220, 260)), "joint", marks=pytest.mark.long),
+        (RaySum(finest=BAND, snr=300, shape=(220, 260), covers="apart", seed=1), 46.5),
+        pytest.param(RaySum(exponent=1.5, shape=(440, 520), covers="apart"), 47.5, marks=pytest.mark.long),
+        pytest.param(RaySum(finest=BAND, shape=(440, 520), covers="apart"), 56.0, marks=pytest.mark.long),
     ],
 )
-def test_the_views_of_a_clean_frame_are_of_the_better_model(scene: RaySum, model: str) -> None:
-    """Little noise alone doesn't say so: of a frame with folded detail the joint model is better without any noise."""
-    found = _reached(scene, model)
-    assert found.joint > found.quick - 0.1
+def test_a_frame_of_little_noise_is_decoded_at_least_as_well_as_by_inverting_it(scene: RaySum, least: float) -> None:
+    """With the model's error as large as a camera's that nobody measured: 41.4, 43.1 and 44.6 dB."""
+    found = _reached(scene)
+    assert found.joint > max(least, found.quick + 1), found
 
 
 @pytest.mark.long
 def test_detail_that_folds_in_from_beyond_the_band_does_not_spoil_the_views() -> None:
     found = _reached(RaySum(exponent=1.1))
     assert found.joint > max(found.quick + 4, found.mean + 4), found
-
-
-@pytest.mark.slow
-def test_a_frame_without_noise_or_folded_detail_is_inverted_as_before() -> None:
-    scene = RaySum(finest=BAND)
-    plane, true = scene.expose()
-    field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
-    assert field.attributes["views_model"] == "independent"
-    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 60
 
 
 @pytest.mark.long

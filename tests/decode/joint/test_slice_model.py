@@ -67,3 +67,19 @@ def test_detail_beyond_the_band_folds_into_the_slices_that_the_mask_sends_it_to(
         wanted += power * np.outer(one, one.conj())
     np.testing.assert_allclose(found, wanted, atol=2e-3)
     assert np.abs(wanted).max() > 0.1
+
+
+def test_what_a_wrong_aperture_leaves_in_the_means_is_told_from_parallax() -> None:
+    model, chance = _model("round", 0.95), np.random.default_rng(3)
+    f = np.hypot(np.fft.fftfreq(80)[:, None], np.fft.rfftfreq(96)[None])
+    scene = np.fft.irfft2(np.fft.rfft2(chance.normal(size=(80, 96))) / np.maximum(f, 1 / 96) ** 1.2, s=(80, 96))
+    scene = 0.35 * (1 + 0.2 * scene / scene.std())
+    away = 0.02 * np.array([0, *((-1) ** n for n in range(len(ORDERS) - 1))]) * TRANSFERS
+    parallax = 0.3 * TRANSFERS[:, None, None] * np.gradient(scene, axis=1)
+    parallax[0] = 0
+    right = model.common()[: len(ORDERS), None, None] * scene + parallax
+    for off in (np.zeros_like(away), away):
+        found, rms = model.unlike((right + off[:, None, None] * scene).astype(np.complex64))
+        assert np.abs(found - off).max() < 0.25 * np.abs(away).max()
+        assert rms < 0.005
+    assert model.unlike(np.zeros((len(ORDERS), 80, 96), np.complex64))[1] == 0

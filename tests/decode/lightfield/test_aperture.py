@@ -77,7 +77,7 @@ def test_views_through_a_round_stop_are_those_of_its_cells() -> None:
     assert lit.sum() == 21
 
     def error(aperture: Aperture, kappa: float) -> float:
-        made, _ = from_slices(
+        made = from_slices(
             slices,
             angular_frequencies(ORDERS, kappa, 0.01),
             TRANSFERS,

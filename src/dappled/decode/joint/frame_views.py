@@ -38,11 +38,6 @@ _MOST_VIEWS = 5  # along an axis: with more, the outer ones move by more than a 
 # Clipping bends the mask's waves, so that light gets into other orders: in clipped patches as much as in the mean of
 # the frame. Measured at half the ideal aperture, where weak orders decide: without it views lose up to 4.5 dB there.
 _ASTRAY = 1.0
-# Times the joint model's errors: where noise leaves less, inverting is better. Noise knows nothing of folded detail, so
-# a frame must be far cleaner where more than a few patches have any. `RaySum`'s frames in the band are better inverted
-# from 1.0 to 1.5 on, those with folded detail at no noise (0.3 to 1.3).
-_CLEANER, _CLEANER_FOLDED = 1.25, 0.2
-_SOME_IN_BAND = 0.04  # of the patches hardly have any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,22 +192,12 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
     """The views of slices.
 
     With `joint` views are made by the joint model, unless slices are smaller than a patch, there are more views than it
-    was measured with or fewer orders than views have, disparities are beyond the widest range, or noise, with folded
-    detail that looks like it, is so little that inverting leaves less than the model's own errors.
+    was measured with or fewer orders than views have, or disparities are beyond the widest range.
     """
-    alone, noise = from_slices(
-        taken.values,
-        taken.angular,
-        taken.transfers,
-        aperture=taken.aperture,
-        noise_variance=taken.noise_variance,
-        colours=taken.colours,
-    )
-    independent = FrameViews(alone, "independent", None)
     if not joint:
-        return independent
+        return _inverted(taken)
     if unfit := _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
-        return replace(independent, reason=unfit)
+        return _inverted(taken, reason=unfit)
     found = joint_views(
         taken.values,
         taken.model(),
@@ -228,15 +213,23 @@ def views_of(taken: TakenSlices, *, joint: bool, workers: int = 1) -> FrameViews
         px, views = FARTHEST * taken.samples_px[1], taken.aperture.views
         doubts = (finding(Code.VIEWS_OUT_OF_REACH, FRAME, share=shares.beyond, px=px, views=views),)
     if shares.beyond > _MOST_BEYOND:  # inverting supposes no range
-        return replace(
-            independent, findings=doubts, reason=finding(Code.VIEWS_BEYOND_MODEL, FRAME, share=shares.beyond)
-        )
-    cleaner = _CLEANER if shares.in_band > _SOME_IN_BAND else _CLEANER_FOLDED
-    if np.mean(noise) < cleaner**2 * np.mean(found.sigma**2):
-        return replace(independent, findings=doubts, reason=finding(Code.VIEWS_LITTLE_NOISE, FRAME))
+        return _inverted(taken, doubts, finding(Code.VIEWS_BEYOND_MODEL, FRAME, share=shares.beyond))
     if shares.contradict > _TOLD_CONTRADICTED:
         doubts += (finding(Code.VIEWS_CONTRADICTED, FRAME, share=shares.contradict),)
     return FrameViews(found.views, "joint", found.sigma, doubts, shares=shares)
+
+
+def _inverted(taken: TakenSlices, doubts: tuple[Finding, ...] = (), reason: Finding | None = None) -> FrameViews:
+    """The views of slices, each frequency alike."""
+    views = from_slices(
+        taken.values,
+        taken.angular,
+        taken.transfers,
+        aperture=taken.aperture,
+        noise_variance=taken.noise_variance,
+        colours=taken.colours,
+    )
+    return FrameViews(views, "independent", None, doubts, reason)
 
 
 def _unfit(orders: int, shape: tuple[int, int], views: int) -> Finding | None:

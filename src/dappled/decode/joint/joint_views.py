@@ -14,6 +14,7 @@ tells which patches have hardly any parallax, and the disparities of the others,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -59,6 +60,8 @@ _FEWEST = 12  # patches in a group
 # Of views whose patches a depth map tells their disparities; the rest are their first views. With all of it, views of
 # boards with hard edges gain 0.1 to 0.3 dB more, and those of boards that blend lose 0.4 dB instead of 0.2.
 _TRUST = np.float32(0.75)
+_UNLIKE = 1e-4  # of the light, times a transfer: what a slice's mean doesn't tell of a wrong aperture
+_ERROR = 5e-6  # of a slice's power: what no light field explains
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 # Of a patch's mean square difference to the views that it and its neighbours were joined to, of the model's variance of
 # what views have alone, and of all else of it, for each kind: 68 % of errors are within the root of the sum. Fitted by
@@ -114,9 +117,12 @@ def joint_views(
     pixels, `reach` the largest usual disparity in sensor columns over the aperture, `astray` (patches,) the share of
     a patch's light that gets into each slice but the first, whatever its transfer, row by row of `sigma`; None: none.
     """
-    patches, common = Patches((slices.shape[1], slices.shape[2]), SIDE), model.common()[: len(slices)]
+    patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
+    off, unlike = model.unlike(slices)
+    common = model.common()[: len(slices)] + off
     first, means = patches.less_means(patches.cut(slices[:1]), common[:1])
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach, workers=workers)
+    frame = replace(frame, unlike=math.hypot(unlike, _UNLIKE), error=_ERROR)
     group = _groups(first[0].real, patches)
     rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
     stray = np.zeros(len(means)) if astray is None else astray

@@ -75,9 +75,10 @@ _AT_REST = 5  # over one next to 0: slices tell no more of them
 # In reaches: disparities of what folds in from beyond the band.
 _FOLDED = {AT_REST: np.linspace(-STILL, STILL, 3), USUAL: np.linspace(-0.6, 0.6, 5)}
 _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate
-_ROUNDING = 1e-9  # of the strongest direction's power: far below `_ERROR`
-_ERROR = 5e-4  # of a slice's power: what no light field explains
-_MEAN_ERROR = 1e-3  # of a patch's mean: what a wrong aperture leaves in each slice
+_ROUNDING = 1e-9  # of the strongest direction's power: far below what is not explained
+_SINGLE = 5e-6  # of a covariance's diagonal: some fifty of single precision's last places, summed up
+_ERROR = 5e-4  # of a slice's power: what no light field explains, where nothing is measured
+_UNLIKE = 1e-3  # of the light, times a transfer: what a wrong aperture leaves in each slice, where nothing is measured
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,7 +123,8 @@ class FrameModel:
     `weights` (F,) of a frequency in likelihoods; `ranges` of disparities, by their place in `RANGES`; `folds` from
     beyond the band, at rest and in the usual range; `alone` (A, V·U), how the slices hold what each view has alone;
     `noise` (A,); `astray`, the share of the scene's light that gets into each slice but the first, whatever its
-    transfer."""
+    transfer, `unlike` the same, times its transfer, by a wrong aperture; `error`, the share of a slice's power that no
+    light field explains."""
 
     model: SliceModel
     frequencies: Floats
@@ -135,6 +137,8 @@ class FrameModel:
     alone: Complexes
     noise: Floats
     astray: float = 0.0
+    unlike: float = _UNLIKE
+    error: float = _ERROR
 
     @classmethod
     def of(
@@ -245,10 +249,10 @@ def rests_of(
     """What is not the band's own detail, of each kind of patch."""
     size = len(frame.noise)
     through = (np.abs(frame.ranges[USUAL].seen) ** 2).mean(axis=(1, 2, 3)) * own
-    own_noise = frame.noise + LEAST_NOISE + _ERROR * through[:, None]
-    means = frame.lowest * (mean * SIDE) ** 2
-    own_noise = own_noise + _MEAN_ERROR**2 * means[:, None] * np.abs(frame.model.transfers) ** 2
-    own_noise[:, 1:] += frame.astray**2 * (own + means)[:, None]
+    own_noise = frame.noise + LEAST_NOISE + frame.error * through[:, None]
+    light = own + frame.lowest * (mean * SIDE) ** 2
+    lost = frame.astray**2 + (frame.unlike * np.abs(frame.model.transfers[1:])) ** 2
+    own_noise[:, 1:] += light[:, None] * lost
     from_beyond = {
         number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size)
         for number, some in frame.folds.items()
@@ -288,7 +292,9 @@ def usual_nats(frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra
 def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
     """L⁻¹ (F, A, A) of covariances LLᴴ (F, A, A): what has a covariance is white behind it."""
     # In double precision: odds of hypotheses are exponentials of numbers in the thousands.
-    lower = np.linalg.cholesky(covariance.astype(np.complex128))
+    exact, diagonal = covariance.astype(np.complex128), range(covariance.shape[1])
+    exact[:, diagonal, diagonal] *= 1 + _SINGLE
+    lower = np.linalg.cholesky(exact)
     # Row by row for all F at once: faster than LU of each.
     found = np.zeros(lower.shape, dtype=np.complex128)
     for row in range(lower.shape[1]):

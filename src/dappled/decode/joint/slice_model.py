@@ -24,6 +24,8 @@ from dappled.decode.array_types import Complexes, Floats
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.optics import Order
 
+_WAVES = 2  # of the longest waves over a frame, those that a Hann window parts from its mean
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SliceModel:
@@ -59,6 +61,34 @@ class SliceModel:
     def common(self) -> NDArray[np.complex128]:
         """(A,) what each slice holds of a scene without texture, over what slice (0, 0) holds."""
         return np.asarray(self.transfers * self.aperture.transform(self.angular))
+
+    def unlike(self, slices: Complexes) -> tuple[NDArray[np.complex128], float]:
+        """By what share of the scene's light slices (K, h, w), the half plane's, are brighter than `common` says, (K,),
+        and the rms error of that, over the transfers.
+
+        A wrong aperture does so, to all of the frame alike: by the means. Over the transfers what it leaves is real, as
+        a stop has no direction; of parallax only what grows with its square is. That is told by the longest waves of
+        the frame.
+        """
+        transfers = self.transfers[: len(slices)]
+        along = np.arange(-_WAVES, _WAVES + 1)
+        down, across = (
+            np.exp(-2j * np.pi * np.outer(along, np.arange(side) / side)) * np.hanning(side + 2)[1:-1]
+            for side in slices.shape[1:]
+        )
+        waves = down @ (slices / transfers[:, None, None]).real @ across.T
+        mean = float(waves[0, _WAVES, _WAVES].real)
+        if not mean > 0:
+            return np.zeros(len(slices), dtype=np.complex128), 0.0
+        common = self.aperture.transform(self.angular[: len(slices)]).real
+        beside = (waves - common[:, None, None] * waves[0]) / mean
+        longest = np.maximum(np.abs(along)[:, None], np.abs(along)) == _WAVES
+        means, weights = beside[:, _WAVES, _WAVES].real, np.abs(transfers) ** 2
+        weights[0] = 0
+        power = weights @ means**2
+        around = float(weights @ (np.abs(beside[:, longest]) ** 2).mean(axis=1))
+        share = max(0.0, 1 - around / power) if power else 0.0
+        return share * means * transfers, float(np.sqrt(share * around / weights.sum()))
 
     def alone(self) -> Complexes:
         """(A, V·U) what the slices hold of a view that has detail which no other view has, of unit spectrum."""

@@ -125,33 +125,25 @@ def from_slices(
     noise_variance: float,
     model_error: float | None = None,
     colours: bool = False,
-) -> tuple[Views, NDArray[np.float64]]:
-    """(views float32 (V, U, h, w), variance float64 (V, U) that the noise leaves in them) of a masked frame.
+) -> Views:
+    """Views float32 (V, U, h, w) of a masked frame.
 
     `slices` complex64 (K, h, w) with DC first and no carrier together with its conjugate; `angular` (K, 2) their
     angular frequencies, `transfers` (K,) their T_k (T_0 = 1); `noise_variance` of a slice pixel; `model_error` the
     relative error of what all views share, in a coefficient (None: what the frame's end rings). With `colours` the
     frame was a colour mosaic: the chroma in a band is estimated from its finest detail and counts as noise; where the
-    orders carry no information, the views are the image that they share. The variance is of white noise and chroma, and
-    of what a view lacks of its own.
+    orders carry no information, the views are the image that they share.
     """
     if model_error is None:
         model_error = _MODEL_ERROR / math.sqrt(min(slices.shape[1:]))
     # What all views share comes through a carrier with the aperture's transform of it, and its error with that.
     shared = np.abs(transfers * aperture.transform(angular)) ** 2 * float(np.mean(slices[0].real ** 2))
     noise = noise_variance + model_error**2 * shared * np.any(angular != 0, axis=1)
-    white = np.full(len(slices), noise_variance)
     if colours:
-        white += chroma_noise(slices, transfers * aperture.transform(angular))
-    noise += white - noise_variance
+        noise += chroma_noise(slices, transfers * aperture.transform(angular))
     alone = view_variance(slices, angular, transfers, aperture, noise)
     coefficients = unmixing(angular, transfers, aperture, noise_variance=noise, view_variance=alone)
-    n = aperture.views
-    whole = np.where(np.any(angular != 0, axis=1), 0.5, 1.0)  # a complex slice's noise is half real
-    variance = np.abs(coefficients) ** 2 @ (whole * white)
-    through = (coefficients @ (transfers[:, None] * aperture.cells(angular))).real  # what view v takes of view w
-    variance += alone * ((np.eye(n * n) - through) ** 2).sum(axis=1)
-    return combine(coefficients, slices).reshape(n, n, *slices.shape[1:]), variance.reshape(n, n)
+    return combine(coefficients, slices).reshape(aperture.views, aperture.views, *slices.shape[1:])
 
 
 def from_lenslet_slices(
