@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -17,6 +17,7 @@ from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, fram
 from dappled.clock import RecordedClock
 from dappled.daemon.health import systemd
 from dappled.daemon.pipeline.capture import PendingShot
+from dappled.daemon.service import Service
 from dappled.drivers.camera import BodyState, StateChanged
 from dappled.findings import Code, Finding, Subject, finding
 from tests.daemon.health.test_metrics import HEALTH
@@ -80,7 +81,7 @@ def test_a_finding_is_said_once_each_time_it_begins() -> None:
             lines.append(text)
 
     remarks = ProblemRemarks(
-        Daemon(),
+        cast(Service, Daemon()),
         Manager(),
         say=lambda text, *_, **__: said.append(text),
         clock=clock,

@@ -20,8 +20,9 @@ from functools import partial
 from typing import ClassVar
 
 from dappled.mocks.body import body, ptp
+from dappled.mocks.body.eos450d import Eos450d
 from dappled.mocks.body.faults import BodyFaults
-from dappled.mocks.body.ptpip import Transactions, exactly
+from dappled.mocks.body.ptpip import exactly
 from dappled.workers import Loop
 
 BUS_ID = "1-1"
@@ -80,7 +81,7 @@ class _Overflow:
 class UsbIpResponder:
     """Serves one body at `BUS_ID`; `close` ends all its threads. One host at a time has it."""
 
-    def __init__(self, body: Transactions, faults: BodyFaults, address: tuple[str, int] = ("127.0.0.1", 0)) -> None:
+    def __init__(self, body: Eos450d, faults: BodyFaults, address: tuple[str, int] = ("127.0.0.1", 0)) -> None:
         self._body = body
         self._faults = faults
         faults.drop = self.drop
@@ -155,7 +156,7 @@ def _described() -> bytes:
 class _Bus:
     """The transfers between one host and the body."""
 
-    def __init__(self, link: socket.socket, body: Transactions, faults: BodyFaults, closed: threading.Event) -> None:
+    def __init__(self, link: socket.socket, body: Eos450d, faults: BodyFaults, closed: threading.Event) -> None:
         self._link, self._body, self._faults, self._closed = link, body, faults, closed
         self._gone = threading.Event()
         self._lock = threading.Lock()  # guards all that follows, and the order on the link

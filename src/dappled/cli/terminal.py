@@ -15,7 +15,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from dappled import codec
 from dappled.clock import Clock, SystemClock
@@ -29,6 +29,9 @@ from dappled.errors import counted
 from dappled.findings import text, told
 from dappled.shown import say
 from dappled.workers import Loop, Worker
+
+if TYPE_CHECKING:
+    from dappled.daemon.service import Service
 
 log = logging.getLogger("dappled.run")
 _PROBLEMS_EVERY_NS = 10**9
@@ -164,13 +167,6 @@ class RunObserver(Observer):
         self._camera.changed(change)
 
 
-class HealthSource(Protocol):
-    """A daemon that has a health record."""
-
-    def health(self) -> Mapping[str, Any]:
-        """The record as it is published."""
-
-
 class StatusLine(Protocol):
     """A service manager that shows one line."""
 
@@ -183,7 +179,7 @@ class ProblemRemarks:
 
     def __init__(
         self,
-        daemon: HealthSource,
+        daemon: Service,
         manager: StatusLine,
         *,
         say: Say = remark,

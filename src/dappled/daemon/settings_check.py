@@ -14,6 +14,7 @@ from pathlib import Path
 from dappled.config import profiles
 from dappled.config.schema import BadSetting, ConfigError, refuse
 from dappled.config.settings import Settings, SettingsFile
+from dappled.daemon.configured_links import key_files
 from dappled.daemon.console import placement
 from dappled.daemon.console import process as console_process
 from dappled.daemon.stream import curve, sockets
@@ -145,13 +146,8 @@ def _trigger(settings: Settings) -> None:
 
 
 def _link_keys(settings: Settings) -> None:
-    keys, links = settings.mavlink.keys, len(settings.mavlink.url)
-    if len(keys) not in (0, 1, links):
-        raise ConfigError(
-            f'mavlink.keys names {len(keys)} files for {links} links; name one for each link ("" for none), or one'
-        )
-    for key in filter(None, keys):
-        read_key(Path(key))
+    for key in filter(None, key_files(settings)):
+        read_key(key)
 
 
 def _nearest(folder: Path) -> Path:

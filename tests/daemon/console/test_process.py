@@ -22,6 +22,7 @@ from dappled.clock import SystemClock
 from dappled.config.settings import ConsoleSettings, PublishSettings, Settings
 from dappled.daemon.console import process
 from dappled.daemon.console.process import Console
+from dappled.daemon.console.requests import ConsoleRequests
 from dappled.drivers.child_process import RestartBudget
 from dappled.errors import DappledError
 from tests.waiting import eventually
@@ -100,11 +101,11 @@ def running(console: Console) -> subprocess.Popen[bytes] | None:
     return console.process
 
 
-class Handler:
+class Handler(ConsoleRequests):
     """Answers by a function of the test."""
 
     def __init__(self, act: Callable[[Mapping[str, Any]], Mapping[str, Any]]) -> None:
-        self.answer = act
+        self.answer = act  # type: ignore[method-assign, assignment]  # this test's
 
 
 def test_a_console_that_dies_is_started_again_and_the_socket_stays(tmp_path: Path) -> None:

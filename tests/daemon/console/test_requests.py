@@ -12,9 +12,11 @@ import pytest
 
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.camera_protocol.parameters import Parameters
+from dappled.daemon.console.live_view import CameraLook
 from dappled.daemon.console.requests import DEADLINE_MS, HEARD_MS, ConsoleRequests, token
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.shutter import IntervalEnd, Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.drivers.camera import PlainCamera, Setting, SettingName
 from tests.daemon.fakes import FakeSink, Rig, rig
 
@@ -35,7 +37,7 @@ def asked(shutter: Shutter) -> ConsoleRequests:
     )
 
 
-class NoSeries:
+class NoSeries(DistanceTrigger):
     """Photographs by distance. `ran`: what a stop finds."""
 
     def __init__(self, ran: IntervalEnd = "none ran") -> None:
@@ -46,8 +48,11 @@ class NoSeries:
         return self.ran
 
 
-class NoLook:
+class NoLook(CameraLook):
     """A camera without live view."""
+
+    def __init__(self) -> None:
+        pass
 
     def answer(self) -> dict[str, Any]:
         return {"ok": False, "error": "none"}

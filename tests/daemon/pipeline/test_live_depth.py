@@ -14,7 +14,7 @@ from dappled import codec
 from dappled.clock import RecordedClock
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
-from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcessError, FrameDepth
+from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess, DecodeProcessError, FrameDepth
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.tagging import FrameSettings as Shown
@@ -76,7 +76,7 @@ class Bench:
         self.published: list[tuple[str, dict[str, Any], Any]] = []
         self.nearest: list[tuple[float, float]] = []
         self.depth = LiveDepth(
-            self.maker,
+            cast(DecodeProcess, self.maker),
             cast(FlightWriter, self),
             PendingShots(FakeCamera()),
             cast(Publisher, self),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from PIL import Image
 
 from dappled.clock import RecordedClock
 from dappled.daemon.stream import watch, wire
+from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.watch import Watched
 from dappled.daemon.stream.wire import Message
 
@@ -56,7 +58,7 @@ def watched(script: Script, **options: float) -> tuple[Watched, list[str], list[
     heard: list[str] = []
     new: list[int] = []
     seen = watch.watch(
-        script,
+        cast(Subscriber, script),
         received=lambda message: heard.append(message.topic),
         new_frame=lambda message: new.append(message.header["frame"]),
         clock=script.clock,

@@ -177,7 +177,7 @@ def test_what_cant_be_compared_is_a_sentence_and_2(
     one = written(tmp_path / "a.tif", np.full((4, 4), 200.0), grid=MapGrid(GRID.crs, *_of(GRID), (4, 4)))
     other = written(tmp_path / "b.tif", np.full((4, 4), 200.0), grid=grid)
     assert main(["terrain", "volume", one, other]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+    _usage, line = capsys.readouterr().err.splitlines()
     assert line.startswith("dappled terrain volume: ")
     assert said in line
 
@@ -202,5 +202,5 @@ def test_what_is_no_raster_of_heights_is_a_sentence_and_2(tmp_path: Path, capsys
         ([good, written(tmp_path / "tag.tif", cone(), 0.1, {"DAPPLED_LEVEL_SIGMA_M": "nan"})], "its tag"),
     ):
         assert main(["terrain", "volume", *words]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
+        _usage, line = capsys.readouterr().err.splitlines()
         assert said in line

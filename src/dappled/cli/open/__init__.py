@@ -13,7 +13,7 @@ from dappled.cli import paths
 from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report, Verb, argument, flag, option
 from dappled.config.settings import LAW_NAMES, ConsoleSettings
-from dappled.errors import DappledError, counted
+from dappled.errors import CallError, counted
 from dappled.workers import Loop
 
 if not words_only:
@@ -100,7 +100,7 @@ def _source(
             stack.callback(decoder.close)
         source = FlightFrames(folder, found.record, decoder, maker)
         if not source.frames():
-            raise DappledError(f"{path} holds no tagged frames: `dappled flight show` says what became of its shots")
+            raise CallError(f"{path} holds no tagged frames: `dappled flight show` says what became of its shots")
         return source, recipe, Mounting.of(layout.read_facts(folder)).mount
     field = found.light_field.field if isinstance(found, opened.OpenedFrame) else found.field
     size = path.stat().st_size if path.is_file() else sum(one.stat().st_size for one in path.rglob("*"))

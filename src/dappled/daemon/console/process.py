@@ -84,13 +84,6 @@ def url(listener: socket.socket) -> str:
     return f"http://{host}:{port}/"
 
 
-class RequestHandler(Protocol):
-    """Answers what the console asks of the daemon: `ConsoleRequests`."""
-
-    def answer(self, request: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Do what is asked; the answer goes to the page, bytes as "picture" too."""
-
-
 class Console(SupervisedProcess):
     """Keeps the console's process running, and answers its requests by `handler`.
 
@@ -102,7 +95,7 @@ class Console(SupervisedProcess):
         self,
         listener: socket.socket,
         setup: Mapping[str, Any],
-        handler: RequestHandler,
+        handler: ConsoleRequests,
         clock: Clock,
         budget: RestartBudget | None = None,
     ) -> None:
@@ -128,7 +121,7 @@ class _PageRequests:
     """The daemon's side of the console: sends `setup`, and answers its requests one by one."""
 
     setup: Mapping[str, Any]
-    handler: RequestHandler
+    handler: ConsoleRequests
 
     def begun(self, channel: ProcessChannel) -> None:
         """The process was started, the first time or again."""

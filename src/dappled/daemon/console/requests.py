@@ -13,9 +13,11 @@ from collections.abc import Mapping
 from typing import Any, Protocol
 
 from dappled.clock import Clock
+from dappled.daemon.console.live_view import CameraLook
 from dappled.daemon.health.logbook import Logbook
 from dappled.daemon.pipeline.repeats import CaptureRequest
-from dappled.daemon.pipeline.shutter import IntervalEnd, ShotDecision, Shutter
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.drivers.camera import CameraError
 
 DEADLINE_MS = 2000  # from the press to the daemon
@@ -36,20 +38,6 @@ class Settable(Protocol):
         """Ask for another value. Whether it is set already; else the body will report it. Raises CameraError."""
 
 
-class Series(Protocol):
-    """Photographs by distance: `pipeline.spacing.DistanceTrigger`."""
-
-    def end(self, *, asked_ns: int | None = None) -> IntervalEnd:
-        """End them; one that began after `asked_ns` goes on."""
-
-
-class LiveAnswers(Protocol):
-    """What shows a page the camera's live view: `live_view.CameraLook`."""
-
-    def answer(self) -> dict[str, Any]:
-        """A picture, or why there is none."""
-
-
 class ConsoleRequests:
     """Answers the console's questions. One thread asks."""
 
@@ -57,10 +45,10 @@ class ConsoleRequests:
         self,
         shutter: Shutter,
         parameters: Settable,
-        look: LiveAnswers,
+        look: CameraLook,
         logbook: Logbook,
         *,
-        series: Series,
+        series: DistanceTrigger,
         clock: Clock,
     ) -> None:
         self.run = secrets.token_hex(4)

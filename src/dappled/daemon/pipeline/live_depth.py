@@ -3,26 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol
 
 from dappled import codec
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
-from dappled.daemon.pipeline.decode_process import FrameDepth
+from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
 from dappled.workers import OneThread, Worker
-
-
-class DepthMaker(Protocol):
-    """Estimates the depth of a recorded frame: `DecodeProcess`."""
-
-    def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
-        """Raises DecodeProcessError."""
-
-    def close(self) -> None:
-        """End, also in the middle of a frame."""
 
 
 class LiveDepth(OneThread):
@@ -34,7 +23,7 @@ class LiveDepth(OneThread):
 
     def __init__(
         self,
-        maker: DepthMaker,
+        maker: DecodeProcess,
         writer: FlightWriter,
         shots: PendingShots,
         publisher: Stream,

@@ -208,7 +208,7 @@ class Relay:
         viewer.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, _USER_TIMEOUT_MS)
         self._number += 1
         one = ViewerConnection(self._number, viewer, path, address, self._clock.monotonic_ns())
-        if self._is_full(one.network):
+        if self._is_over(one.network, 1):
             self._refused[address, Code.PEER_TOO_MANY] += 1
             viewer.close()
             return
@@ -217,10 +217,6 @@ class Relay:
         opening = [each for other in self._kept.values() if (each := other.opening) is not None]
         if (victim := admission.surplus(opening, self._limits)) is not None:
             self._close(self._kept[victim.number], Code.PEER_DISPLACED)
-
-    def _is_full(self, network: str) -> bool:
-        networks = [one.network for one in self._kept.values() if one.opening is None]
-        return len(networks) >= self._limits.open or networks.count(network) >= self._limits.open_per_address
 
     def _serve(self, one: ViewerConnection) -> None:
         try:
@@ -244,7 +240,7 @@ class Relay:
             self._close(one, Code.PEER_SAYS_TOO_MUCH)
         elif inward.ended or (outward.ended and not outward.waiting):
             self._close(one, None if one.handshake.complete else Code.PEER_HANDSHAKE_FAILED)
-        elif one.handshake.complete and not was_open and self._is_over(one.network):
+        elif one.handshake.complete and not was_open and self._is_over(one.network, 0):
             self._close(one, Code.PEER_TOO_MANY)
         else:
             self._await(one, inward, outward)
@@ -253,9 +249,11 @@ class Relay:
         age_s = (self._clock.monotonic_ns() - one.began_ns) / 1e9
         return inward.read_bytes > self._limits.said_bytes + self._limits.said_b_s * age_s
 
-    def _is_over(self, network: str) -> bool:
+    def _is_over(self, network: str, more: int) -> bool:
+        """Whether so many more open connections, and of a network, are too many."""
         networks = [one.network for one in self._kept.values() if one.opening is None]
-        return len(networks) > self._limits.open or networks.count(network) > self._limits.open_per_address
+        limits = self._limits
+        return len(networks) + more > limits.open or networks.count(network) + more > limits.open_per_address
 
     def _await(self, one: ViewerConnection, inward: Flow, outward: Flow) -> None:
         for sock, reads, writes in ((inward.source, inward, outward), (outward.source, outward, inward)):

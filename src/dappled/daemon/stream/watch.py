@@ -6,27 +6,16 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from PIL import Image
 
 from dappled.clock import Clock
+from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import Message
 from dappled.decode.lightfield.light_field import slice_mosaic
 
 _LOOK_S = 0.5
-
-
-class StreamView(Protocol):
-    """The part of `Subscriber` that `watch` uses."""
-
-    @property
-    def waiting_for(self) -> int:
-        """How many answers are outstanding."""
-
-    def receive(self, timeout_s: float) -> Message | None:
-        """The next message; None when there was none for that long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +34,7 @@ class Watched:
 
 
 def watch(
-    stream: StreamView,
+    stream: Subscriber,
     *,
     received: Callable[[Message], None],
     new_frame: Callable[[Message], None],

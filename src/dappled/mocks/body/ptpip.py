@@ -10,30 +10,19 @@ import os
 import socket
 import threading
 from functools import partial
-from typing import Protocol
 
 from dappled.mocks.body import ptp
-from dappled.mocks.body.eos450d import MODEL
+from dappled.mocks.body.eos450d import MODEL, Eos450d
 from dappled.mocks.body.faults import BodyFaults
-from dappled.mocks.body.ptp import PtpPacket, PtpResponse
+from dappled.mocks.body.ptp import PtpPacket
 from dappled.workers import Loop
-
-
-class Transactions(Protocol):
-    """What a responder needs of a body."""
-
-    def answer(self, request: ptp.PtpRequest, data: bytes) -> PtpResponse:
-        """The answer to one transaction."""
-
-    def disconnected(self) -> None:
-        """The link is gone."""
 
 
 class Responder:
     """Serves a body on ports of its own choosing; `close` ends all its threads. The body answers at the first of its
     `addresses`, the others refuse; `move` takes it to the next one."""
 
-    def __init__(self, body: Transactions, faults: BodyFaults, host: str = "127.0.0.1", addresses: int = 1) -> None:
+    def __init__(self, body: Eos450d, faults: BodyFaults, host: str = "127.0.0.1", addresses: int = 1) -> None:
         self._body = body
         self._faults = faults
         faults.drop = self.drop

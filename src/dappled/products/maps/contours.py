@@ -13,9 +13,10 @@ from scipy import ndimage
 
 from dappled import durable
 from dappled.decode.array_types import Floats
+from dappled.errors import CallError
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, geojson_line
-from dappled.products.maps.heights import HeightRaster, HeightsError
+from dappled.products.maps.heights import HeightRaster
 
 MOST_HEIGHTS = 5000
 _HEIGHTS = 20.0  # over the relief, where no interval is asked for
@@ -58,17 +59,15 @@ def smoothed(raster: HeightRaster, reach_m: float) -> Floats:
 def of(raster: HeightRaster, interval_m: float, *, smooth_m: float = 0.0) -> list[Contour]:
     """The lines at whole multiples of an interval, through the cells' centres; they end where heights are unknown.
 
-    Raises HeightsError where there would be too many.
+    Raises CallError where there would be too many.
     """
     heights = smoothed(raster, smooth_m) if smooth_m else raster.height_m.astype(np.float64)
     first = math.ceil(float(np.nanmin(heights)) / interval_m)
     last = math.floor(float(np.nanmax(heights)) / interval_m)
     if last - first >= MOST_HEIGHTS:
-        raise HeightsError(
-            f"{raster.name} has {last - first + 1} heights {interval_m:g} m apart: give a larger interval"
-        )
+        raise CallError(f"{raster.name} has {last - first + 1} heights {interval_m:g} m apart: give a larger interval")
     if min(heights.shape) < 2:
-        raise HeightsError(f"{raster.name} has one row or column of heights, which shows no lines")
+        raise CallError(f"{raster.name} has one row or column of heights, which shows no lines")
     x, y = raster.grid.axes()
     generator = need("contourpy").contour_generator(x, y, heights, line_type="Separate")
     return [

@@ -11,19 +11,13 @@ import numpy as np
 
 from dappled.bounds import claims
 from dappled.decode.array_types import Singles
-from dappled.errors import DappledError, first_line
+from dappled.errors import CallError, first_line
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.rasters import open_raster
 
 _SIGMA = "sigma of a height"  # as the name of the band begins
-
-
-class HeightsError(DappledError):
-    """Rasters of heights can't be used, or not together; one sentence."""
-
-    exit_code = 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -46,18 +40,18 @@ class HeightRaster:
 def read(path: Path) -> HeightRaster:
     """Read the heights of a file, or those that `georeference --as terrain` wrote into a flight's folder.
 
-    Raises HeightsError where they can't be read, or don't lie north-up on a projection in metres.
+    Raises CallError where they can't be read, or don't lie north-up on a projection in metres.
     """
     file = path / "maps" / "terrain.tif" if path.is_dir() else path
     if not file.is_file():
-        raise HeightsError(f"{path} has no maps/terrain.tif: make it with dappled georeference {path} --as terrain")
+        raise CallError(f"{path} has no maps/terrain.tif: make it with dappled georeference {path} --as terrain")
     try:
         with open_raster(file) as source:
             return _read(source, file)
-    except HeightsError:
+    except CallError:
         raise
     except Exception as error:  # GDAL and PROJ raise anything
-        raise HeightsError(f"the heights {file} can't be read: {first_line(error)}") from error
+        raise CallError(f"the heights {file} can't be read: {first_line(error)}") from error
 
 
 def resampled(values: Singles, source: MapGrid, target: MapGrid) -> Singles:
@@ -82,11 +76,11 @@ def _read(source: Any, file: Path) -> HeightRaster:
     """The heights of an open dataset. Raises DappledError, ClaimError and what GDAL raises."""
     turn = source.transform
     if source.crs is None or turn.is_identity:
-        raise HeightsError(f"{file} has no coordinates: give heights with a coordinate system")
+        raise CallError(f"{file} has no coordinates: give heights with a coordinate system")
     if turn.b or turn.d or turn.a <= 0 or turn.e >= 0:
-        raise HeightsError(f"{file} does not lie north-up on its map: gdalwarp makes it so")
+        raise CallError(f"{file} does not lie north-up on its map: gdalwarp makes it so")
     if source.dtypes[0] == "uint8":
-        raise HeightsError(f"{file} is a picture: give heights, as georeference --as terrain makes them")
+        raise CallError(f"{file} is a picture: give heights, as georeference --as terrain makes them")
     rows, columns = source.shape
     claims.check_size(8 * rows * columns, file.stat().st_size, f"{rows} × {columns} heights")
     projection = Projection(source.crs.to_string())
@@ -98,7 +92,7 @@ def _read(source: Any, file: Path) -> HeightRaster:
     named = [number for number, name in enumerate(source.descriptions, 1) if (name or "").startswith(_SIGMA)]
     height = band(1)
     if not np.isfinite(height).any():
-        raise HeightsError(f"{file} holds no known height")
+        raise CallError(f"{file} holds no known height")
     return HeightRaster(
         str(file),
         MapGrid(projection.name, turn.c, turn.f, turn.a, -turn.e, (rows, columns)),

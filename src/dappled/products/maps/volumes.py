@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.geometry.area import PlannedArea
-from dappled.products.maps.heights import HeightRaster, HeightsError, resampled
+from dappled.errors import CallError
+from dappled.products.maps.heights import HeightRaster, resampled
 from dappled.products.maps.map_grid import MapGrid
 
 SURE_SIGMAS = 2.0  # a cell that changed by more has surely changed
@@ -95,10 +96,10 @@ def between(
     """The volumes between two rasters of one projection, on the first's grid, in an area or where either knows heights.
 
     `stable` is ground that has not changed: the median of its changes is taken off. `sigma_m` holds where a raster has
-    no σ of its own, `correlated_m` in place of what the rasters say. Raises HeightsError.
+    no σ of its own, `correlated_m` in place of what the rasters say. Raises CallError.
     """
     if before.projection.crs != after.projection.crs:
-        raise HeightsError(
+        raise CallError(
             f"{before.name} lies on {before.projection.name} and {after.name} on {after.projection.name}: "
             "make both with one --crs"
         )
@@ -145,7 +146,7 @@ def _compared(
     sigma_m: float | None,
     correlated_m: float | None,
 ) -> _Compared:
-    """The change in an area, or everywhere. Raises HeightsError where no height is known to both."""
+    """The change in an area, or everywhere. Raises CallError where no height is known to both."""
     grid = before.grid if area is None else _grid_over(before, area)
     first, second = (resampled(one.height_m, one.grid, grid) for one in (before, after))
     wanted = np.isfinite(first) | np.isfinite(second)
@@ -155,7 +156,7 @@ def _compared(
     known = wanted & np.isfinite(change)
     if not known.any():
         where = "" if area is None else f" in {area.name}"
-        raise HeightsError(f"{before.name} and {after.name} share no known height{where}: they need common ground")
+        raise CallError(f"{before.name} and {after.name} share no known height{where}: they need common ground")
     first_sigma, second_sigma = (_sigma(one, grid, known, sigma_m) for one in (before, after))
     sigmas = None if first_sigma is None or second_sigma is None else (first_sigma, second_sigma)
     cell = grid.step_x * grid.step_y
@@ -171,17 +172,17 @@ def _compared(
 
 
 def _grid_over(before: HeightRaster, area: PlannedArea) -> MapGrid:
-    """The raster's grid, cut or widened to an area. Raises HeightsError where the area lies elsewhere."""
+    """The raster's grid, cut or widened to an area. Raises CallError where the area lies elsewhere."""
     grid = before.grid
     corners = np.concatenate(area.on_map(before.projection))
     (west, south), (east, north) = corners.min(axis=0), corners.max(axis=0)
     box = grid.bounds
     if not (west < box[2] and box[0] < east and south < box[3] and box[1] < north):  # also where one is not finite
-        raise HeightsError(f"{area.name} lies elsewhere than {before.name}")
+        raise CallError(f"{area.name} lies elsewhere than {before.name}")
     left, right = math.floor((west - grid.west) / grid.step_x), math.ceil((east - grid.west) / grid.step_x)
     top, bottom = math.floor((grid.north - north) / grid.step_y), math.ceil((grid.north - south) / grid.step_y)
     if (right - left) * (bottom - top) > _MOST_CELLS:
-        raise HeightsError(f"{area.name} has {bottom - top} × {right - left} cells: draw a smaller area")
+        raise CallError(f"{area.name} has {bottom - top} × {right - left} cells: draw a smaller area")
     return grid.part(slice(top, bottom), slice(left, right))
 
 
@@ -199,7 +200,7 @@ def _level(still: _Compared, stable: PlannedArea) -> tuple[float, float]:
     """(median change of ground that has not changed, its σ by what it scatters, or by σ of its heights if larger)."""
     values = still.change_m[still.known]
     if len(values) < _LEAST_STABLE:
-        raise HeightsError(f"{stable.name} has {len(values)} known cells: stable ground needs {_LEAST_STABLE} or more")
+        raise CallError(f"{stable.name} has {len(values)} known cells: stable ground needs {_LEAST_STABLE} or more")
     middle = float(np.median(values))
     scatter = _NORMAL * float(np.median(np.abs(values - middle)))
     alike = min(1.0, math.sqrt(max(still.patches) / len(values)))
