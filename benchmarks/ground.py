@@ -25,6 +25,7 @@ import numpy as np
 from growth import CAMERA, F_NUMBER, MASK, fly, run
 from limits import show
 from PIL import Image
+from tests.simulated.profiles import raw_table
 
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.masked_camera import reference_camera
@@ -42,10 +43,7 @@ def prepared(folder: Path, scale: float) -> tuple[Path, Path, tuple[int, int]]:
     height, width = camera.sensor.shape
     shipped = resources.files("dappled.config").joinpath("profiles", "cameras", f"{CAMERA}.toml").read_text("utf-8")
     (folder / "camera.toml").write_text(
-        f'{shipped}\n[[raw]]\nname = "measured"\nshape = [{height}, {width}]\n'
-        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
-        if f"[{height}, {width}]" not in shipped
-        else shipped,
+        shipped if f"[{height}, {width}]" in shipped else f"{shipped}\n{raw_table(height, width)}",
         encoding="utf-8",
     )
     return fly(folder, 1, exposure.file), white, (height, width)

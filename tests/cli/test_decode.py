@@ -14,6 +14,7 @@ from dappled.mocks.scene.dng import Exif, encode
 from dappled.mocks.scene.lens import Installation
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products.exports import light_files
+from tests.simulated.profiles import profile
 
 MASK = "reference-5x5"
 
@@ -25,10 +26,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     camera = reference_camera(6, scale=0.25, scene="bench")  # its mask sits where the aperture is the ideal one
     (folder / "stopped.dng").write_bytes(camera.expose(0.0, 0, f_number=59.2).file)
     (folder / "open.dng").write_bytes(camera.expose(0.0, 1).file)
-    (folder / "quarter.toml").write_text(
-        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
-        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
-    )
+    (folder / "quarter.toml").write_text(profile(694, 922))
     return folder / "stopped.dng"
 
 

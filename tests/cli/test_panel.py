@@ -16,6 +16,7 @@ from dappled.config import profiles
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.ray_camera import REAL_COLOURS, RayCamera
 from dappled.mocks.scene.sharp_boards import SharpBoard
+from tests.simulated.profiles import profile
 
 BLACK, WHITE = 1024, 15000
 SEEN = (0.6, 0.8, 0.4)  # of a white's light at 1/100 s, f/8 and ISO 100: what red, green and blue give
@@ -39,10 +40,7 @@ def frame(folder: Path, name: str, scene: np.ndarray, *, exposure_s: float = 1e-
 
 def written(path: Path, raw: np.ndarray, exif: dng.Exif) -> Path:
     path.write_bytes(dng.encode(raw, black=BLACK, white=WHITE, exif=exif, mono=False))
-    path.with_name("small.toml").write_text(
-        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "small"\nshape = [160, 240]\n'
-        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
-    )
+    path.with_name("small.toml").write_text(profile(160, 240))
     return path
 
 

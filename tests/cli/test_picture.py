@@ -16,6 +16,7 @@ from PIL import Image
 from dappled.cli import main
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.products.geotags import exif_gps
+from tests.simulated.profiles import profile
 
 
 @pytest.fixture(scope="module")
@@ -24,10 +25,7 @@ def frame(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("frames")
     data = reference_camera(6, scale=0.25, scene="bench").expose(0.0, 0, f_number=22.0).file
     (folder / "frame.dng").write_bytes(exif_gps.tagged(data, exif_gps.Place(-33.5, 151.25, 120.0)))
-    (folder / "quarter.toml").write_text(
-        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
-        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
-    )
+    (folder / "quarter.toml").write_text(profile(694, 922))
     return folder / "frame.dng"
 
 

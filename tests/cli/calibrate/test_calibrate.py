@@ -18,6 +18,7 @@ from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.findings import Code
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from dappled.products.exports import light_files
+from tests.simulated import profiles
 
 MASK = "reference-5x5"
 LENGTHS = (35.0, 50.0, 80.0)
@@ -34,10 +35,7 @@ def _zoom(seed: int, length_mm: float, law: str = "geometric") -> MaskedCamera:
 @pytest.fixture(scope="module")
 def profile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("profile") / "quarter.toml"
-    path.write_text(
-        'law = "geometric"\nmask_distance_mm = 0.48\n[[raw]]\nname = "a quarter"\nshape = [694, 922]\n'
-        "row_mm = [0.01, 0.0]\ncolumn_mm = [0.0, 0.01]\n"
-    )
+    path.write_text(profiles.profile(694, 922))
     return path
 
 
