@@ -79,7 +79,7 @@ class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
                 lists.append(partial(_lists, placed=placed, jobs=planned))
             except DappledError as error:  # go on with the other flights
                 refused += 1
-                output.warn(str(error) if str(flight) in str(error) else f"{flight}: {error}")
+                output.warn(f"{flight.name}: {error}")
         if refused and not jobs:
             return Report(failed=True)
         bad = 0

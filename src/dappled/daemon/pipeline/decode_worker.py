@@ -74,8 +74,10 @@ class DecodeWorker:
             if body["do"] == "depth":
                 return _depth(self._decided or self._darkroom, body)
             return self._decode(self._darkroom, body)
+        except MemoryError:
+            return {"error": "there is not enough memory for it"}, ()
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
-            return {"error": _naming(body.get("path"), error)}, ()
+            return {"error": sentence(error)}, ()
 
     def _decode(self, configured: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         path, index = asked["path"], asked["index"]
@@ -304,12 +306,6 @@ def _seen(done: DecodeResult) -> dict[str, Any]:
         "histogram": [round(one, 5) for one in done.exposed.histogram],
         "clipped_share": round(done.exposed.clipped_share, 6),
     }
-
-
-def _naming(path: str | None, error: Exception) -> str:
-    """The error's sentence, with the frame's file in it."""
-    text = "there is not enough memory for it" if isinstance(error, MemoryError) else sentence(error)
-    return text if path is None or path in text else f"{path}: {text}"
 
 
 def main() -> None:
