@@ -56,6 +56,20 @@ MUTATIONS = (
         ("drivers/gphoto2/test_intake.py",),
     ),
     Mutation(
+        "a main loop that hangs is fed while any thread waits for the disk now and then",
+        "daemon/health/patience.py",
+        "        if waiting & self._waited:\n",
+        "        if waiting:\n",
+        ("daemon/health/test_patience.py",),
+    ),
+    Mutation(
+        "a main loop that waits for the disk is not fed",
+        "daemon/health/patience.py",
+        "            self._notifier.feed()\n",
+        "",
+        ("daemon/health/test_patience.py",),
+    ),
+    Mutation(
         "a folder is not made sure of after a rename",
         "durable.py",
         "        if folder is None:\n            sync_folder(path.parent)\n",
