@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import left_behind
+from tests import forked, left_behind
 
 # No test fails for the speed of the machine it runs on, nor by chance: by default the examples are the same each time.
 settings.register_profile("many", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=300)
@@ -60,6 +60,17 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 _watch = left_behind.Watch()
+_forks = forked.Forks()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Default tests fork their processes of dappled, with all that their fixtures start (`tests/forked.py`)."""
+    slow = item.get_closest_marker("slow") is not None
+    _forks.on = sys.platform == "linux" and not slow and "coverage" not in sys.modules
+    if _forks.on:
+        with _watch.wider():
+            _forks.begin()
 
 
 @pytest.hookimpl(wrapper=True)
@@ -126,9 +137,15 @@ def shared_data() -> Path:
     return folder
 
 
+def pytest_configure() -> None:
+    """Processes may be forked from here on."""
+    _forks.install()
+
+
 def pytest_unconfigure(config: pytest.Config) -> None:
     """End the process although a test that failed has left a thread behind: the interpreter would wait for it for ever,
     and so would whoever waits for the tests."""
+    _forks.close()
     left = [one.name for one in threading.enumerate() if one is not threading.main_thread() and not one.daemon]
     if left and not hasattr(config, "workerinput"):
         print(f"left behind by tests: the threads {', '.join(left)}", file=sys.stderr, flush=True)  # noqa: T201
