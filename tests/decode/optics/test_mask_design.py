@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -151,16 +152,17 @@ def test_nonsense_is_answered(changed: dict[str, Any], said: str) -> None:
 
 def test_a_plan_by_hand() -> None:
     """10 µm pixels, 50 mm, 50 m: 1 cm a pixel, 36.88 × 27.76 m; 80 % overlap is 5.55 m, at 5.552 m/s a second."""
-    made = lenses.plan_survey(
-        REFERENCE,
+    survey = lenses.SurveyFlight(
         focal_length_mm=50,
         altitude_m=50.05,
         speed_m_s=5.552,
+        overlap=0.8,
+        sidelap=0.6,
         exposure_s=0.002,
         hours=0.5,
         frame_bytes=10_000_000,
-        view_columns=461,
     )
+    made = survey.plan(REFERENCE, 461)
     assert made.ground_sample_m == pytest.approx(0.01, rel=1e-6)
     assert made.footprint_m == pytest.approx((27.76, 36.88), rel=1e-6)
     assert made.view_sample_m == pytest.approx(0.08, rel=1e-3)
@@ -169,6 +171,4 @@ def test_a_plan_by_hand() -> None:
     assert made.frames in (1800, 1801)
     assert made.disk_bytes == made.frames * 10_000_000
     assert made.longest_exposure_s == pytest.approx(0.01 / 5.552, rel=1e-6)
-    assert lenses.plan_survey(REFERENCE, focal_length_mm=50, altitude_m=50.05, speed_m_s=5, sideways=True).footprint_m[
-        0
-    ] == pytest.approx(36.88, rel=1e-6)
+    assert replace(survey, sideways=True).plan(REFERENCE).footprint_m[0] == pytest.approx(36.88, rel=1e-6)

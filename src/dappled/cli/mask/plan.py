@@ -71,8 +71,7 @@ class PlanFlight(AltitudeArguments, Verb):
                     views=optics.mask.views_per_axis,
                 )
                 warnings += _shallow(depth, self.altitude)
-        made = lenses.plan_survey(
-            sensor,
+        flight = lenses.SurveyFlight(
             focal_length_mm=length,
             altitude_m=self.altitude,
             speed_m_s=self.speed,
@@ -81,9 +80,9 @@ class PlanFlight(AltitudeArguments, Verb):
             exposure_s=self.exposure,
             hours=self.hours,
             frame_bytes=round(self.frame_mb * 1e6),
-            view_columns=columns,
             sideways=self.sideways,
         )
+        made = flight.plan(sensor, columns)
         if self.interval is not None and made.interval_s < self.interval:
             warnings.append(_too_fast(made, self.interval, self.speed))
         views = "" if made.view_sample_m is None else f" of the picture, {made.view_sample_m * 100:.1f} cm of a view"

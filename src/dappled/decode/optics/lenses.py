@@ -137,52 +137,48 @@ class SurveyPlan:
     area_m2: float
 
 
-def plan_survey(
-    sensor: Sensor,
-    *,
-    focal_length_mm: float,
-    altitude_m: float,
-    speed_m_s: float,
-    overlap: float = 0.8,
-    sidelap: float = 0.6,
-    exposure_s: float = 1 / 1000,
-    hours: float = 1.0,
-    frame_bytes: int = 18_000_000,
-    view_columns: int | None = None,
-    sideways: bool = False,
-) -> SurveyPlan:
-    """Plan a flight at this altitude above ground and speed over ground.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SurveyFlight:
+    """A flight to plan: the lens, the altitude above ground and speed over ground, `overlap` and `sidelap` as shares of
+    the footprint. `sideways`: the frame's columns lie along the flight."""
 
-    `overlap` and `sidelap` are shares of the footprint, `view_columns` the pixels of a decoded view across.
-    `longest_exposure_s` blurs by one frame pixel.
-    """
-    height_mm, width_mm = sensor.size_mm
-    down, across = (ground_sample_m(side, focal_length_mm, altitude_m) for side in (height_mm, width_mm))
-    footprint = (across, down) if sideways else (down, across)
-    samples = (down / sensor.shape[0], across / sensor.shape[1])
-    along_sample = samples[1] if sideways else samples[0]
-    view_sample = None
-    if view_columns is not None:
-        within("view", view_columns, "px", 1, sensor.shape[1])
-        view_sample = across / view_columns
-    spacing = footprint[0] * (1 - overlap)
-    line = footprint[1] * (1 - sidelap)
-    interval = spacing / speed_m_s
-    blur = speed_m_s * exposure_s
-    frames = math.ceil(hours * 3600 / interval)
-    return SurveyPlan(
-        footprint_m=footprint,
-        ground_sample_m=max(samples),
-        view_sample_m=view_sample,
-        spacing_m=spacing,
-        line_m=line,
-        interval_s=interval,
-        frames_per_minute=60 / interval,
-        blur_m=blur,
-        blur_px=blur / along_sample,
-        view_blur_px=None if view_sample is None else blur / view_sample,
-        longest_exposure_s=along_sample / speed_m_s,
-        frames=frames,
-        disk_bytes=frames * frame_bytes,
-        area_m2=speed_m_s * hours * 3600 * line,
-    )
+    focal_length_mm: float
+    altitude_m: float
+    speed_m_s: float
+    overlap: float
+    sidelap: float
+    exposure_s: float
+    hours: float
+    frame_bytes: int
+    sideways: bool = False
+
+    def plan(self, sensor: Sensor, view_columns: int | None = None) -> SurveyPlan:
+        """What it takes. `view_columns` are a decoded view's pixels across. `longest_exposure_s` blurs by one frame
+        pixel."""
+        down, across = (ground_sample_m(side, self.focal_length_mm, self.altitude_m) for side in sensor.size_mm)
+        footprint = (across, down) if self.sideways else (down, across)
+        samples = (down / sensor.shape[0], across / sensor.shape[1])
+        along_sample = samples[1] if self.sideways else samples[0]
+        view_sample = None
+        if view_columns is not None:
+            within("view", view_columns, "px", 1, sensor.shape[1])
+            view_sample = across / view_columns
+        spacing, line = footprint[0] * (1 - self.overlap), footprint[1] * (1 - self.sidelap)
+        interval, blur = spacing / self.speed_m_s, self.speed_m_s * self.exposure_s
+        frames = math.ceil(self.hours * 3600 / interval)
+        return SurveyPlan(
+            footprint_m=footprint,
+            ground_sample_m=max(samples),
+            view_sample_m=view_sample,
+            spacing_m=spacing,
+            line_m=line,
+            interval_s=interval,
+            frames_per_minute=60 / interval,
+            blur_m=blur,
+            blur_px=blur / along_sample,
+            view_blur_px=None if view_sample is None else blur / view_sample,
+            longest_exposure_s=along_sample / self.speed_m_s,
+            frames=frames,
+            disk_bytes=frames * self.frame_bytes,
+            area_m2=self.speed_m_s * self.hours * 3600 * line,
+        )
