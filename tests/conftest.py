@@ -98,6 +98,7 @@ TIDY = tuple(
         "drivers/gnss",
         "drivers/test_",
         "drivers/wired",
+        "flight",
         "mocks",
         "test_",
     )

@@ -1,7 +1,8 @@
-"""What a test leaves behind for the next one: threads, child processes and sockets.
+"""What a test leaves behind for the next one: threads, child processes, sockets and open files.
 
 Each costs the next test: a socket that nobody closed is warned of whenever the garbage is collected, in a test that has
-nothing to do with it. A fixture of a wider scope may keep what it made until its own end.
+nothing to do with it; and a daemon that leaves a file open at each frame ends in the middle of a flight. A fixture of a
+wider scope may keep what it made until its own end.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ GRACE_S = 30.0
 # without a copy; tqdm; Zarr, a loop of asyncio with its own two sockets; multiprocessing.
 FOREVER = ("GarbageCollectorThread", "TMonitor")
 ZARR = ("zarr_io", "asyncio_")
+# Where tests have their files.
+FILES = "/pytest-of-"
 TRACKER = "from multiprocessing.resource_tracker"
 
 Held = frozenset[tuple[str, str]]
@@ -35,6 +38,8 @@ def held() -> Held:
             continue
         if target.startswith("socket:"):
             found.add(("socket", f"{name} {target}"))
+        elif FILES in target:
+            found.add(("file", f"{name} {target}"))
     for task in os.listdir("/proc/self/task"):
         try:
             found |= {("process", child) for child in Path(f"/proc/self/task/{task}/children").read_text().split()}

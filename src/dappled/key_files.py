@@ -51,8 +51,8 @@ def read(path: Path, what: str) -> str:
     `what` says in errors what it should be. Raises KeyFileError.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe must not block
-        with os.fdopen(fd, "rb") as file:
+        # a pipe must not block, and a folder is open before it is found to be none that can be read
+        with durable.descriptor(path, os.O_RDONLY | os.O_NONBLOCK) as fd, open(fd, "rb", closefd=False) as file:
             facts = os.fstat(fd)
             text = file.read(_MOST).decode("ascii")
     except (OSError, UnicodeDecodeError) as error:
