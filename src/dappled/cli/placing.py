@@ -160,6 +160,7 @@ class Placing(Mounted):
             focal_length_mm=self.focal_length,
             f_number=self.f_number,
             frames=self.frames,
+            as_flown=not (self.camera or self.mask or self.calibration or self.focal_length),
         )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +31,7 @@ from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Subject, finding
-from dappled.flight import Tag, TimeSource, recording
+from dappled.flight import Result, Tag, TimeSource, recording
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene.masked_camera import Truth, reference_camera
 from dappled.mocks.simulation import CAMERA, MASK
@@ -269,18 +269,50 @@ def test_a_base_map_elsewhere_leaves_the_recorded_poses(short_flight: Flown, tmp
     assert report["files"] == ["footprints.geojson"]
 
 
-@pytest.fixture(scope="module")
-def frames_apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A flight of two tiny frames, half a kilometre from each other. Not to be written to."""
-    begun = recording.begin(tmp_path_factory.mktemp("apart"), RecordedClock(flown.START_NS))
+def apart(
+    parent: Path, nats: Sequence[float] = (), facts: Mapping[str, Any] | None = None, scale: float = 0.125
+) -> Path:
+    """A flight of two tiny frames, half a kilometre from each other, and what decoding told of their mask."""
+    begun = recording.begin(parent, RecordedClock(flown.START_NS), facts)
     path = FlightPath(3)
-    file = reference_camera(3, scale=0.125, scene="bench").bench_frame().file
+    file = reference_camera(3, scale=scale, scene="bench").bench_frame().file
     for index in range(2):
         true = path.pose(float(index))
         there = replace(true, latitude_deg=path.home_latitude_deg + 0.005 * index)
         flown.record(begun, index, file, flown.F_NUMBER, flown.as_recorded(there))
+    for index, one in enumerate(nats):
+        details = {"mask_nats": one}
+        begun.ledger.add_result(Result(index, "ab", 1, 13, "geometric", "calibrated", details=details))
     begun.close()
     return begun.folder.path
+
+
+@pytest.fixture(scope="module")
+def frames_apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Not to be written to."""
+    return apart(tmp_path_factory.mktemp("apart"))
+
+
+@pytest.mark.parametrize(
+    ("nats", "more", "doubt"),
+    [
+        ((-3.4, -16.0), [], "caution"),
+        ((120.0, -3.4), [], "note"),
+        ((-3.4, -16.0), ["--focal-length", "50"], None),
+    ],
+    ids=["gone", "there", "decoded with another"],
+)
+def test_maps_of_pictures_tell_what_the_flight_saw_of_its_mask(
+    tmp_path: Path, nats: Sequence[float], more: list[str], doubt: str | None
+) -> None:
+    """A picture shows no light field; frames that were decoded with other values say nothing of these."""
+    facts = {"settings": {"camera": {"profile": CAMERA}, "mask": {"profile": MASK}}}
+    flight = apart(tmp_path, nats, facts, scale=0.25)
+    output = tmp_path / "maps"
+    ends = main(["georeference", str(flight), "-o", str(output), "--as", "footprints", "--workers", "1", *more])
+    doubts = json.loads((output / "report.json").read_text())["doubts"]
+    assert [one["level"] for one in doubts if one["code"] == Code.MASK_OVER_FLIGHT] == ([doubt] if doubt else [])
+    assert ends == 1 or doubt != "caution"
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,8 @@ class Job:
     """One frame and all that is to be made of it. `station` is the error where its position isn't known;
     `level_m` is the height of flat ground. `key` is a hash of everything that the outcome depends on.
     `utc_ns` is mid-exposure, corrected; None where UTC was never known. `others` are the frames that the mask's shadow
-    is taken from, and `told` what these tell of it, as soon as they were asked."""
+    is taken from, and `told` what these tell of it, as soon as they were asked; `flown_nats` is what decoding in flight
+    told of the mask."""
 
     flight: str
     frame: Frame
@@ -64,6 +65,7 @@ class Job:
     utc_ns: int | None = None
     others: tuple[LensFrame, ...] = ()
     told: tuple[ToldShadow, ...] = ()
+    flown_nats: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,7 @@ class BatchOutput:
 class Done:
     """The result of a job. `error` is a sentence, or None; `cpu_seconds` and `peak_mb` (so far) are the process'.
     `refused` says why a kind was not made where others were or could have been; `doubts` are those of the frame's
-    picture and light field, whichever were made, `mask_nats` the log odds that the light field shows its mask."""
+    picture and light field, whichever were made, `mask_nats` the log odds that it shows its mask, or did in flight."""
 
     key: str
     flight: str
@@ -152,19 +154,21 @@ def plan(
     jobs = []
     pictured = set(kinds) & set(FORMS if options.view != MEAN else PLACED)
     near = beside(list(files.values())) if pictured else {}
+    flown = photographs.flown_nats(flight) if options.as_flown else {}
     for frame in frames:
         tag = tags.get(frame.index)
         utc_ns = placed[frame.index].utc_ns if frame.index in placed else None
         others = near.get(files[frame.index], ()) if frame.index in files else ()
         said = {**common, "flight": flight.name, "name": frame.name, "frame": frame.sha256, "utc_ns": utc_ns,
-                "tag": codec.plain(tag), "others": [hashes[one.path] for one in others]}  # fmt: skip
+                "tag": codec.plain(tag), "others": [hashes[one.path] for one in others],
+                "flown_nats": flown.get(frame.index)}  # fmt: skip
         if frame.index in stations and stations[frame.index].camera.height_ellipsoid_m is not None:
             said["height_ellipsoid_m"] = stations[frame.index].camera.height_ellipsoid_m
         key = hashlib.sha256(codec.canonical(said)).hexdigest()
         jobs.append(
             Job(
                 str(flight.absolute()), frame, tag, stations.get(frame.index) or unplaced[frame.index], level, recipe,
-                options, tuple(kinds), str(output.absolute()), key, utc_ns, others,
+                options, tuple(kinds), str(output.absolute()), key, utc_ns, others, flown_nats=flown.get(frame.index),
             )
         )  # fmt: skip
     return jobs
@@ -190,6 +194,7 @@ def make(job: Job) -> Done:
     seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
     name, doubts = Path(job.flight).name, () if making is None else making.frame.doubts
     nats = None if making is None else making.frame.mask_nats
+    nats = job.flown_nats if nats is None else nats
     return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused, doubts, nats)
 
 

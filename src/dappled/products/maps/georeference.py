@@ -49,7 +49,8 @@ class Options:
     `ground_m` is the ground's height above sea level (default: home's); `terrain` a raster file, with ellipsoidal
     heights where `terrain_geoid` is given. `gsd_m` defaults to the finest of the frames'. `view` is "mean" (the picture
     at the sensor's own resolution), "ground" (all views, refocused on the ground) or "v,u". `focus_m` is the distance
-    at which the lens was focused. `frames` holds the frames' numbers.
+    at which the lens was focused. `frames` holds the frames' numbers. `as_flown`: camera, mask and focal length
+    are those of decoding in flight, so that what this told of the mask counts where no light field is made.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -63,6 +64,7 @@ class Options:
     focal_length_mm: float | None = None
     f_number: float | None = None
     frames: frozenset[int] | None = None
+    as_flown: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,8 +85,8 @@ class Survey:
 
     @property
     def doubts(self) -> list[Finding]:
-        """What is in doubt about the photographs, the mask that their light fields show, and what their lens was not
-        told."""
+        """What is in doubt about the photographs, the mask that their light fields or the flight show, and what their
+        lens was not told."""
         of_lens = self.lens.doubts if self.lens else ()
         return [*doubts_over((one.name, one.mask_nats, one.doubts) for one in self.photographs), *of_lens]
 
@@ -148,6 +150,7 @@ def survey(
         foresee(planned)
     workers = 1 if watch is not None else processes.worth(workers, len(stations))
     recipe = recipe.shared_by(workers)
+    flown = photographs.flown_nats(flight) if options.as_flown else {}
     taken: list[Photograph] = []
     with processes.Crew(workers) as crew:
         told = _told(recipe, stations, files, crew, progress) if options.view == MEAN else {}
@@ -159,7 +162,8 @@ def survey(
                 if isinstance(one, DappledError):
                     left.append((station.frame.name, str(one)))
                 else:
-                    taken.append(_from_shelf(one, scratch))
+                    nats = flown.get(station.frame.index) if one.mask_nats is None else one.mask_nats
+                    taken.append(replace(_from_shelf(one, scratch), mask_nats=nats))
     progress("develop", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
 

@@ -73,7 +73,8 @@ class Photograph:
     Sigmas are one standard deviation of the eye's centre (m) and attitude (rad) as recorded. `grid` maps to the
     sensor, as in `LightField`. With `views` (n, h, w[, 3]) and their aperture points, maps are drawn from the views:
     their mean on the ground is the frame refocused there. `doubts` are the picture's and the light field's,
-    `mask_nats` the log odds that this shows its mask, None without one; `lens` is that of the eye.
+    `mask_nats` the log odds that this shows its mask, or that its frame did in flight, None where neither is known;
+    `lens` is that of the eye.
     """
 
     name: str
@@ -138,6 +139,13 @@ def recorded(flight: Path) -> tuple[list[Frame], dict[int, Tag]]:
     """A flight's safe frames and their tags. Raises FlightError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
         return ledger.frames(), ledger.tags()
+
+
+def flown_nats(flight: Path) -> dict[int, float]:
+    """What decoding in flight told of the mask, by image index: the log odds that it is where it was calibrated. Raises
+    FlightError."""
+    with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
+        return {at: one.mask_nats for at, one in ledger.results().items() if one.mask_nats is not None}
 
 
 def station(frame: Frame, tag: Tag | None, mounting: Mounting) -> Station:
