@@ -362,6 +362,7 @@ class Code(StrEnum):
     SERIES_OLD_POSITION = "series.old_position"
     SERIES_TOO_FAST = "series.too_fast"
     SERIES_TOO_LOW = "series.too_low"
+    SERVICE_STOOD_STILL = "service.stood_still"
     SERVICE_STOPPING = "service.stopping"
     SETTINGS_DIFFER = "settings.differ"
     SETTINGS_SIMULATED = "settings.simulated"

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from dappled.clock import SystemClock
 from dappled.config import settings as configuration
 from dappled.config.settings import (
     DecodeSettings,
@@ -32,6 +33,7 @@ from dappled.daemon.pipeline.shutter import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChanged, StateChanged
 from dappled.errors import DappledError
+from dappled.findings import Code
 from dappled.findings import told as findings_told
 from dappled.flight import FlightError, LedgerReader, Recording, flight_report, layout
 from dappled.flight.checks import flight_check
@@ -297,6 +299,34 @@ def test_a_battery_that_runs_empty_is_told_until_there_is_another(camera: FakeCa
         eventually(lambda: "battery" not in stepped(service), "another battery")
     finally:
         service.stop()
+
+
+class LateClock(SystemClock):
+    """It can be put forward."""
+
+    late_ns = 0
+
+    def monotonic_ns(self) -> int:
+        return super().monotonic_ns() + self.late_ns
+
+
+def test_a_service_that_stood_still_tells_so_for_a_minute_and_in_the_ledger(
+    camera: FakeCamera, settings: Settings
+) -> None:
+    clock = LateClock()
+    service = Service(settings, clock=clock)
+    service.start()
+    try:
+        service.step()
+        clock.late_ns += 4 * S
+        assert "stood still" not in stepped(service)
+        clock.late_ns += 9 * S
+        assert "the service stood still for 9 s" in stepped(service)
+        clock.late_ns += 61 * S
+        assert Code.SERVICE_STOOD_STILL not in codes(service.health())
+    finally:
+        service.stop()
+    assert any("the service stood still for 9 s" in one for one in told(service.folder))
 
 
 def test_another_mask_ends_the_flight_between_two_frames(camera: FakeCamera, settings: Settings) -> None:

@@ -66,7 +66,7 @@ from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
 from dappled.errors import DappledError, report, sentence
-from dappled.findings import Code, Finding, Level, Subject
+from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import Recording, Tag, seal_key
 from dappled.flight import recording as flights
 
@@ -74,6 +74,8 @@ log = logging.getLogger(__name__)
 HEALTH_NS = 10**9
 AGAIN_NS = 10**9
 _LOOK_S = 0.02
+_STILL_NS = 5_000_000_000  # without a heartbeat for so long ground stations take a camera for lost
+_STOOD_TOLD_NS = 60_000_000_000
 _STOP_S = 5.0
 
 
@@ -153,6 +155,7 @@ class Service:
         self._alarms, self._standing, self._told = Alarms(), StandingFindings(), StandingEvents()
         self._stack = ExitStack()
         self._stopping = threading.Event()
+        self._turns = LoopTurns()
         self._started = False
 
     # start, and in the reverse order stop
@@ -429,6 +432,7 @@ class Service:
 
     def step(self) -> None:
         """Do once what is due."""
+        self._turns.turned(self._clock.monotonic_ns())
         for task, do in self._tasks.items():
             task.turn(do, self._clock.monotonic_ns())
 
@@ -482,6 +486,7 @@ class Service:
             *self.parts.body.unseen(),
             self.parts.overlap.trouble(utc_ns) if series is None else None,  # a series by distance tells it itself
             *(task.failing for task in self._tasks),
+            self._turns.stood_still(self._clock.monotonic_ns()),
         )
         return health.record(
             self._settings.now,
@@ -567,6 +572,26 @@ class PeriodicTask:
         else:
             self.failing = None
             self._due_ns = now_ns + self._every_ns
+
+
+class LoopTurns:
+    """When the working loop turned last, and for how long it stood still. Times are monotonic."""
+
+    def __init__(self) -> None:
+        self._turned_ns: int | None = None
+        self._stood_ns, self._ended_ns = 0, 0
+
+    def turned(self, now_ns: int) -> None:
+        """Note a turn."""
+        if self._turned_ns is not None and now_ns - self._turned_ns >= _STILL_NS:
+            self._stood_ns, self._ended_ns = now_ns - self._turned_ns, now_ns
+        self._turned_ns = now_ns
+
+    def stood_still(self, now_ns: int) -> Finding | None:
+        """That it did within the last minute, by the last time."""
+        if not self._stood_ns or now_ns - self._ended_ns > _STOOD_TOLD_NS:
+            return None
+        return finding(Code.SERVICE_STOOD_STILL, Subject("service"), seconds=self._stood_ns / 1e9)
 
 
 def _close(recording: Recording) -> None:
