@@ -196,8 +196,10 @@ def text(one: Finding) -> Text:
 
 
 def remedy(one: Finding) -> Text:
-    """What to do; "" where nothing is to be done."""
-    return Text(_filled(words()[one.code].remedy, one.facts))
+    """What to do; "" where nothing is to be done, as about a doubt that stands as a note only."""
+    usual = words()[one.code]
+    settled = one.level is Level.NOTE and usual.level > Level.NOTE
+    return Text("" if settled else _filled(usual.remedy, one.facts))
 
 
 def named(one: Finding, under: Subject | None = None) -> Text:

@@ -22,12 +22,13 @@ def test_the_odds_of_a_mask_add_up_over_a_flight() -> None:
     assert one(2, -3.0) == ()
     (told,) = flight.unseen
     assert (told.level, told.facts["seen"], told.facts["frames"], told.facts["unseen"]) == (Level.NOTE, 1, 3, 2)
+    assert str(remedy(told)) == ""
     for index in range(3, 7):
         fallen = one(index, -3.4)
     assert fallen == (unseen,)
     (told,) = flight.unseen
     assert (told.level, told.facts["frames"]) == (Level.CAUTION, 7)
-    assert f"not above {SEEN_NATS}," in str(remedy(told))
+    assert f"more than {SEEN_NATS} are asked" in str(remedy(told))
     assert one(7, None) == ()
     assert flight.unseen == (told,)
 
