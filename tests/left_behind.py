@@ -7,6 +7,7 @@ wider scope may keep what it made until its own end.
 
 from __future__ import annotations
 
+import gc
 import os
 import threading
 import time
@@ -63,6 +64,8 @@ class Watch:
 
     def left(self, before: Held) -> Held:
         """What is there and was not before, after as long as it may take to end."""
+        if any(kind == "file" for kind, _ in self._left(before)):
+            gc.collect()  # sqlite3's connections are cycles: when they are closed by themselves is chance
         until = time.monotonic() + GRACE_S
         while (left := self._left(before)) and time.monotonic() < until:
             threading.Event().wait(0.01)

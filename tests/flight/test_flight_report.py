@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,7 @@ def test_refused_requests_are_counted_at_their_source(flight: Recording) -> None
     for source, times in (("mavlink:7/1", 1), ("console", 1), ("mavlink:7/1", 511), ("other peers", 9)):
         one = finding(Code.CAMERA_ABSENT, Subject("source", source), reason="", times=times)
         flight.ledger.add_event("refused", one)
-    with sqlite3.connect(flight.folder.ledger) as damaged:
+    with closing(sqlite3.connect(flight.folder.ledger)) as damaged, damaged:
         damaged.execute("INSERT INTO events (utc_ns, kind, text) VALUES (0, 'refused', '{\"code\": \"gibberish\"}')")
     counts = {one.source: one for one in by_source(flight.folder.path)}
     assert (counts["mavlink:7/1"].wishes, counts["mavlink:7/1"].refused) == (512, 512)
