@@ -147,6 +147,20 @@ MUTATIONS = (
         ("daemon/navigation/test_clocks.py",),
     ),
     Mutation(
+        "two round trips explain four times what they can",
+        "daemon/navigation/clocks.py",
+        "(old.delay_ns + new.delay_ns) / 2",
+        "(old.delay_ns + new.delay_ns) * 2",
+        ("daemon/navigation/test_clocks.py",),
+    ),
+    Mutation(
+        "a setting that the body holds fast is offered",
+        "drivers/gphoto2/session.py",
+        " and not widget.get_readonly()",
+        "",
+        ("drivers/gphoto2/test_session.py",),
+    ),
+    Mutation(
         "sigma of a fitted clock is halved",
         "daemon/navigation/clocks.py",
         "math.hypot(math.sqrt(variance), _TIMESYNC_ASYMMETRY * float(delay.min())),",

@@ -54,6 +54,17 @@ def test_sigma_is_the_error_of_a_clock_that_answers_tell(count: int) -> None:
     assert 0.8 < np.sqrt(np.mean(np.square(ratios))) < 1.2
 
 
+@pytest.mark.parametrize(("there_ms", "back_ms"), [(0, 0), (40, 0), (0, 60), (80, 100)])
+def test_what_two_round_trips_can_explain_is_no_step(there_ms: int, back_ms: int) -> None:
+    """The first answer took all of its round trip on the way there, the second on the way back: half of both apart, at
+    most. Two thousandths of a second more are a step."""
+    first = TimesyncAnswer(0, START_NS, START_NS + there_ms * MS, there_ms * MS)
+    for step_ms in (0, 2, -(there_ms + back_ms + 2)):
+        later_ns = START_NS + 10**9
+        second = TimesyncAnswer(1, later_ns, later_ns + back_ms * MS, 10**9 - step_ms * MS)
+        assert clocks.stepped_since([first], second) is (first if step_ms else None)
+
+
 def test_the_contact_is_taken_and_half_the_exposure_added() -> None:
     chosen = clocks.choose_feedback([event(55)], EXPECTED, CLOCK)
     assert chosen == event(55)

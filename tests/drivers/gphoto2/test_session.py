@@ -36,6 +36,7 @@ class Widget:
     value: str
     choices: tuple[str, ...] = ()
     kind: int = gp.GP_WIDGET_RADIO
+    readonly: int = 0
 
     def get_value(self) -> str:
         return self.value
@@ -44,7 +45,7 @@ class Widget:
         return self.kind
 
     def get_readonly(self) -> int:
-        return 0
+        return self.readonly
 
     def get_choices(self) -> tuple[str, ...]:
         return self.choices
@@ -132,6 +133,19 @@ def test_what_changes_rarely_is_read_again_only_after_a_change(library: FakeLibr
     library.widgets["autoexposuremode"] = Widget("AV", ("Manual", "AV"))
     assert session.news() == [SettingTurned()]
     assert ("exposure_mode", "AV") in [(one.name, one.value) for one in session.settings()]
+
+
+@pytest.mark.parametrize("readonly", [0, 1])
+def test_what_the_body_holds_fast_offers_no_choice(
+    library: FakeLibrary, session: GPhoto2Session, readonly: int
+) -> None:
+    library.widgets = {
+        "iso": Widget("100", ("100", "200"), readonly=readonly),
+        "autopoweroff": Widget("30", kind=gp.GP_WIDGET_TEXT, readonly=readonly),
+    }
+    choices = {one.name: one.choices for one in session.settings()}
+    offered = {"iso": ("100", "200"), "auto_power_off": ("0", "30")}
+    assert choices == (dict.fromkeys(offered, ()) if readonly else offered)
 
 
 @pytest.mark.parametrize(("text", "value"), [(CUSTOM.format(1), "on"), (CUSTOM.format(0), "off"), ("bad length", None)])
