@@ -161,6 +161,20 @@ MUTATIONS = (
         ("drivers/gphoto2/test_session.py",),
     ),
     Mutation(
+        "the sign in a quaternion of the camera",
+        "decode/geometry/field_of_view.py",
+        "half, (m01 + m10) * quarter, (m02 + m20) * quarter),",
+        "half, (m01 - m10) * quarter, (m02 + m20) * quarter),",
+        ("decode/geometry/test_field_of_view.py",),
+    ),
+    Mutation(
+        "the sign in a turn between two near attitudes",
+        "decode/geometry/pose.py",
+        "(1 - share) * a[2] + share * b[2]",
+        "(1 - share) * a[2] - share * b[2]",
+        ("decode/geometry/test_pose.py",),
+    ),
+    Mutation(
         "sigma of a fitted clock is halved",
         "daemon/navigation/clocks.py",
         "math.hypot(math.sqrt(variance), _TIMESYNC_ASYMMETRY * float(delay.min())),",

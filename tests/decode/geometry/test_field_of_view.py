@@ -50,6 +50,17 @@ def test_the_axis_meets_the_ground_where_it_should(roll: float, pitch: float, ya
     assert found.apply([0, 1, 0]) == pytest.approx(turn.apply(np.array(DOWN).reshape(3, 3) @ [1, 0, 0]), abs=1e-9)
 
 
+@given(st.tuples(*[st.floats(-1, 1)] * 4).filter(lambda one: math.hypot(*one) > 0.1))
+def test_a_camera_in_any_attitude_has_that_attitude(parts: tuple[float, float, float, float]) -> None:
+    """Each of the four ways to a quaternion, as any of its numbers may be the largest."""
+    turn = Rotation.from_quat(parts, scalar_first=True)
+    attitude, _ = look(replace(LEVEL, attitude=tuple(turn.as_quat(scalar_first=True))), DOWN)
+    assert attitude is not None
+    right, down, forward = (turn.apply(axis) for axis in np.array(DOWN).reshape(3, 3).T)
+    found = Rotation.from_quat(attitude, scalar_first=True)
+    assert found.as_matrix() == pytest.approx(np.stack([forward, right, down], axis=1), abs=1e-9)
+
+
 def test_towards_the_sky_without_a_pose_or_a_height_there_is_no_ground() -> None:
     assert look(None, DOWN) == (None, None)
     assert look(no_pose(), DOWN) == (None, None)
