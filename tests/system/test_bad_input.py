@@ -23,6 +23,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink import LinkError
 from dappled.errors import DappledError
+from dappled.findings import Subject
 from dappled.flight import FlightsLock, LedgerReader, flight_report
 from dappled.flight.checks import flight_check
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
@@ -306,8 +307,11 @@ def test_a_frame_of_another_size_than_its_profile_s(here: Path, tmp_path: Path) 
     small = tmp_path / "small.dng"
     small.write_bytes(reference_camera(1, scale=0.2, scene="white").bench_frame().file)
     daemon, _ = photographed(small, here)
-    for word in ("not decoded", "000000.dng", "reference-36mm", "556 × 738", "1388 × 1844"):
-        assert word in words(daemon.shots[0].problem)
+    problem = daemon.shots[0].problem
+    assert problem is not None
+    assert problem.subject == Subject("frame", 0)
+    for word in ("not decoded", "reference-36mm", "556 × 738", "1388 × 1844"):
+        assert word in words(problem)
 
 
 @pytest.mark.slow
