@@ -40,7 +40,7 @@ _DNG_VERSION, _MAX_SAMPLE = 50706, 281  # TIFF tags
 _LINEAR_FROM = 0.95  # a PNG's gamma: 1 is linear, 0.45455 is usual
 
 
-class NoFrameError(ValueError):
+class UnfitFileError(ValueError):
     """A file is whole, and what it holds is no frame."""
 
 
@@ -134,7 +134,7 @@ def _sentence(label: str, error: Exception) -> str:
         case rawpy.LibRawFileUnsupportedError() | UnidentifiedImageError():
             kinds = "camera raw, DNG, Lytro, TIFF, PNG, JPEG or NPY"
             return f"{label} is not a frame that can be read ({kinds}), or is cut short"
-        case ClaimError() | NoFrameError():
+        case ClaimError() | UnfitFileError():
             return f"{label} can't be read as a frame: {error}"
         case MemoryError():
             return f"{label} needs more memory than is free: close other programs"
@@ -157,13 +157,13 @@ def _words(error: BaseException) -> str:
 
 
 def _read_libraw(file: BinaryIO) -> RawFile:
-    """Read a raw file with a mosaic. Raises what LibRaw and EXIF raise, and NoFrameError for one without."""
+    """Read a raw file with a mosaic. Raises what LibRaw and EXIF raise, and UnfitFileError for one without."""
     stored = _length(file)
     with rawpy.imread(file) as raw:
         if (size := (raw.sizes.raw_width, raw.sizes.raw_height))[0] * size[1] > FREE_PIXELS:
             check_pixels(size, 2, stored)
         if raw.raw_type != rawpy.RawType.Flat:
-            raise NoFrameError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
+            raise UnfitFileError("it holds no mosaic (linear or demosaiced raws have no masked light field to decode)")
         mosaic = np.array(raw.raw_image_visible)
         cfa = None if raw.num_colors == 1 or raw.raw_pattern is None else _visible_pattern(raw)
         count = 1 if cfa is None else int(cfa.max()) + 1
@@ -236,11 +236,11 @@ def _balance(gains: list[float], names: str) -> tuple[float, ...] | None:
 
 
 def _read_picture(file: BinaryIO) -> RawFile:
-    """Read a PNG or a JPEG. Raises what Pillow raises, and NoFrameError for one that holds no frame."""
+    """Read a PNG or a JPEG. Raises what Pillow raises, and UnfitFileError for one that holds no frame."""
     image = open_picture(file)
     developed = _developed(image)
     if image.format == "PNG" and image.mode != "I;16" and _png_is_deep_colour(file):
-        raise NoFrameError(
+        raise UnfitFileError(
             "it is a colour PNG of 16 bits, which would lose its lower 8; save it as TIFF or as grey PNG"
         )
     if image.mode in ("P", "PA", "CMYK", "YCbCr", "LAB", "HSV"):
@@ -286,7 +286,7 @@ def _is_plain_tiff(file: BinaryIO, label: str) -> bool:
 
 
 def _read_tiff(file: BinaryIO) -> RawFile:
-    """Read the first page of a TIFF. Raises what tifffile raises, and NoFrameError."""
+    """Read the first page of a TIFF. Raises what tifffile raises, and UnfitFileError."""
     with tifffile.TiffFile(file) as tiff:
         page = tiff.pages.first
         check_tiff_page(page, file)
@@ -302,7 +302,7 @@ def _read_tiff(file: BinaryIO) -> RawFile:
 
 def _plain(values: NDArray[Any], settings: ExposureSettings) -> RawFile:
     """Make a frame of an array without a mosaic; white is the largest integer of its type, or 1. Raises
-    NoFrameError."""
+    UnfitFileError."""
     if values.dtype.kind == "b":
         values = values.astype(np.uint8) * np.uint8(255)
     kind = values.dtype.kind
@@ -311,13 +311,13 @@ def _plain(values: NDArray[Any], settings: ExposureSettings) -> RawFile:
     elif kind in "iu" and values.dtype not in (np.uint8, np.uint16) and values.size:
         low, high = int(values.min()), int(values.max())
         if low < 0 or high > np.iinfo(np.uint16).max:
-            raise NoFrameError(f"its values are {low} to {high}; a frame has 8 or 16 bits unsigned, or floats")
+            raise UnfitFileError(f"its values are {low} to {high}; a frame has 8 or 16 bits unsigned, or floats")
         values = values.astype(np.uint16)
     if values.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise NoFrameError(f"its values are {values.dtype}; a frame has 8 or 16 bits unsigned, or floats")
+        raise UnfitFileError(f"its values are {values.dtype}; a frame has 8 or 16 bits unsigned, or floats")
     white = 1.0 if values.dtype.kind == "f" else float(np.iinfo(values.dtype).max)
     if values.ndim == 3 and values.shape[2] in (3, 4):
         values = values[..., :3].astype(np.float32) @ np.array([0.25, 0.5, 0.25], dtype=np.float32)
     if values.ndim != 2 or 0 in values.shape:
-        raise NoFrameError(f"its shape is {values.shape}; a frame has rows and columns, and 3 colours at most")
+        raise UnfitFileError(f"its shape is {values.shape}; a frame has rows and columns, and 3 colours at most")
     return RawFile.of(settings, np.array(values), black=0.0, white=white, cfa=None, colour_names=("W",), balance=None)
