@@ -394,6 +394,13 @@ MUTATIONS = (
         ("flight/test_offload.py",),
     ),
     Mutation(
+        "a copy that was cut short does not say so",
+        "flight/offload.py",
+        '            self._there.write(layout.UNFINISHED, [os.fsencode(f"offloaded from {self._source.path}\\n")])\n',
+        "",
+        ("flight/test_offload.py",),
+    ),
+    Mutation(
         "the covariance of an attitude leaves out the time's",
         "daemon/navigation/navigation.py",
         "_symmetric(rates, sigma_s, (each, each, each))",

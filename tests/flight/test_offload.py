@@ -6,6 +6,7 @@ other devices, bind mounts and file systems.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
@@ -467,6 +468,28 @@ def test_a_disk_that_lies_is_found(closed: Path, tmp_path: Path, monkeypatch: py
     with pytest.raises(FlightError, match="reads back different"):
         go(closed, tmp_path / "disk", prune=True)
     assert frames(closed) == TWO
+
+
+def test_a_copy_that_was_cut_short_says_so_until_it_is_finished(
+    closed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A daemon that recorded there would repair it, and work there would be lost."""
+    whole, there = Tree.write, tmp_path / "disk" / closed.name
+
+    def full(tree: Tree, name: str, pieces: object) -> None:
+        if name.endswith("000001.cr2"):
+            raise OSError(errno.ENOSPC, "No space left on device")
+        whole(tree, name, pieces)  # type: ignore[arg-type]  # as it came
+
+    with monkeypatch.context() as broken:
+        broken.setattr(Tree, "write", full)
+        with pytest.raises(FlightError, match="the disk is full"):
+            go(closed, tmp_path / "disk")
+    assert Code.FLIGHT_COPY_UNFINISHED in [one.code for one in check(there).problems]
+    with pytest.raises(FlightError, match="cut short: run that offload again"):
+        layout.refuse_unfinished(layout.open_folder(there))
+    go(closed, tmp_path / "disk")
+    assert check(there).problems == ()
 
 
 def test_another_file_of_that_name_is_not_overwritten(closed: Path, tmp_path: Path) -> None:
