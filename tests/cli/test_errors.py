@@ -22,6 +22,7 @@ INTERNAL = {  # caught where they arise, and told as another error or as an even
     "dappled.durable.NoPlainFileError",
     "dappled.drivers.gphoto2.protocol.SessionError",
     "dappled.drivers.mavlink.ulog_reader.FieldsError",
+    "dappled.drivers.raw.reading.UnfitFileError",
     "dappled.mocks.body.ptp.MalformedPacketError",
 }
 
