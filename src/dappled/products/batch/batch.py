@@ -193,8 +193,7 @@ def make(job: Job) -> Done:
         error = _why(job, caught)
     seconds, cpu = round(time.monotonic() - began, 3), round(time.process_time() - cpu, 3)
     name, doubts = Path(job.flight).name, () if making is None else making.frame.doubts
-    nats = None if making is None else making.frame.mask_nats
-    nats = job.flown_nats if nats is None else nats
+    nats = job.flown_nats if making is None else making.frame.mask_nats
     return Done(job.key, name, job.frame.name, tuple(outputs), error, seconds, cpu, _peak_mb(), refused, doubts, nats)
 
 
@@ -264,7 +263,9 @@ def _making(job: Job) -> _Making:
     if isinstance(job.station, DappledError) and set(job.kinds) <= set(PLACED):
         raise job.station
     given = {"focal_length_mm": job.options.focal_length_mm, "f_number": job.options.f_number}
-    frame = laboratory(job.recipe).frame(Path(job.flight), job.frame, job.tag, **given, told=job.told)
+    frame = laboratory(job.recipe).frame(
+        Path(job.flight), job.frame, job.tag, **given, told=job.told, flown_nats=job.flown_nats
+    )
     return _Making(job, frame)
 
 

@@ -49,8 +49,9 @@ class Options:
     `ground_m` is the ground's height above sea level (default: home's); `terrain` a raster file, with ellipsoidal
     heights where `terrain_geoid` is given. `gsd_m` defaults to the finest of the frames'. `view` is "mean" (the picture
     at the sensor's own resolution), "ground" (all views, refocused on the ground) or "v,u". `focus_m` is the distance
-    at which the lens was focused. `frames` holds the frames' numbers. `as_flown`: camera, mask and focal length
-    are those of decoding in flight, so that what this told of the mask counts where no light field is made.
+    at which the lens was focused. `frames` holds the frames' numbers. `as_flown`: camera, mask, calibration
+    and focal length are those of decoding in flight, so that what this told of the mask counts where no light field is
+    made.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -154,7 +155,7 @@ def survey(
     taken: list[Photograph] = []
     with processes.Crew(workers) as crew:
         told = _told(recipe, stations, files, crew, progress) if options.view == MEAN else {}
-        develop = _Developing(flight, recipe, options, projection.name, scratch, watch, told)
+        develop = _Developing(flight, recipe, options, projection.name, scratch, watch, told, flown)
         with closing(crew.in_order(stations, develop, _lost)) as made:
             for number, station in enumerate(stations):
                 progress("develop", number, len(stations))
@@ -162,8 +163,7 @@ def survey(
                 if isinstance(one, DappledError):
                     left.append((station.frame.name, str(one)))
                 else:
-                    nats = flown.get(station.frame.index) if one.mask_nats is None else one.mask_nats
-                    taken.append(replace(_from_shelf(one, scratch), mask_nats=nats))
+                    taken.append(_from_shelf(one, scratch))
     progress("develop", len(stations), len(stations))
     return on_ground(flight.name, taken, left, projection=projection, level_m=level, options=options)
 
@@ -198,6 +198,7 @@ class _Developing:
     scratch: Path
     watch: Watch | None
     told: Mapping[int, tuple[ToldShadow, ...]]
+    flown: Mapping[int, float]
 
     @cached_property
     def projection(self) -> Projection:
@@ -211,7 +212,7 @@ class _Developing:
             frame = laboratory(self.recipe).frame(
                 self.flight, station.frame, station.tag,
                 focal_length_mm=options.focal_length_mm, f_number=options.f_number,
-                told=self.told.get(station.frame.index, ()),
+                told=self.told.get(station.frame.index, ()), flown_nats=self.flown.get(station.frame.index),
             )  # fmt: skip
             one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
             if self.watch is not None:

@@ -44,10 +44,12 @@ class Laboratory:
         focal_length_mm: float | None = None,
         f_number: float | None = None,
         told: Sequence[ToldShadow] = (),
+        flown_nats: float | None = None,
     ) -> FlightFrame:
-        """One frame of a flight (see `exposure`), and what frames beside it have `told` of the mask's shadow."""
+        """One frame of a flight (see `exposure`), what frames beside it have `told` of the mask's shadow, and what
+        decoding in flight told of the mask."""
         one = exposure(flight, frame, tag, focal_length_mm=focal_length_mm, f_number=f_number)
-        return FlightFrame(self, one.path, one.focal_length_mm, one.f_number, told)
+        return FlightFrame(self, one.path, one.focal_length_mm, one.f_number, told, flown_nats)
 
 
 _here = threading.local()  # a decoder keeps buffers: one for each working thread
@@ -131,6 +133,7 @@ class FlightFrame:
     focal_length_mm: float | None
     f_number: float | None
     told: Sequence[ToldShadow] = ()
+    flown_nats: float | None = None
     _found: dict[str, tuple[Finding, ...]] = field(default_factory=dict)
     _kept: dict[str, Photograph] = field(default_factory=dict)  # by projection
 
@@ -148,8 +151,10 @@ class FlightFrame:
 
     @property
     def mask_nats(self) -> float | None:
-        """The log odds that the mask is where it was calibrated; None where no light field was made, or none tells."""
-        return self.decoded.report.mask_nats if "decoded" in self._found else None
+        """The log odds that the mask is where it was calibrated: by the light field, where one was made and tells, else
+        by decoding in flight; None where neither tells."""
+        own = self.decoded.report.mask_nats if "decoded" in self._found else None
+        return self.flown_nats if own is None else own
 
     def photograph(self, station: Station, projection: Projection, *, view: str, focus_m: float) -> Photograph:
         """The frame on the map: its picture for `view` "mean", else views, see `photographs.photograph`. Raises
