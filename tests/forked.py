@@ -64,7 +64,7 @@ class Forks:
             if not (ours.on and _forkable(told, ours._loaded_in) and ours._fork(process, told)):
                 ours._start(process, *given)
 
-        subprocess.Popen._execute_child = start  # type: ignore[attr-defined]
+        subprocess.Popen._execute_child = start  # type: ignore[attr-defined]  # as above
 
     def close(self) -> None:
         """End the process that forks."""
@@ -198,7 +198,7 @@ def _serve(asked: socket.socket) -> dict[str, Any] | None:
 def _become(call: dict[str, Any], fds: list[int]) -> None:
     """Be the process that was asked for, up to its first module."""
     while os.getppid() != call["parent"]:
-        time.sleep(0.0002)
+        time.sleep(0.0002)  # the kernel tells nobody that a process has another parent
     wanted = [0, 1, 2, *call["kept"]]
     high = max(wanted) + 1
     copies = [fcntl.fcntl(fd, fcntl.F_DUPFD, high) for fd in fds]
