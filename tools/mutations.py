@@ -415,6 +415,13 @@ MUTATIONS = (
         ("daemon/navigation/test_pose_quality.py",),
     ),
     Mutation(
+        "the reach of a mark grows as the interval gets shorter",
+        "products/geotags/mark_matching.py",
+        "_GAP_SHARE * np.minimum(gaps",
+        "_GAP_SHARE / np.minimum(gaps",
+        ("products/geotags/test_marks.py",),
+    ),
+    Mutation(
         "a process is started again without end",
         "daemon/supervised_process.py",
         "            self._budget.spend(self._clock.monotonic_ns())\n",

@@ -307,8 +307,7 @@ def test_the_marks_antenna_has_a_lever_arm_of_its_own(tmp_path: Path) -> None:
     assert there.camera.altitude_msl_m - here.camera.altitude_msl_m == pytest.approx(-0.2, abs=1e-3)
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 2.0, 5.0])
-@pytest.mark.parametrize("utc_known", [True, False])
+@pytest.mark.parametrize(("rate_hz", "utc_known"), [(1.0, True), (2.0, False), (5.0, True), (5.0, False)])
 def test_no_shot_ever_gets_another_ones_mark(rate_hz: float, utc_known: bool) -> None:
     """Even and uneven flights with lost and extra marks, and one shot whose time is hardly known: right, or refused."""
     rng = np.random.default_rng(round(rate_hz))
@@ -332,6 +331,16 @@ def test_no_shot_ever_gets_another_ones_mark(rate_hz: float, utc_known: bool) ->
             assert all(truth.get(times[mark]) == shot for shot, mark in found.pairs), trial
             assert len(found.pairs) >= len(truth) - 2
     assert refused <= (0 if utc_known and rate_hz < 5 else 10)
+
+
+@pytest.mark.parametrize(("interval_s", "off_s", "its_own"), [(0.2, 0.06, True), (0.2, 0.11, False), (10.0, 0.5, True)])
+def test_a_mark_that_is_nearer_to_the_next_shot_is_not_its_own(interval_s: float, off_s: float, its_own: bool) -> None:
+    """Shot 7's time is hardly known: up to 0.4 of the interval, and no more, says which mark is its own."""
+    begins = np.arange(20) * interval_s
+    marks = [float(at) + off_s * (i == 7) for i, at in enumerate(begins)]
+    shots = [TimedShot(i, float(at), 0.3 if i == 7 else 0.002) for i, at in enumerate(begins)]
+    found = pair(shots, marks, utc_known=True, most_s=10.0)
+    assert set(found.pairs) == {(i, i) for i in range(20) if i != 7 or its_own}
 
 
 def test_a_covariance_keeps_its_axes() -> None:
