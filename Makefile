@@ -70,8 +70,9 @@ test-long: everything peers ## soaks, sweeps, matrices and benchmarks, and prope
 
 tier:
 	@failed=0; \
-	$(BIN)/mypy || failed=1; \
+	$(BIN)/mypy & types=$$!; \
 	$(BIN)/pytest -q --no-header -m "$(OF) and not alone" --durations=25 $(BESIDE) $(call MARKED,slow|long) || failed=1; \
+	wait $$types || failed=1; \
 	$(BIN)/pytest -q --no-header -m "$(OF) and alone" --durations=15 $(call MARKED,alone) || failed=1; \
 	[ -z "$(PROPERTIES)" ] || $(BIN)/pytest -q --no-header -m "hypothesis and not slow" --hypothesis-profile $(PROPERTIES) $(BESIDE) || failed=1; \
 	exit $$failed

@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import forked, left_behind
+from tests import forked, left_behind, shared
 
 # No test fails for the speed of the machine it runs on, nor by chance: by default the examples are the same each time.
 settings.register_profile("many", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=300)
@@ -136,6 +136,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no test data at {folder} (set DAPPLED_DATA)")
     return folder
+
+
+@pytest.fixture
+def types_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What mypy keeps of the modules that programs of users import: one program after another."""
+    with shared.alone(shared.folder_of_run(tmp_path_factory), "mypy") as folder:
+        yield folder
 
 
 def pytest_configure() -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import fcntl
 import os
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
 
@@ -20,6 +21,15 @@ def folder_of_run(factory: pytest.TempPathFactory) -> Path:
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     folder.mkdir(exist_ok=True)
     return folder
+
+
+@contextmanager
+def alone(folder: Path, name: str) -> Iterator[Path]:
+    """A folder that one worker uses at a time."""
+    with (folder / f"{name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        (folder / name).mkdir(exist_ok=True)
+        yield folder / name
 
 
 def once(folder: Path, name: str, make: Callable[[], Made]) -> Made:

@@ -152,12 +152,12 @@ def documented(page: str) -> str:
 
 
 @pytest.mark.slow
-def test_a_typed_program_and_the_documented_ones_pass_mypy_strict(tmp_path: Path) -> None:
+def test_a_typed_program_and_the_documented_ones_pass_mypy_strict(tmp_path: Path, types_cache: Path) -> None:
     programs = {"program.py": TYPED, **{f"{page}.py": documented(f"{page}.md") for page in ("api", "products")}}
     for name, text in programs.items():
         assert "dappled.open(" in text
         (tmp_path / name).write_text(text, encoding="utf-8")
-    words = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path / "cache"), *sorted(programs)]
+    words = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(types_cache), *sorted(programs)]
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, timeout=110, check=False)
     assert "no issues found" in done.stdout, done.stdout + done.stderr
 

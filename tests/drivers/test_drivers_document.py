@@ -68,8 +68,8 @@ def test_its_own_tests_pass_with_public_imports_alone(package: Path) -> None:
 
 
 @pytest.mark.slow
-def test_it_is_typed(package: Path) -> None:
-    printed = run(package, "mypy", "--strict", "--cache-dir", str(package / "cache"), "your_package", "test_camera.py")
+def test_it_is_typed(package: Path, types_cache: Path) -> None:
+    printed = run(package, "mypy", "--strict", "--cache-dir", str(types_cache), "your_package", "test_camera.py")
     assert "no issues found in 3 source files" in printed
 
 
