@@ -6,7 +6,6 @@ import configparser
 import gc
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -29,7 +28,7 @@ from dappled.errors import DappledError
 from dappled.flight import FlightsLock, LedgerReader, flight_report
 from dappled.mocks.autopilot.autopilot import Autopilot
 from dappled.mocks.simulation import free_port
-from tests.system.conftest import dappled
+from tests.system.conftest import dappled, tells_of_no_problem
 from tests.waiting import eventually
 
 HELD_UP = 0.2  # of the objects of the process may be looked at while it flies
@@ -128,11 +127,9 @@ def test_frames_that_could_not_be_decoded_are_said_and_a_run_ends_regularly_with
     assert flight.balance.balanced
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("burning", [0, pytest.param(2, marks=pytest.mark.long)], ids=["calm", "both cores loaded"])
-def test_a_run_that_goes_well_tells_of_no_problem(tmp_path: Path, burning: int) -> None:
-    """Every line on a person's screen is one of these: no warning of a library, no death of a process, no "problem"."""
-    load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(burning)]
+@pytest.mark.long
+def test_a_run_beside_loaded_cores_tells_of_no_problem(tmp_path: Path) -> None:
+    load = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
     try:
         done = dappled("run", "--simulate", "--frames", "4", "--for", "300", cwd=tmp_path, timeout_s=360)
     finally:
@@ -140,12 +137,7 @@ def test_a_run_that_goes_well_tells_of_no_problem(tmp_path: Path, burning: int) 
             one.kill()
             one.wait()
     assert done.returncode == 0, done.stderr
-    assert re.fullmatch(r"(00000[0-3]  IMAGE_START_CAPTURE [^\n]* carriers [^\n]*\n){4}", done.stdout)
-    head = ("simulating ", "flight ", "stream ", "console ", "camera ready", "waiting for ")
-    *told, last = done.stderr.splitlines()
-    assert [line for line in told if not line.startswith(head)] == []
-    assert last == "4 shots: 4 frames safe, 4 decoded, 0 with a problem"
-    assert not re.search("problem|PROBLEM|died|Warning|Traceback", done.stdout + "\n".join(told))
+    tells_of_no_problem(done.stdout, done.stderr, 4)
 
 
 def test_time_that_runs_out_before_the_frames_is_a_failure(config: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -40,6 +41,16 @@ def dappled(*arguments: str, cwd: Path | None = None, timeout_s: float = 240) ->
     """The `dappled` command in a process of its own."""
     command = [sys.executable, "-m", "dappled", *arguments]
     return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
+def tells_of_no_problem(out: str, err: str, frames: int) -> None:
+    """Every line on a person's screen is one of these: no warning of a library, no death of a process, no "problem"."""
+    assert re.fullmatch(rf"(\d{{6}}  IMAGE_START_CAPTURE [^\n]* carriers [^\n]*\n){{{frames}}}", out)
+    head = ("simulating ", "flight ", "stream ", "console ", "camera ready", "waiting for ")
+    *told, last = err.splitlines()
+    assert [line for line in told if not line.startswith(head)] == []
+    assert last == f"{frames} shots: {frames} frames safe, {frames} decoded, 0 with a problem"
+    assert not re.search("problem|PROBLEM|died|Warning|Traceback", out + "\n".join(told))
 
 
 def until_it_listens(process: subprocess.Popen[Any]) -> None:

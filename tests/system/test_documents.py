@@ -16,7 +16,14 @@ from dappled.daemon.pipeline import repeats
 from tests.system.documents import ROOT, Stage, commands, stage
 
 DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-LONG = ("README.md", "decoding.md", "maps.md", "products.md")  # their commands cost a core half a minute or more
+LONG = (
+    "README.md",
+    "decoding.md",
+    "maps.md",
+    "operating.md",
+    "products.md",
+    "wire.md",
+)  # their commands cost a core half a minute or more
 
 
 def test_the_readme_s_first_screen_says_what_one_gains_and_what_it_costs() -> None:

@@ -19,7 +19,7 @@ from dappled.cli import main
 from dappled.flight import LedgerReader, flight_report
 from dappled.flight.checks import flight_check
 from tests.schemas import schema
-from tests.system.conftest import FRAMES, Flown, dappled, flip
+from tests.system.conftest import FRAMES, Flown, dappled, flip, tells_of_no_problem
 
 
 def test_every_wish_became_one_frame(flown: Flown) -> None:
@@ -46,6 +46,10 @@ def test_a_line_was_printed_for_each_frame(flown: Flown) -> None:
         assert line.startswith(f"{index:06d}  IMAGE_START_CAPTURE #")
         for word in ("50 mm", "carriers", "roll", "MB", "decode"):
             assert word in line
+
+
+def test_a_run_that_goes_well_tells_of_no_problem(flown: Flown) -> None:
+    tells_of_no_problem(flown.out, flown.err, FRAMES)
 
 
 def test_frames_are_raw_files_that_libraw_opens(flown: Flown) -> None:
@@ -151,24 +155,24 @@ def test_verify_needs_a_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.slow
-def test_a_new_recipe_writes_beside_the_old_results(copied: Path) -> None:
+def test_a_new_recipe_writes_beside_the_old_results(copied: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Without a calibration, as if it had been lost: its own run, which verifies, and the flight's own still does."""
     (shipped,) = (copied / "inputs" / "masks").glob("*.toml")
-    done = dappled("replay", str(copied), "--mask", str(shipped), "--camera", "reference-36mm", "--run", "again")
-    assert done.returncode == 0, done.stderr
-    assert "as run again" in done.stderr
+    again = ["--mask", str(shipped), "--camera", "reference-36mm", "--run", "again"]
+    assert main(["replay", str(copied), *again]) == 0
+    assert "as run again" in capfd.readouterr().err
     with LedgerReader.open(copied / "flight.sqlite") as ledger:
         assert ledger.runs() == {"live": FRAMES, "again": FRAMES}
     for words in (["--run", "again"], []):
-        verified = dappled("replay", str(copied), "--verify", *words)
-        assert verified.returncode == 0, verified.stdout + verified.stderr
-    assert f"again: {FRAMES} frames decoded again" in dappled("flight", "show", str(copied)).stdout
+        assert main(["replay", str(copied), "--verify", *words]) == 0
+    capfd.readouterr()
+    assert main(["flight", "show", str(copied)]) == 0
+    assert f"again: {FRAMES} frames decoded again" in capfd.readouterr().out
     with closing(sqlite3.connect(copied / "flight.sqlite")) as ledger_file, ledger_file:
         ledger_file.execute("DELETE FROM results WHERE idx = 1 AND run = 'again'")
     ledger_file.close()
-    spoilt = dappled("replay", str(copied), "--verify", "--run", "again")
-    assert spoilt.returncode == 1
-    assert "frame 1: the record holds no hash of its slices" in spoilt.stderr
+    assert main(["replay", str(copied), "--verify", "--run", "again"]) == 1
+    assert "frame 1: the record holds no hash of its slices" in capfd.readouterr().err
 
 
 def test_flight_verbs_read_it(flown: Flown, capsys: pytest.CaptureFixture[str]) -> None:

@@ -183,7 +183,7 @@ def test_decoding_is_switched_from_the_ground_and_the_flight_says_so(tmp_path: P
     assert verified.stdout.endswith("verified 2 frames: all hashes the same (1 left undecoded in flight)\n")
 
 
-@pytest.mark.slow
+@pytest.mark.long  # its sibling without processes: tests/daemon/test_flight_handover.py
 @pytest.mark.timeout(600)
 def test_another_law_set_from_the_ground_begins_the_next_flight_and_both_verify(tmp_path: Path) -> None:
     port = free_port()

@@ -82,7 +82,7 @@ def lawful(plan: Plan, folder: Path) -> VirtualFlight:
     return flown
 
 
-@pytest.mark.parametrize("plan", [TWO_MINUTES, pytest.param(TEN_MINUTES, marks=pytest.mark.slow)], ids=["2", "10"])
+@pytest.mark.parametrize("plan", [TWO_MINUTES, pytest.param(TEN_MINUTES, marks=pytest.mark.long)], ids=["2", "10"])
 def test_minutes_over_a_bad_link_are_lawful(plan: Plan, tmp_path: Path) -> None:
     """Two cuts of the links, packets lost, doubled and late, and every fiftieth shot a failure."""
     flown = lawful(plan, tmp_path)
