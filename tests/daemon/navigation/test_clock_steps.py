@@ -127,7 +127,7 @@ def test_a_request_that_a_link_held_is_known_as_late(answers: bool, fast_port: b
             assert doubts[0].facts["late_s"] == pytest.approx(late_s, abs=0.1)
 
 
-@pytest.mark.parametrize("by_s", [0.12, 0.4, -0.12, -0.4, 1.5])
+@pytest.mark.parametrize("by_s", [0.12, -0.4, 1.5])
 def test_a_pose_next_to_a_step_is_in_doubt_and_those_around_it_are_right(by_s: float) -> None:
     """The clock steps at 20.05 s, between two answers (20.02 and 20.22 s)."""
     boot = BootTime(drift=20e-6, jumps=((20.05, by_s),))

