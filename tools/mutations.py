@@ -191,8 +191,8 @@ MUTATIONS = (
     Mutation(
         "sigma of a distance is halved",
         "decode/depth/ranging.py",
-        "np.hypot(distance**2 * error / np.float32(self.gain_px_m)",
-        "np.hypot(distance**2 * error / np.float32(2 * self.gain_px_m)",
+        "sigma = np.sqrt(variance) * distance_m**2 / self.gain_px_m",
+        "sigma = np.sqrt(variance) * distance_m**2 / (2 * self.gain_px_m)",
         ("decode/depth/test_ranging.py",),
     ),
     Mutation(

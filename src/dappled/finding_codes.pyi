@@ -385,6 +385,7 @@ class Code(StrEnum):
     SHOT_WITHOUT_FRAME = "shot.without_frame"
     STAGE_BEHIND = "stage.behind"
     TAG_OTHER_BYTES = "tag.other_bytes"
+    TARGETS_DISAGREE = "targets.disagree"
     TASK_FAILING = "task.failing"
     TELEMETRY_BLOCK_CHANGED = "telemetry.block_changed"
     TELEMETRY_BLOCKS_MISSING = "telemetry.blocks_missing"

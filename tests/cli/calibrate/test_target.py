@@ -11,9 +11,11 @@ from typing import Any
 import pytest
 
 from dappled.cli import main
-from dappled.cli.calibrate.target import from_frames
+from dappled.cli.calibrate.target import from_frames, misfits
+from dappled.decode.depth.ranging import Target, fit_targets
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.errors import DappledError
+from dappled.findings import Code
 from dappled.mocks.scene.masked_camera import reference_camera
 from tests.system.test_depth import target
 
@@ -36,7 +38,7 @@ def test_targets_lead_to_metres(folder: Path, capsys: pytest.CaptureFixture[str]
     with_mask = ["--mask", "reference-5x5", "--calibration", str(folder / "c.toml")]
     frames = [str(folder / f"{metres}.dng") for metres in (2, 6)]
     assert main(["calibrate", *frames, "--target", "2", "6", *with_mask, "-o", str(folder / "m.toml")]) == 0
-    assert "px·m" in capsys.readouterr().out
+    assert "in focus at" not in capsys.readouterr().out  # the lens is focused at infinity
     told = tomllib.loads((folder / "m.toml").read_text())["ranging"]
     assert told["gain_px_m"] == pytest.approx(33.5, rel=0.01)
     words = ["--mask", "reference-5x5", "--calibration", str(folder / "m.toml"), "-o", str(folder / "lf.npz")]
@@ -75,6 +77,16 @@ def test_targets_without_a_distance_each_are_told_before_a_frame_is_read(
     assert main(["calibrate", *words, "--target", "2"]) == 1
     assert "give --target one distance per frame" in capsys.readouterr().err
     assert sorted(tmp_path.iterdir()) == frames
+
+
+def test_a_target_at_another_distance_than_was_told_is_named() -> None:
+    paths = [Path(f"{metres}.dng") for metres in (2, 3, 6)]
+    for told, named in ((3.0, []), (3.1, [(Code.TARGETS_DISAGREE, "3.dng")])):
+        targets = [Target(z, 33.5 / z - 16.0, 0.02) for z in (2.0, 3.0, 6.0)]
+        targets[1] = replace(targets[1], distance_m=told)
+        found = misfits(fit_targets(targets, f_number=7.4), paths, targets)
+        assert [(one.code, one.subject.which) for one in found] == named
+    assert misfits(fit_targets(targets[:2], f_number=7.4), paths[:2], targets[:2]) == []
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled.cli import main
+from dappled.decode.depth import Ranging
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.georeference import Survey
@@ -51,7 +52,8 @@ def told(eye: Eye, ground: Raster, sigma: float, rng: np.random.Generator | None
     if rng is not None:
         errors = rng.normal(0, sigma, (rows // BLOCK + 1, columns // BLOCK + 1))
         inverse = inverse + np.kron(errors, np.ones((BLOCK, BLOCK)))[:rows, :columns]
-    return InverseDepth(inverse.astype(np.float32), np.full((rows, columns), sigma, np.float32), 0.0, "a test", GRID)
+    sigmas = np.full((rows, columns), sigma, np.float32)
+    return InverseDepth(inverse.astype(np.float32), sigmas, Ranging(1.0, 0.0, source="a test"), GRID)
 
 
 def flight(count: int, ground: Flat | Raster | None = None, height_m: float = 40.0) -> Survey:

@@ -10,6 +10,7 @@ from dappled import codec, durable
 from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Report
 from dappled.errors import DappledError, counted
+from dappled.findings import Code, Finding, Subject, finding, of_subject
 
 if not words_only:
     import tomli_w
@@ -17,10 +18,13 @@ if not words_only:
     from dappled.config import profiles
     from dappled.decode.depth import RANGING, Ranging
     from dappled.decode.depth.ranging import Target, fit_targets, target_shift
+    from dappled.decode.lightfield import ViewStack
     from dappled.drivers.raw import calibration_files
     from dappled.drivers.raw.darkroom import Darkroom, Recipe
     from dappled.products import opened
     from dappled.products.opened import OpenedLightField
+
+_FAR_SIGMAS = 4.0  # 1 in 10⁴ of normal errors is beyond it
 
 
 def calibrated(
@@ -35,19 +39,23 @@ def calibrated(
     """Fit the ranging, and write it with the calibration that the frames were decoded with."""
     if to.suffix != ".toml":
         raise DappledError(f"{to}: the name of a calibration with distances must end in .toml")
-    found, targets = from_frames(recipe, frames, metres, focal_length_mm, output)
+    found, targets, doubts, stack = from_frames(recipe, frames, metres, focal_length_mm, output)
     written = _write(recipe, to, found)
     lines = []
     for path, target in zip(frames, targets, strict=True):
         clear = target.shift_px - found.offset_px
         says = f"{found.gain_px_m / clear:.3g} m" if clear > 0 else "beyond infinity"
-        shift = f"{target.shift_px:.3f} px over the aperture; by the fit {says}"
+        shift = f"{target.shift_px:.3f} ± {target.sigma_px:.3f} px over the aperture; by the fit {says}"
         lines.append(f"{path.name}: {target.distance_m:g} m, {shift}")
-    lines.append(f"shift = {found.gain_px_m:.4g} px·m / distance {found.offset_px:+.4g} px, from {found.source}")
-    if found.offset_px < 0:
-        lines.append(f"in focus at {-found.gain_px_m / found.offset_px:.4g} m")
+    gain = f"{found.gain_px_m:.4g} ± {found.gain_sigma_share * found.gain_px_m:.2g} px·m"
+    offset = f"{found.offset_px:+.4g} ± {found.offset_sigma_px:.2g} px"
+    lines.append(f"shift = {gain} / distance {offset}, from {found.source}")
+    focus = found.focus(stack)
+    if focus is not None:
+        lines.append("in focus at {:.4g} ± {:.1g} m".format(*focus))
     lines.append(f"written to {', '.join(map(str, written))}")
-    return Report({"targets": codec.plain(targets), **codec.plain(found)}, lines)
+    values = {"targets": codec.plain(targets), **codec.plain(found), "focus_m": focus, "doubts": codec.plain(doubts)}
+    return Report(values, lines, findings=doubts)
 
 
 def from_frames(
@@ -56,13 +64,18 @@ def from_frames(
     metres: Sequence[float],
     focal_length_mm: float | None = None,
     output: Output | None = None,
-) -> tuple[Ranging, list[Target]]:
-    """The ranging that frames of targets show, and what each target showed. Raises DappledError."""
+) -> tuple[Ranging, list[Target], list[Finding], ViewStack]:
+    """The ranging that frames of targets show, what each target showed, what puts it in doubt, and the last
+    frame's views.
+
+    Raises DappledError.
+    """
     if len(frames) != len(metres):
         both = f"{counted(len(frames), 'frame')} and {counted(len(metres), 'distance')}"
         raise DappledError(f"{both}: give --target one distance per frame")
     darkroom = Darkroom(recipe)
     targets: list[Target] = []
+    doubts: list[Finding] = []
     stops: set[float | None] = set()
     lengths: set[float | None] = set()
     lens: Ranging | None = None
@@ -72,13 +85,24 @@ def from_frames(
         field = OpenedLightField(made.light_field, path)
         with darkroom.naming(path):
             targets.append(Target(distance, *target_shift(field.depth(), field.stack)))
+        doubts += of_subject(made.doubts, Subject("frame", path.name))
         stops.add(None if recipe.mask == profiles.LENSLET else field.attributes.get("f_number"))
         lengths.add(field.attributes.get("focal_length_mm"))
         lens = opened.lens_ranging(field.field, float("inf"))
     for several, name in ((stops, "f-numbers"), (lengths, "focal lengths")):
         if len(several) > 1:
             raise DappledError(f"the targets were taken at several {name} ({_listed(several)}): take them all at one")
-    return fit_targets(targets, f_number=stops.pop(), focal_length_mm=lengths.pop(), lens=lens), targets
+    found = fit_targets(targets, f_number=stops.pop(), focal_length_mm=lengths.pop(), lens=lens)
+    return found, targets, doubts + misfits(found, frames, targets), field.stack
+
+
+def misfits(found: Ranging, frames: Sequence[Path], targets: Sequence[Target]) -> list[Finding]:
+    """What tells of a wrong distance, or of a lens that was focused in between: three or more targets on no line."""
+    off = [abs(found.gain_px_m / one.distance_m + found.offset_px - one.shift_px) / one.sigma_px for one in targets]
+    path, sigmas = max(zip(frames, off, strict=True), key=lambda pair: pair[1])
+    if len(targets) < 3 or sigmas < _FAR_SIGMAS:
+        return []
+    return [finding(Code.TARGETS_DISAGREE, Subject("frame", path.name), sigmas=sigmas)]
 
 
 def _listed(values: set[float | None]) -> str:

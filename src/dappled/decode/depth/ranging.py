@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,21 @@ RANGING = "ranging"  # the attribute of light fields, and the table of calibrati
 _FARTHEST_SIGMAS = 2.0  # a shift that is not clear of infinity by so many standard errors has no distance
 _ROUNDED_MM = 0.5  # files and bodies may round focal lengths to whole millimetres
 _NOMINAL = 0.02  # f-numbers and focal lengths are rounded, and nominal
+# px from view to view that planes of drawn texture are off by behind a round stop, beyond their scatter: from the line
+# through all distances, rms, and together. Behind a square stop 0.0003 and 0.001.
+_BENT, _TOGETHER = 0.0017, 0.0075
+_FEW = 8  # blocks: the scatter of fewer is known to a quarter at best
 _FRESH_DISTANCES = 1.01  # targets whose distances differ by less tell the offset only
 
 
 @dataclass(frozen=True, slots=True)
 class Ranging:
     """S = `gain_px_m`/Z + `offset_px`, for a lens at `f_number` (None: the scale doesn't depend on it, as under
-    lenslets) and one focal length (None: unknown). `source` says in words where it is from, `gain_sigma_share` how
-    well the gain is known, as a share of it: all distances are off together by as much."""
+    lenslets) and one focal length (None: unknown). `source` says in words where it is from.
+
+    How well both are known, which all distances have in common: `gain_sigma_share` is the gain's standard error as a
+    share of it, `offset_sigma_px` the offset's, `covariance_px2_m` that of both, px²·m. An offset by the lens' focus is
+    taken as exact."""
 
     gain_px_m: float
     offset_px: float
@@ -39,6 +46,8 @@ class Ranging:
     source: str = "calibration"
     gain_sigma_share: float = 0.0
     focal_length_mm: float | None = None
+    offset_sigma_px: float = 0.0
+    covariance_px2_m: float = 0.0
 
     def __post_init__(self) -> None:
         """Raises DecodeError for numbers that are impossible for a lens."""
@@ -65,13 +74,25 @@ class Ranging:
 
         Raises DecodeError for another focal length, or where only one of the two is known: a zoom changes gain and
         offset in a way that Eq 5 alone doesn't describe. A difference that rounding may hide (half a millimetre) is
-        added to the gain's σ.
+        added to their errors, and that f-numbers are nominal where it is another.
         """
-        made = replace(self, gain_sigma_share=math.hypot(self.gain_sigma_share, self._zoom_share(focal_length_mm)))
-        if self.f_number is None or f_number is None:
-            return made
-        scale = self.f_number / f_number
-        return replace(made, gain_px_m=self.gain_px_m * scale, offset_px=self.offset_px * scale, f_number=f_number)
+        share = self._zoom_share(focal_length_mm)
+        if self.f_number is None or f_number is None or f_number == self.f_number:
+            return self._less_sure(share)
+        made, scale = self._less_sure(math.hypot(share, _NOMINAL)), self.f_number / f_number
+        return replace(
+            made, gain_px_m=self.gain_px_m * scale, offset_px=self.offset_px * scale, f_number=f_number,
+            offset_sigma_px=made.offset_sigma_px * scale, covariance_px2_m=made.covariance_px2_m * scale**2,
+        )  # fmt: skip
+
+    def _less_sure(self, share: float) -> Ranging:
+        """The same with gain and offset off together by a share of both, as a scale is."""
+        return replace(
+            self,
+            gain_sigma_share=math.hypot(self.gain_sigma_share, share),
+            offset_sigma_px=math.hypot(self.offset_sigma_px, share * self.offset_px),
+            covariance_px2_m=self.covariance_px2_m + share**2 * self.gain_px_m * self.offset_px,
+        )
 
     def _zoom_share(self, focal_length_mm: float | None) -> float:
         """What a focal length this far from the calibrated one may change of the gain, which grows as its square."""
@@ -99,9 +120,31 @@ class Ranging:
         with np.errstate(invalid="ignore", divide="ignore"):
             known = beyond > _FARTHEST_SIGMAS * error
             distance = np.where(known, np.float32(self.gain_px_m) / beyond, np.float32(np.nan))
-            # Eq 5: σ_Z = Z²·σ_S/gain, and a gain that is a share off makes all distances as much
-            sigma = np.hypot(distance**2 * error / np.float32(self.gain_px_m), self.gain_sigma_share * distance)
-        return DistanceMap(distance.astype(np.float32), sigma.astype(np.float32))
+            sigma = self.sigma_m(distance, error)
+        return DistanceMap(distance.astype(np.float32), sigma)
+
+    @overload
+    def sigma_m(self, distance_m: float, shift_sigma_px: float = 0.0) -> float: ...
+    @overload
+    def sigma_m(self, distance_m: Map, shift_sigma_px: Map) -> Map: ...
+    def sigma_m(self, distance_m: Map | float, shift_sigma_px: Map | float = 0.0) -> Map | float:
+        """How well a distance is known whose shift is known so well: by 1/Z = (S − offset)/gain, with the gain's and
+        the offset's errors, which all distances have in common (alone: shift_sigma_px = 0)."""
+        inverse = 1 / distance_m
+        common = (self.gain_sigma_share * self.gain_px_m * inverse) ** 2 + self.offset_sigma_px**2
+        variance = shift_sigma_px**2 + np.maximum(common + 2 * self.covariance_px2_m * inverse, 0)
+        sigma = np.sqrt(variance) * distance_m**2 / self.gain_px_m
+        return float(sigma) if isinstance(distance_m, float) else np.asarray(sigma, np.float32)
+
+    def focus(self, stack: ViewStack) -> tuple[float, float] | None:
+        """(m, σ in m): where the lens is focused, by targets; None at infinity.
+
+        All shifts may be off together, which moves the focus, but no distance of what looks like the targets.
+        """
+        if self.offset_px >= 0:
+            return None
+        metres = -self.gain_px_m / self.offset_px
+        return metres, self.sigma_m(metres, _TOGETHER * _scale(stack))
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Ranging:
@@ -145,15 +188,16 @@ def fit_targets(
     focal_length_mm: float | None = None,
     lens: Ranging | None = None,
 ) -> Ranging:
-    """The ranging fitted to targets at known distances, by least squares in 1/Z.
+    """The ranging fitted to targets at known distances, by least squares in 1/Z, each weighted by its σ.
 
-    The gain's σ follows from the targets' σ, or from their misfit where that is larger. A single distance gives only
+    Its errors follow from the targets' σ, or from their misfit where that is larger. A single distance gives only
     the offset (the focus); the gain is then that of `lens`. Raises DecodeError without it.
     """
     if not targets:
         raise DecodeError("no target was seen")
     inverse = np.array([1 / t.distance_m for t in targets])
     shifts = np.array([t.shift_px for t in targets])
+    sigmas = np.array([t.sigma_px for t in targets])
     if not np.all(np.isfinite(inverse) & (inverse > 0)):
         raise DecodeError("targets must be at distances above 0 m")
     if inverse.max() / inverse.min() < _FRESH_DISTANCES:
@@ -161,21 +205,26 @@ def fit_targets(
             raise DecodeError(
                 "targets at a single distance give the focus but not the scale: add one at another distance"
             )
-        gain = lens.gain_px_m
-        offset = float(np.mean(shifts - gain * inverse))
-        source = f"{len(targets)} target(s) and the lens"
-        return Ranging(gain, offset, f_number, source, lens.gain_sigma_share, focal_length_mm)
-    design = np.column_stack([inverse, np.ones_like(inverse)])
-    gain, offset = np.linalg.lstsq(design, shifts, rcond=None)[0]
+        gain_sigma, away = lens.gain_sigma_share * lens.gain_px_m, float(inverse.mean())
+        return replace(
+            lens, offset_px=float(np.mean(shifts - lens.gain_px_m * inverse)), f_number=f_number,
+            source=f"{len(targets)} target(s) and the lens", focal_length_mm=focal_length_mm,
+            offset_sigma_px=math.hypot(float(np.hypot.reduce(sigmas)) / len(targets), gain_sigma * away),
+            covariance_px2_m=-(gain_sigma**2) * away,
+        )  # fmt: skip
+    weights = 1 / sigmas if sigmas.all() else np.ones_like(sigmas)
+    design = np.column_stack([inverse, np.ones_like(inverse)]) * weights[:, None]
+    solve = np.linalg.pinv(design)
+    gain, offset = (float(v) for v in solve @ (shifts * weights))
     if gain <= 0:
         raise DecodeError("nearer targets were seen with smaller shifts: are the distances in the order of the frames?")
-    by_target = np.linalg.pinv(design)[0]  # how each shift moves the gain
-    sigma = float(np.hypot.reduce(by_target * [t.sigma_px for t in targets]))
-    if len(targets) > 2:
-        misfit = shifts - design @ [gain, offset]
-        sigma = max(sigma, float(np.sqrt(misfit @ misfit / (len(targets) - 2) * (by_target @ by_target))))
-    source = f"{len(targets)} targets"
-    return Ranging(float(gain), float(offset), f_number, source, sigma / float(gain), focal_length_mm)
+    misfit = shifts * weights - design @ [gain, offset]
+    reach = float(misfit @ misfit) / (len(targets) - 2) if len(targets) > 2 else 0.0
+    covariance = solve @ solve.T * max(reach, float(sigmas.all()))
+    return Ranging(
+        gain, offset, f_number, f"{len(targets)} targets", math.sqrt(covariance[0, 0]) / gain, focal_length_mm,
+        math.sqrt(covariance[1, 1]), float(covariance[0, 1]),
+    )  # fmt: skip
 
 
 def target_shift(
@@ -183,21 +232,32 @@ def target_shift(
 ) -> tuple[float, float]:
     """The shift S of what fills the picture's middle (`share` of its height and width), and its standard error.
 
-    The median, each pixel counting by its variance, with one free measurement a `window`. Raises DecodeError where less
-    than a tenth of it is known.
+    The median, each pixel counting by its variance. Its error is that of the mean of blocks of a `window`, from their
+    scatter (of few blocks, by the pixels' σ with one free measurement a block), and `_BENT`. Raises DecodeError where
+    less than a tenth of it is known.
     """
-    height, width = depth.disparity.shape
-    cut = tuple(slice(round(n * (1 - share) / 2), max(round(n * (1 + share) / 2), 1)) for n in (height, width))
-    values, sigma = depth.disparity[cut].ravel(), depth.sigma[cut].ravel()
+    cut = tuple(slice(round(n * (1 - share) / 2), max(round(n * (1 + share) / 2), 1)) for n in depth.disparity.shape)
+    values, sigma = depth.disparity[cut], depth.sigma[cut]
     known = np.isfinite(values)
     if known.mean() < 0.1:
         raise DecodeError("the target in the picture's middle has too little texture: hang a printed page there")
     order = np.argsort(values[known])
     weight: NDArray[np.float64] = np.cumsum(1 / sigma[known][order].astype(np.float64) ** 2)
     middle = values[known][order][int(np.searchsorted(weight, weight[-1] / 2))]
-    free = max(float(known.sum()) / window**2, 1.0)
-    error = math.sqrt(math.pi / 2 / free) * float(np.median(sigma[known]))  # a median's, of normal errors
-    return float(middle) * _scale(stack), error * _scale(stack)
+    tiles = [values[y : y + window, x : x + window] for y, x in _corners(values.shape, window)]
+    medians = [np.median(tile[seen]) for tile in tiles if (seen := np.isfinite(tile)).mean() >= 0.5]
+    if len(medians) >= _FEW:
+        error = float(np.std(medians, ddof=1)) / math.sqrt(len(medians))
+    else:
+        free = max(float(known.sum()) / window**2, 1.0)
+        error = math.sqrt(math.pi / 2 / free) * float(np.median(sigma[known]))  # a median's, of normal errors
+    return float(middle) * _scale(stack), math.hypot(error, _BENT) * _scale(stack)
+
+
+def _corners(shape: tuple[int, ...], side: int) -> list[tuple[int, int]]:
+    """Where squares of a side begin that lie in an area of this shape beside each other."""
+    height, width = shape
+    return [(y, x) for y in range(0, height - side + 1, side) for x in range(0, width - side + 1, side)]
 
 
 def _scale(stack: ViewStack) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Singles
-from dappled.decode.depth import DepthMap
+from dappled.decode.depth import DepthMap, Ranging
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
 from dappled.products.maps.photographs import Photograph
@@ -26,14 +26,13 @@ class InverseDepth:
     errors; both NaN where the disparity is unknown.
 
     Inverse distances have errors that are normal and don't depend on the distance, and below 2 σ they can't be told
-    from infinity: so frames are averaged in them. `gain_sigma_share` is the common error of all distances as a share of
-    them, `source` where the distances come from; `grid` maps their pixels to the sensor, as in `LightField`.
+    from infinity: so frames are averaged in them. `ranging` made them, and tells what error they have in common; `grid`
+    maps their pixels to the sensor, as in `LightField`.
     """
 
     inverse_per_m: Singles
     sigma_per_m: Singles
-    gain_sigma_share: float
-    source: str
+    ranging: Ranging
     grid: NDArray[np.float64]
 
 
@@ -44,10 +43,7 @@ def of_field(found: OpenedLightField, made: DepthMap) -> InverseDepth:
         raise OpenError("views from a folder have no sensor, so they give only relative depth")
     share = np.float32(scale / ranging.gain_px_m)
     inverse = made.disparity * share - np.float32(ranging.offset_px / ranging.gain_px_m)
-    return InverseDepth(
-        inverse.astype(np.float32), (made.sigma * share).astype(np.float32), ranging.gain_sigma_share, ranging.source,
-        found.field.grid,
-    )  # fmt: skip
+    return InverseDepth(inverse.astype(np.float32), (made.sigma * share).astype(np.float32), ranging, found.field.grid)
 
 
 @dataclass(frozen=True, slots=True)

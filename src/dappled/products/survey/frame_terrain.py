@@ -105,7 +105,7 @@ def of(
     return FrameTerrain(
         grid, height, sigma, single, frames, None if isinstance(made.ground, Flat) else above,
         float(np.median([_level_sigma(one, depth, _level(one, made)) for one, depth in seen])),
-        float(np.nanmedian(above)), 1 / focus if focus > 0 else math.inf, seen[0][1].source,
+        float(np.nanmedian(above)), 1 / focus if focus > 0 else math.inf, seen[0][1].ranging.source,
         CONTRAST_WINDOW * gsd_m,
     )  # fmt: skip
 
@@ -297,4 +297,4 @@ def _level_sigma(one: Photograph, depth: InverseDepth, level_m: float) -> float:
     pixels = np.array([(x, y) for x in np.linspace(0, columns - 1, _FIELD) for y in np.linspace(0, rows - 1, _FIELD)])
     aside = (one.eye.on_plane(pixels, level_m) - one.eye.centre[:2]) / one.eye.scale
     turn = float(np.sqrt(np.mean(aside**2))) * one.attitude_sigma_rad
-    return math.hypot(one.position_sigma_m, turn, depth.gain_sigma_share * away)
+    return math.hypot(one.position_sigma_m, turn, depth.ranging.sigma_m(away))
