@@ -569,7 +569,7 @@ class MaskDecoder:
             rotation_rad=taken.rotation_rad + rest.turn_rad,
         )
         again = moved.width(distance_known=known.distance_fitted)
-        if width.fits and not again.fits:
+        if width.fits and again.contradicts(width):
             return found, width, rest.beyond(by_means, alone=True) if any(by_means) else None
         return moved.through(again), again, place
 

@@ -81,6 +81,16 @@ def test_views_behind_a_mask_that_moved_far_or_turned_are_right() -> None:
         assert views > mean - 1, changed
 
 
+@pytest.mark.slow
+def test_light_lost_at_the_corners_is_no_mask_that_moved() -> None:
+    """Patches placed it 9 um away, where the means of the slices, which are bright, would have turned: 22 dB."""
+    one = Mixture.disturbed(11)
+    assert one.changed == "falloff told_mm"
+    views, mean, doubted = _views(one)
+    assert views > mean - 4
+    assert not doubted
+
+
 @pytest.mark.long
 def test_what_changed_since_the_calibration_spoils_no_views_without_a_doubt() -> None:
     changed = [one for one in map(Mixture.disturbed, range(_LONG)) if one.changed]
