@@ -18,7 +18,7 @@ from dappled.errors import DappledError
 from dappled.products import opened
 from dappled.products.exports import mask_files
 from dappled.products.geotags import pos_file, sidecars
-from dappled.products.maps.rasters import open_raster
+from dappled.products.maps import ground
 
 DOORS: dict[str, Callable[[Path], object]] = {
     "a.cr2": reading.read,
@@ -28,7 +28,7 @@ DOORS: dict[str, Callable[[Path], object]] = {
     "b.npz": lambda path: arrays.read_npz(path, ["a"]),
     "a.h5": opened.light_field,
     "a.png": mask_files.read,
-    "a.tif": open_raster,
+    "a.tif": ground.check,
     "a.kml": area.read,
     "a.pos": pos_file.read,
     "a.bin": lambda path: list(dataflash.packets(path)),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import secrets
 import tempfile
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,6 +32,7 @@ if not words_only:
     from dappled.products.opened import OpenedLightField, OpenError
     from dappled.products.survey import flight_sweep, frame_terrain
     from dappled.products.survey.frame_depths import FrameDepths
+    from dappled.products.whole_files import whole
 
 _POINTS = (".ply", ".las", ".laz")
 _RASTERS, _PICTURES = (".tif", ".tiff"), (".png", ".jpg", ".jpeg")  # of a flight's heights
@@ -162,9 +161,11 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
             }  # fmt: skip
             if distances is not None:
                 arrays |= {"distance_m": distances.distance_m, "distance_sigma_m": distances.sigma_m}
-            _whole(path, lambda part: np.savez_compressed(part, allow_pickle=False, **arrays))
+            with whole(path) as part:
+                np.savez_compressed(part, allow_pickle=False, **arrays)
         elif kind == ".pfm":
-            _whole(path, lambda part: exports.write_pfm(part, made.disparity))
+            with whole(path) as part:
+                exports.write_pfm(part, made.disparity)
         elif kind in _POINTS:
             return self._points(path, found, distances)
         elif distances is not None:
@@ -250,18 +251,6 @@ def words(report: dict[str, Any]) -> list[str]:
             f"{counted(report['points'], 'point')}, {report['withheld']} omitted for their σ ({report['coordinates']})"
         )
     return lines + [f"written: {path}" for path in report.get("written", [])]
-
-
-def _whole(path: Path, write: Callable[[Path], None]) -> None:
-    """Write under another name, then rename, so that no half-written file is left. Raises OpenError."""
-    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
-    try:
-        write(part)
-        part.replace(path)
-    except OSError as error:
-        raise OpenError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _picture(values: NDArray[np.float32], unit: str) -> prints.Bytes:

@@ -94,7 +94,7 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path, kind: str, mon
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", refuse)
-    with pytest.raises(DappledError, match=r"cannot write the light field .*No space left"):
+    with pytest.raises(DappledError, match=r"can't be written: No space left"):
         save(path, replace(light_field(), attributes={}), overwrite=True)
     monkeypatch.undo()
     assert load(path).attributes == ATTRIBUTES

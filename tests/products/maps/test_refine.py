@@ -225,7 +225,7 @@ def test_bad_control_points_and_base_maps_are_sentences(exact: Case, tmp_path: P
     projection = exact.survey.projection
     path = tmp_path / "gcp.csv"
     for text, said in (
-        ("name,frame\n", "lacks the column column"),
+        ("name,frame\n", "has no column column"),
         ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,41,x,3\n", "line 2"),
         ("name,frame,column,row,latitude,longitude,altitude\na,0,1,2,141,9,3\n", "not a place on Earth"),
     ):

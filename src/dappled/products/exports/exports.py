@@ -10,13 +10,9 @@ from __future__ import annotations
 import configparser
 import math
 import os
-import secrets
-import shutil
 import struct
 import zlib
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +22,10 @@ from scipy import io
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
-from dappled.errors import DappledError, install_extra
+from dappled.errors import DappledError
 from dappled.products.exports import point_cloud, prints
+from dappled.products.extras import need
+from dappled.products.whole_files import whole
 
 ESLF_LENSLET_PX = 14  # LFToolbox' and LiFF's readers assume this size
 _LARGEST_MAT = 2**31 - 1  # bytes of one variable in a version 5 file
@@ -50,7 +48,7 @@ def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
     views = as_cameras(stack)
     white = prints.white_of([views])
 
-    def write(folder: Path) -> None:
+    with whole(path, fresh=True) as folder:
         folder.mkdir()
         for number, view in enumerate(views.reshape(-1, *views.shape[2:])):
             picture = prints.toned(view, white)
@@ -60,8 +58,6 @@ def hci(path: Path, field: LightField, depth: DepthMap | None = None) -> None:
             _parameters(field, stack, white, depth).write(file)
         if depth is not None:
             write_pfm(folder / "disp_estimate.pfm", depth.disparity)
-
-    _whole(path, write)
 
 
 def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
@@ -83,15 +79,14 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
     sheet[:, top : top + count_v, :, left : left + count_u] = values.transpose(order)
     flat = sheet.reshape(height * side, width * side, *colours)
 
-    def write(part: Path) -> None:
-        _png16(part, flat)
-
     beside = path.with_suffix(".txt")
     if beside.exists():
         raise DappledError(f"{beside} exists already; choose another name")
-    _whole(path, write)
+    with whole(path, fresh=True) as part:
+        _png16(part, flat)
     note = f"lenslet_px = {side}\nviews = {count_v} x {count_u}\nwhite = {white:.6g}\n"
-    _whole(beside, lambda part: part.write_text(note, encoding="utf-8"))
+    with whole(beside, fresh=True) as part:
+        part.write_text(note, encoding="utf-8")
 
 
 def mat(path: Path, field: LightField) -> None:
@@ -111,12 +106,8 @@ def mat(path: Path, field: LightField) -> None:
         "GeneratedByInfo": {"mfilename": "dappled"},
         "LFMetadata": {key: value for key, value in field.attributes.items() if isinstance(value, str | int | float)},
     }
-
-    def write(part: Path) -> None:
-        with part.open("wb") as file:
-            io.savemat(file, content, format="5", do_compression=True)
-
-    _whole(path, write)
+    with whole(path, fresh=True) as part, part.open("wb") as file:
+        io.savemat(file, content, format="5", do_compression=True)
 
 
 def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
@@ -139,11 +130,8 @@ def quilt(path: Path, field: LightField, *, disparity: float = 0.0) -> Path:
     sheet = np.concatenate(lines[::-1], axis=0)  # the first row is the lowest
     height, width = pictures[0].shape[:2]
     named = path.with_name(f"{path.stem}_qs{columns}x{rows}a{width / height:.3f}.png")
-
-    def write(part: Path) -> None:
-        Image.fromarray(sheet).save(part, format="PNG")
-
-    _whole(named, write)
+    with whole(named, fresh=True) as part:
+        Image.fromarray(sheet).save(part)
     return named
 
 
@@ -211,23 +199,6 @@ def _png16(path: Path, values: NDArray[np.uint16]) -> None:
             file.write(struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)))
 
 
-def _whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """`write` under another name, then rename. Raises DappledError where `path` exists, or the disk refuses."""
-    if path.exists():
-        raise DappledError(f"{path} exists already: move it away, or choose another name")
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
-        write(part)
-        part.rename(path)
-    except OSError as error:
-        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
-    finally:
-        if part.is_dir():
-            shutil.rmtree(part)
-        else:
-            part.unlink(missing_ok=True)
-
-
 def rerun(
     path: Path,
     field: LightField,
@@ -238,11 +209,11 @@ def rerun(
     """Write a recording (.rrd) for the Rerun viewer: `view/v/u`, `picture`, `disparity`, `sigma`, and `points` where
     distances are known. Nothing is sent anywhere. Raises DappledError without the extra `rerun`.
     """
-    rr = _rerun()
+    os.environ.setdefault("RERUN_ANALYTICS", "0")
+    rr = need("rerun")
     if path.suffix != ".rrd":
         raise DappledError(f"{path}: the name of a Rerun recording must end in .rrd")
-
-    def write(part: Path) -> None:
+    with whole(path, fresh=True) as part:
         recording = rr.RecordingStream("dappled")
         recording.save(str(part))
         stack = ViewStack.of(field)
@@ -260,14 +231,3 @@ def rerun(
             recording.log("points", rr.Points3D(cloud.points.astype(np.float32), colors=colours), static=True)
         recording.flush()
         recording.disconnect()
-
-    _whole(path, write)
-
-
-def _rerun() -> Any:
-    os.environ.setdefault("RERUN_ANALYTICS", "0")
-    try:
-        import rerun  # noqa: PLC0415  optional: an extra of 764 MB
-    except ImportError as error:
-        raise DappledError(f"a Rerun recording needs its library; {install_extra('rerun')}") from error
-    return rerun

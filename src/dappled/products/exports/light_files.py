@@ -8,11 +8,8 @@ HDF5 they are the file's attributes (those without an HDF5 type as JSON text), a
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,14 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled import codec, confined, durable
+from dappled import codec, confined
 from dappled.bounds.arrays import read_npz
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import parse_json
 from dappled.decode.lightfield import LightField
-from dappled.errors import DappledError, first_line, install_extra
+from dappled.errors import DappledError, first_line
 from dappled.findings import Finding
 from dappled.products.exports import h5_reader, packed_arrays
+from dappled.products.extras import need
+from dappled.products.whole_files import whole
 
 _ARRAYS: dict[str, tuple[type[np.generic], int]] = {
     "slices": (np.complex64, 3),
@@ -65,15 +64,8 @@ def save(path: Path, field: LightField, *, overwrite: bool = False) -> None:
     attributes = _json(path, field.attributes)
     if path.exists() and not overwrite:
         raise DappledError(f"{path} exists already: choose another name, or --overwrite replaces it (overwrite=True)")
-    part = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
-    try:
+    with whole(path) as part:
         write(part, arrays, attributes)
-        _sync(part)
-        _put_in_place(part, path)
-    except OSError as error:
-        raise DappledError(f"cannot write the light field {path}: {error.strerror or error}") from error
-    finally:
-        _remove(part)
 
 
 def load(path: Path) -> LightField:
@@ -181,7 +173,7 @@ def _json(path: Path, attributes: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
-    group = _zarr(part).open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
+    group = need("zarr", "use .npz").open_group(store=part, mode="w-", zarr_format=3, attributes=attributes)
     names = axes(arrays)
     for name, values in arrays.items():
         # One chunk for each slice or view: they are read one at a time.
@@ -198,7 +190,7 @@ def _save_zarr(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_zarr(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    zarr = _zarr(path)
+    zarr = need("zarr", "use .npz")
     confined.refuse_links(path, f"the light field {path}")
     added = {name: kind for name, kind in _ADDED.items() if (path / name).is_dir()}
     kinds = {name: kind for name, (kind, _) in {**_ARRAYS, **added}.items()}
@@ -219,7 +211,7 @@ def _load_npz(path: Path) -> tuple[_Arrays, dict[str, Any]]:
 
 
 def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
-    with _h5py(part).File(part, "w") as file:
+    with need("h5py", "use .npz").File(part, "w") as file:
         names = axes(arrays)
         for name, values in arrays.items():
             made = file.create_dataset(name, data=values)
@@ -232,50 +224,6 @@ def _save_h5(part: Path, arrays: _Arrays, attributes: dict[str, Any]) -> None:
 
 
 def _load_h5(path: Path) -> tuple[_Arrays, dict[str, Any]]:
-    _h5py(path)
+    need("h5py", "use .npz")
     arrays, attributes = h5_reader.read(path, list(_ARRAYS), _ATTRIBUTES, also=list(_ADDED))
     return arrays, parse_json(attributes)
-
-
-def _zarr(path: Path) -> Any:
-    return _ground("zarr", path, "Zarr", "use .npz")
-
-
-def _h5py(path: Path) -> Any:
-    return _ground("h5py", path, "HDF5", "use .npz")
-
-
-def _ground(name: str, path: Path, what: str, instead: str) -> Any:
-    """Import a library that the onboard install leaves out. Raises DappledError."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
-        raise DappledError(f"{path.name} needs {what}; {install_extra('ground')} (or {instead})") from error
-
-
-def _sync(path: Path) -> None:
-    """fsync a file, or a folder with its content."""
-    files = [Path(base, name) for base, _, names in os.walk(path) for name in names] if path.is_dir() else [path]
-    for name in files:
-        with durable.descriptor(name, os.O_RDWR) as fd:  # Windows flushes no file that is open for reading
-            os.fsync(fd)
-    if path.is_dir():
-        for base, _, _ in os.walk(path):
-            durable.sync_folder(Path(base))
-
-
-def _put_in_place(part: Path, path: Path) -> None:
-    """Rename. A folder can't replace one that isn't empty, so an old one is moved aside first."""
-    old = part.with_name(part.name + ".old.part")
-    if path.is_dir():
-        os.rename(path, old)
-    os.rename(part, path)
-    durable.sync_folder(path.parent)
-    _remove(old)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import os
 import struct
 import zlib
 from collections.abc import Callable, Iterator
@@ -17,11 +14,11 @@ import tifffile
 from numpy.typing import NDArray
 
 from dappled import durable
-from dappled.bounds.claims import ClaimError
-from dappled.bounds.parsing import read_bytes
 from dappled.bounds.pictures import check_tiff_page, open_picture
 from dappled.decode.optics.film import DensityCurve, density_curve
 from dappled.errors import DappledError, first_line
+from dappled.products import csv_tables
+from dappled.products.whole_files import whole
 from dappled.workers import spans
 
 Levels = NDArray[np.unsignedinteger]
@@ -60,14 +57,8 @@ def write(
     writer = writers.get(path.suffix.lower())
     if writer is None:
         raise DappledError(f"{path}: the name of a mask image must end in .png or .tif")
-    part = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as part:
         writer(part, _Picture(shape, bits, px_per_mm, tile, progress))
-        os.replace(part, path)
-    except OSError as error:
-        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _write_png(path: Path, picture: _Picture) -> None:
@@ -168,24 +159,12 @@ def read_spots(path: Path) -> list[tuple[float, float]]:
 
 
 def _numbers(path: Path, wanted: tuple[str, ...]) -> list[tuple[float, ...]]:
-    try:
-        with io.StringIO(read_bytes(path).decode("utf-8-sig"), newline="") as file:
-            reader = csv.DictReader(file, skipinitialspace=True)
-            names = [name.strip().lower() for name in reader.fieldnames or []]
-            missing = [name for name in wanted if name not in names]
-            if missing:
-                raise DappledError(f"{path} has no column {missing[0]}: its first line must name {', '.join(wanted)}")
-            reader.fieldnames = names
-            found = []
-            for line in reader:
-                texts = [(line[name] or "").strip() for name in wanted]
-                if any(text in ("", "-") for text in texts):
-                    continue
-                found.append(tuple(float(text) for text in texts))
-    except OSError as error:
-        raise DappledError(f"{path} can't be read: {error.strerror or error}") from None
-    except (ClaimError, UnicodeDecodeError, csv.Error) as error:
-        raise DappledError(f"{path} can't be read as CSV: {error}") from None
-    except ValueError as error:
-        raise DappledError(f"{path}, line {reader.line_num}: {first_line(error)}") from None
+    found = []
+    for number, row in csv_tables.rows(path, wanted):
+        if any(row[name] in ("", "-") for name in wanted):
+            continue
+        try:
+            found.append(tuple(float(row[name]) for name in wanted))
+        except ValueError as error:
+            raise DappledError(f"{path}, line {number}: {first_line(error)}") from None
     return found

@@ -5,7 +5,6 @@ Points above a limit of σ are withheld.
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.eye import intrinsics
 from dappled.products.maps.photographs import Station, eye_of, lens_of
+from dappled.products.whole_files import whole
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,14 +87,8 @@ def write(path: Path, cloud: PointCloud) -> None:
         raise DappledError(
             f"no point of {path.name} is known well enough ({cloud.withheld} withheld): allow a larger σ"
         )
-    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
-    try:
+    with whole(path) as part:
         writers[path.suffix.lower()](part, cloud)
-        part.replace(path)
-    except OSError as error:
-        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _ply(path: Path, cloud: PointCloud) -> None:

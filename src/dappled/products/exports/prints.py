@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from dappled.decode import srgb
 from dappled.errors import DappledError
+from dappled.products.whole_files import whole
 
 Bytes = NDArray[np.uint8]
 _GAP = 6  # px between the pictures of a mosaic
@@ -116,11 +116,5 @@ def save(path: Path, picture: Bytes | NDArray[np.uint16]) -> None:
     """Write a PNG, JPEG or TIFF under its name, whole or not at all. Raises DappledError."""
     if path.suffix.lower() not in (".png", ".jpg", ".jpeg", ".tif", ".tiff"):
         raise DappledError(f"{path}: the name of a picture must end in .png, .jpg or .tif")
-    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
-    try:
+    with whole(path) as part:
         Image.fromarray(np.ascontiguousarray(picture)).save(part)
-        part.replace(path)
-    except OSError as error:
-        raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
-    finally:
-        part.unlink(missing_ok=True)

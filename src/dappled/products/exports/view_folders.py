@@ -15,6 +15,7 @@ from dappled import durable, picture_order
 from dappled.bounds import claims
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.pictures import open_picture
+from dappled.decode import srgb
 from dappled.decode.lightfield import LightField
 from dappled.decode.lightfield.light_field import CAMERAS, centred
 from dappled.errors import DappledError, first_line
@@ -84,12 +85,6 @@ def _linear(path: Path) -> NDArray[np.float32]:
     with _opened(path) as picture:
         values = np.asarray(picture if picture.mode in ("L", "I;16", "I", "RGB") else picture.convert("RGB"))
     top = 255 if values.dtype == np.uint8 else 65535
-    encoded = values.astype(np.float32) / np.float32(top)
-    linear: NDArray[np.float32] = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    if (
-        linear.ndim == 3
-        and np.array_equal(linear[..., 0], linear[..., 1])
-        and np.array_equal(linear[..., 0], linear[..., 2])
-    ):
-        return linear[..., 0].astype(np.float32)
-    return linear.astype(np.float32)
+    linear = srgb.decoded(values.astype(np.float32) / np.float32(top)).astype(np.float32)
+    grey = linear.ndim == 3 and bool((linear == linear[..., :1]).all())
+    return linear[..., 0] if grey else linear

@@ -8,7 +8,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,6 +19,7 @@ from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
 from dappled.products.handover import view_cameras, view_files
 from dappled.products.handover.view_cameras import FrameCameras, LocalAxes, ViewCamera
+from dappled.products.whole_files import replacing
 
 _RIG_COLUMNS = (
     "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, "
@@ -58,18 +58,11 @@ def write_model(folder: Path, frames: Sequence[FrameCameras]) -> list[Path]:
     theirs = sorted(path.name for path in final.iterdir() if path.name not in texts) if final.is_dir() else []
     if theirs:
         raise DappledError(f"{final} holds {theirs[0]}, which no batch wrote: move the folder, and run it again")
-    part = durable.temporary(final)
-    shutil.rmtree(part, ignore_errors=True)
-    durable.make_folder(part)
-    for name, text in texts.items():
-        durable.write_file(part / name, text.encode())
-    old = durable.temporary(final.with_name("replaced"))
-    shutil.rmtree(old, ignore_errors=True)
-    if final.exists():
-        final.rename(old)
-    part.rename(final)
-    durable.sync_folder(final.parent)
-    shutil.rmtree(old, ignore_errors=True)
+    durable.make_folder(final.parent)
+    with replacing(final) as part:
+        part.mkdir()
+        for name, text in texts.items():
+            (part / name).write_bytes(text.encode())
     return [final / name for name in texts]
 
 

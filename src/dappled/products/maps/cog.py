@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -17,6 +16,7 @@ from dappled.decode import srgb
 from dappled.decode.array_types import Singles
 from dappled.products.extras import need
 from dappled.products.maps.map_grid import MapError, MapGrid
+from dappled.products.whole_files import replacing
 
 TILE = 512
 _LEVELS = 65535  # of linear values: a twentieth of what 8 bits in sRGB's curve tell apart in the dark
@@ -88,7 +88,7 @@ def write_pieces(
         profile["nodata"] = float("nan")
     durable.make_folder(path.parent)
     with tempfile.TemporaryDirectory(prefix=".maps-", dir=path.parent) as scratch:
-        plain, part = Path(scratch) / "plain.tif", Path(scratch) / "cog.tif"
+        plain = Path(scratch) / "plain.tif"
         try:
             with rasterio.open(plain, "w", **profile) as target:
                 for at_rows, at_columns, values in pieces:
@@ -97,20 +97,13 @@ def write_pieces(
                 for number, name in enumerate(names, 1):
                     target.set_band_description(number, name)
                 target.update_tags(**tags)
-            shutil.copy(
-                plain,
-                part,
-                driver="COG",
-                compress="deflate",
-                level=_DEFLATE,
-                predictor="yes",
-                blocksize=TILE,
-                overview_resampling="average",
-                num_threads=1,
-            )
+            with replacing(path) as part:
+                shutil.copy(
+                    plain, part, driver="COG", compress="deflate", level=_DEFLATE, predictor="yes", blocksize=TILE,
+                    overview_resampling="average", num_threads=1,
+                )  # fmt: skip
         except rasterio.errors.RasterioError as error:
             raise MapError(f"cannot write the map {path}: {error}") from error
-        settle(part, path)
 
 
 def write(
@@ -119,11 +112,3 @@ def write(
     """Write a COG of values (rows, columns, bands); see `write_pieces`."""
     everything = (slice(0, grid.shape[0]), slice(0, grid.shape[1]), values)
     write_pieces(path, grid, [everything], dtype=str(values.dtype), bands=values.shape[2], tags=tags, names=names)
-
-
-def settle(part: Path, path: Path) -> None:
-    """Rename a finished file, durably."""
-    with part.open("rb") as file:
-        os.fsync(file.fileno())
-    part.rename(path)
-    durable.sync_folder(path.parent)

@@ -22,6 +22,7 @@ from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
 
 GEODETIC = "EPSG:4326"
+DEGREE_M = math.radians(1) * 6378137.0  # on the equator of WGS 84
 Degrees = TypeVar("Degrees", float, Floats)
 _OVERLAP_DEG = 6.0  # how far a projection may be used beyond the area that it was made for
 _MOST_M = 120.0  # of sea level above or below the ellipsoid: EGM2008 has -107 to 86

@@ -6,8 +6,6 @@ Heights are above sea level. `sigma_m` is the uncertainty of the ground's height
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,13 +15,14 @@ from numpy.typing import NDArray
 
 from dappled.bounds import claims
 from dappled.decode.array_types import Floats
-from dappled.errors import DappledError, first_line
+from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps.earth import Geoid, Projection, touch
 from dappled.products.maps.eye import Eye
-from dappled.products.maps.rasters import open_raster
+from dappled.products.maps.rasters import opened, step_m
 
 FLAT_SIGMA_M = 1.5  # from grass to roofs, where nothing better is known
+_WHAT = "the terrain"
 _STEPS = 400  # at most, along a ray through a raster
 
 
@@ -148,7 +147,7 @@ def load(
     Heights are taken as above sea level (DTED's are); with a `geoid` they are taken as ellipsoidal and converted.
     Raises DappledError where the file can't be read, is not georeferenced, or does not overlap.
     """
-    with _opened(path) as source:
+    with opened(path, _WHAT) as source:
         values, west, north, step = _posts(source, path, projection, bounds)
     if np.isnan(values).all():
         raise DappledError(f"the terrain {path} has no heights under the flight: give one that covers it")
@@ -160,25 +159,8 @@ def load(
 
 def check(path: Path) -> None:
     """Raise DappledError where a terrain raster can't be read or is not georeferenced."""
-    with _opened(path):
+    with opened(path, _WHAT):
         pass
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    try:
-        with open_raster(path) as source:
-            _check_placed(source, path)
-            yield source
-    except DappledError:
-        raise
-    except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
-        raise DappledError(f"the terrain {path} can't be read: {first_line(error)}") from error
-
-
-def _check_placed(source: Any, path: Path) -> None:
-    if source.crs is None or source.transform.is_identity:
-        raise DappledError(f"the terrain {path} has no coordinates: give one with a coordinate system")
 
 
 def _posts(
@@ -188,7 +170,7 @@ def _posts(
     and what GDAL raises."""
     rasterio, warp = need("rasterio"), need("rasterio.warp")
     target = projection.crs.to_wkt()
-    step = _step(source, projection, bounds)
+    step = step_m(source, projection, (bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
     margin = 4 * step
     west, south = bounds[0] - margin, bounds[1] - margin
     columns = math.ceil((bounds[2] + margin - west) / step) + 1
@@ -214,16 +196,6 @@ def _posts(
         resampling=warp.Resampling.bilinear,
     )
     return values, west, north, step
-
-
-def _step(source: Any, projection: Projection, bounds: tuple[float, float, float, float]) -> float:
-    """The raster's own step under the flight, in map metres."""
-    a, e = abs(source.transform.a), abs(source.transform.e)
-    if source.crs.is_geographic:
-        latitude, _ = projection.to_geodetic((bounds[0] + bounds[2]) / 2, (bounds[1] + bounds[3]) / 2)
-        return float(min(a * math.cos(math.radians(float(latitude))), e)) * math.radians(1) * 6378137.0
-    factor = source.crs.linear_units_factor[1] if source.crs.is_projected else 1.0
-    return float(min(a, e) * factor)
 
 
 def _words(box: tuple[float, ...]) -> str:

@@ -11,11 +11,11 @@ import numpy as np
 
 from dappled.bounds import claims
 from dappled.decode.array_types import Singles
-from dappled.errors import CallError, first_line
+from dappled.errors import CallError, DappledError
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.map_grid import MapGrid
-from dappled.products.maps.rasters import open_raster
+from dappled.products.maps.rasters import opened
 
 _SIGMA = "sigma of a height"  # as the name of the band begins
 
@@ -46,12 +46,10 @@ def read(path: Path) -> HeightRaster:
     if not file.is_file():
         raise CallError(f"{path} has no maps/terrain.tif: make it with dappled georeference {path} --as terrain")
     try:
-        with open_raster(file) as source:
+        with opened(file, "the heights") as source:
             return _read(source, file)
-    except CallError:
-        raise
-    except Exception as error:  # GDAL and PROJ raise anything
-        raise CallError(f"the heights {file} can't be read: {first_line(error)}") from error
+    except DappledError as error:
+        raise CallError(str(error)) from error
 
 
 def resampled(values: Singles, source: MapGrid, target: MapGrid) -> Singles:
@@ -75,8 +73,6 @@ def resampled(values: Singles, source: MapGrid, target: MapGrid) -> Singles:
 def _read(source: Any, file: Path) -> HeightRaster:
     """The heights of an open dataset. Raises DappledError, ClaimError and what GDAL raises."""
     turn = source.transform
-    if source.crs is None or turn.is_identity:
-        raise CallError(f"{file} has no coordinates: give heights with a coordinate system")
     if turn.b or turn.d or turn.a <= 0 or turn.e >= 0:
         raise CallError(f"{file} does not lie north-up on its map: gdalwarp makes it so")
     if source.dtypes[0] == "uint8":

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
 from dappled.products.extras import need
-from dappled.products.maps.earth import GEODETIC, Projection, wrapped
+from dappled.products.maps.earth import DEGREE_M, GEODETIC, Projection, wrapped
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.photographs import Photograph
@@ -115,8 +115,7 @@ def footprint(eye: Eye, ground: Ground, steps: int = 16) -> Floats:
 def degree_steps(projection: Projection, east: float, north: float, gsd_m: float) -> tuple[float, float]:
     """(longitude, latitude) degrees for one cell of `gsd_m` at a place."""
     latitude, _ = projection.to_geodetic(east, north)
-    metres = math.radians(1) * 6378137.0
-    return gsd_m / (metres * max(0.01, math.cos(math.radians(float(latitude))))), gsd_m / metres
+    return gsd_m / (DEGREE_M * max(0.01, math.cos(math.radians(float(latitude))))), gsd_m / DEGREE_M
 
 
 def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
@@ -180,7 +179,7 @@ def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground) -> Singles
         image = image[..., None]
     middle = np.array([[(eye.shape[1] - 1) / 2, (eye.shape[0] - 1) / 2]])
     level = float(ground.meet(eye, middle)[0, 2])
-    step_m = grid.step_y * math.radians(1) * 6378137.0 if grid.crs == GEODETIC else grid.step_y
+    step_m = grid.step_y * DEGREE_M if grid.crs == GEODETIC else grid.step_y
     return smoothed_to(image, step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,14 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.bounds.claims import ClaimError
-from dappled.bounds.parsing import read_bytes
 from dappled.decode.array_types import Floats
-from dappled.errors import DappledError, first_line
+from dappled.errors import DappledError
+from dappled.products import csv_tables
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, touch
 from dappled.products.maps.map_grid import MapGrid, around
-from dappled.products.maps.rasters import open_raster
+from dappled.products.maps.rasters import opened, step_m
 
 _MOST_MASK = 256_000_000  # cells
 
@@ -44,12 +41,7 @@ class BaseMap:
         warp = need("rasterio.warp")
         with self._open() as source:
             box = (*points.min(axis=0), *points.max(axis=0))
-            try:
-                there = warp.transform_bounds(self.projection.crs.to_wkt(), source.crs, *box)
-            except Exception as error:  # GDAL and PROJ raise anything
-                raise BaseMapError(
-                    f"the base map {self.path} and the flight have no common system: {first_line(error)}"
-                ) from error
+            there = warp.transform_bounds(self.projection.crs.to_wkt(), source.crs, *box)
             b = source.bounds
             if not touch(there, b, degrees=source.crs.is_geographic):
                 raise BaseMapError(
@@ -61,8 +53,8 @@ class BaseMap:
         """The picture float32 (rows, columns) around points (n, 2), NaN where it is empty, and its grid; None where all
         of it is empty."""
         rasterio, warp = need("rasterio"), need("rasterio.warp")
-        with self._open() as source, self._sentences():
-            step = max(self.gsd_m, self._step(source, points))
+        with self._open() as source:
+            step = max(self.gsd_m, step_m(source, self.projection, *points.mean(axis=0).tolist()))
             corners = np.concatenate([points - margin, points + margin])
             grid = around(corners, self.projection.name, step, step)
             bands = [1, 2, 3] if source.count >= 3 else [1]
@@ -112,33 +104,8 @@ class BaseMap:
         window = windows.Window(left, top, right - left, bottom - top)
         return source.dataset_mask(window=window, out_shape=shape), transform
 
-    def _open(self) -> Any:
-        with self._sentences():
-            source = open_raster(self.path)
-            placed = source.crs is not None and not source.transform.is_identity
-        if not placed:
-            source.close()
-            raise BaseMapError(f"the base map {self.path} has no coordinates: give a GeoTIFF or the like")
-        return source
-
-    @contextmanager
-    def _sentences(self) -> Iterator[None]:
-        try:
-            yield
-        except DappledError:
-            raise
-        except Exception as error:  # GDAL, PROJ and a transform of zeros raise anything
-            raise BaseMapError(f"the base map {self.path} can't be read: {first_line(error)}") from error
-
-    def _step(self, source: Any, points: Floats) -> float:
-        """The size of the map's own cells near the points, in metres."""
-        if source.crs.is_geographic:
-            latitude, _ = self.projection.to_geodetic(*points.mean(axis=0))
-            metres = math.radians(1) * 6378137.0
-            return float(
-                min(abs(source.transform.a) * math.cos(math.radians(float(latitude))), abs(source.transform.e)) * metres
-            )
-        return float(min(abs(source.transform.a), abs(source.transform.e)) * source.crs.linear_units_factor[1])
+    def _open(self) -> AbstractContextManager[Any]:
+        return opened(self.path, "the base map", BaseMapError)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,29 +122,17 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
     """Control points from CSV with the columns name, frame, column, row, latitude, longitude, altitude: pixels of the
     frame as the camera made it, degrees, metres above sea level. Raises DappledError naming the line."""
     wanted = ("name", "frame", "column", "row", "latitude", "longitude", "altitude")
-    try:
-        with io.StringIO(read_bytes(path).decode("utf-8-sig"), newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            missing = [name for name in wanted if name not in (rows.fieldnames or ())]
-            if missing:
-                raise DappledError(f"{path} lacks the column {missing[0]}: its first line names {', '.join(wanted)}")
-            found = []
-            for row in rows:
-                try:
-                    column, line, latitude, longitude, altitude = (float(row[name]) for name in wanted[2:])
-                except (TypeError, ValueError):
-                    raise DappledError(f"{path}, line {rows.line_num}: a number is missing or invalid") from None
-                if not (abs(latitude) <= 90 and math.isfinite(longitude + altitude + column + line)):
-                    raise DappledError(f"{path}, line {rows.line_num}: {latitude}, {longitude} is not a place on Earth")
-                east, north = projection.to_map(latitude, longitude)
-                place = (float(east), float(north), altitude)
-                found.append(ControlPoint(row["name"], Path(row["frame"]).stem, (column, line), place))
-    except OSError as error:
-        raise DappledError(f"the control points {path} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise DappledError(f"the control points {path} are not text in UTF-8") from None
-    except (ClaimError, csv.Error) as error:
-        raise DappledError(f"the control points {path} can't be read: {error}") from None
+    found = []
+    for number, row in csv_tables.rows(path, wanted):
+        try:
+            column, line, latitude, longitude, altitude = (float(row[name]) for name in wanted[2:])
+        except ValueError:
+            raise DappledError(f"{path}, line {number}: a number is missing or invalid") from None
+        if not (abs(latitude) <= 90 and math.isfinite(longitude + altitude + column + line)):
+            raise DappledError(f"{path}, line {number}: {latitude}, {longitude} is not a place on Earth")
+        east, north = projection.to_map(latitude, longitude)
+        place = (float(east), float(north), altitude)
+        found.append(ControlPoint(row["name"], Path(row["frame"]).stem, (column, line), place))
     return found
 
 

@@ -7,7 +7,6 @@ heights show houses upright.
 from __future__ import annotations
 
 import math
-import tempfile
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,6 +26,7 @@ from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.hyperstereo import Surface
 from dappled.products.maps.map_grid import MapGrid
+from dappled.products.whole_files import replacing
 
 VERTICAL = "EPSG:5773"  # EGM96 height: what autopilots call mean sea level
 CELL = 2.0  # of a map's cells: heights are coarser than pictures
@@ -124,10 +124,8 @@ def write_points(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     if terrain.difference_m is not None:
         points.difference = terrain.difference_m[known]
     durable.make_folder(path.parent)
-    with tempfile.TemporaryDirectory(prefix=".maps-", dir=path.parent) as scratch:
-        part = Path(scratch) / "points.las"
+    with replacing(path) as part:
         points.write(part)
-        cog.settle(part, path)
     return path
 
 
