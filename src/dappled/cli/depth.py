@@ -27,7 +27,6 @@ if not words_only:
     from dappled.products.exports import exports, point_cloud, prints
     from dappled.products.maps import photographs, terrain
     from dappled.products.maps.georeference import Survey
-    from dappled.products.maps.terrain import TerrainModel
     from dappled.products.mounting import Mounting
     from dappled.products.opened import OpenedLightField, OpenError
     from dappled.products.survey import flight_sweep, frame_terrain
@@ -138,7 +137,7 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
     def _together(self, made: Survey, output: Output) -> Report:
         """Heights of a flight where all of its frames agree."""
         surface = flight_sweep.surface(made, output.show, cell_m=self.cell)
-        found = TerrainModel(surface, flight_sweep.difference(made, surface))
+        found = terrain.over(made, surface)
         for path in self.output:
             if path.suffix.lower() in _RASTERS:
                 terrain.write_raster(made, found, path)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from dappled import durable
 from dappled.errors import DappledError
@@ -46,6 +48,14 @@ def whole(path: Path, *, fresh: bool = False) -> Iterator[Path]:
             yield part
     except OSError as error:
         raise DappledError(f"{path} can't be written: {error.strerror or error}; choose another place") from None
+
+
+def write_json(path: Path, value: Any, indent: int | None = 1) -> Path:
+    """Write a value as JSON, whole or not at all, and its folder where it is missing; returns the path. Raises OSError,
+    and ValueError for a number that JSON hasn't."""
+    durable.make_folder(path.absolute().parent)
+    durable.write_file(path.absolute(), (json.dumps(value, indent=indent, allow_nan=False) + "\n").encode())
+    return path
 
 
 def _sync(path: Path) -> None:

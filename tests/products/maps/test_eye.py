@@ -36,13 +36,13 @@ def eye_at(
 ) -> Eye:
     attitude = from_euler(*(math.radians(angle) for angle in tilt_deg))
     at = Projection(utm(latitude, longitude)).at(latitude, longitude)
-    return eyes.look(
+    return Eye(
         eyes.intrinsics(SENSOR, lens, GRID),
-        lens,
-        shape=SHAPE,
-        at=at,
-        height_m=height_m,
-        camera_to_ned=camera_pose.matrix_of(attitude) @ NADIR,
+        lens.distortion,
+        at.from_ned() @ camera_pose.matrix_of(attitude) @ NADIR,
+        np.array([at.east, at.north, height_m]),
+        at.scale,
+        SHAPE,
     )
 
 

@@ -29,6 +29,7 @@ from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.kmz import Overlay
 from dappled.products.maps.map_grid import MapError, MapGrid
 from dappled.products.maps.photographs import Photograph
+from dappled.products.whole_files import write_json
 from tests import globe
 from tests.products.maps.test_eye import GRID, SHAPE, eye_at
 from tests.products.maps.test_ground import hill
@@ -318,7 +319,8 @@ def footprint(folder: Path) -> Path:
     eye, ground = eye_at(height_m=100.0), hill()
     one = photograph(eye, painted(eye, ground))
     path = folder / "footprints.geojson"
-    path.write_bytes(map_files._collection([map_files.feature(one, ground, Projection("EPSG:32615"), {"a": 1})]))
+    features = [map_files.feature(one, ground, Projection("EPSG:32615"), {"a": 1})]
+    write_json(path, {"type": "FeatureCollection", "features": features})
     return path
 
 

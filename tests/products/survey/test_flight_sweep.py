@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dappled.cli import main
 from dappled.cli.placing import Refining
+from dappled.products.maps import terrain
 from dappled.products.maps.hyperstereo import HyperstereoError, Surface
 from dappled.products.survey import flight_sweep
 from tests.products.survey import seen
@@ -47,7 +48,7 @@ def test_a_box_stands_out_of_the_ground() -> None:
     assert np.median(np.abs(ground)) < 0.08
     assert np.quantile(np.abs(ground), 0.95) < 0.4
     assert np.nanmax(found.score) <= 1.001
-    assert flight_sweep.difference(flight, found) is None
+    assert terrain.over(flight, found).difference_m is None
 
 
 def test_sigma_holds_what_poses_make() -> None:

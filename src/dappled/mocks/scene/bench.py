@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from dappled.decode import srgb
 from dappled.decode.array_types import Singles
 from dappled.mocks.autopilot.path import TruePose
 from dappled.mocks.scene.landscape import noise
@@ -221,7 +222,7 @@ class RealViews:
         if len({picture.shape for picture in pictures}) > 1:
             raise ValueError(f"the PNG files in {folder} differ in size")
         encoded = np.stack(pictures).reshape(n, n, *pictures[0].shape)
-        linear = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
+        linear = srgb.decoded(encoded)
         return cls(linear.astype(np.float32), size_mm)
 
     @property

@@ -8,6 +8,7 @@ import numpy as np
 from PIL import Image
 from scipy import ndimage
 
+from dappled.decode import srgb
 from dappled.decode.array_types import Singles
 
 RGGB = np.array([[0, 1], [1, 2]])
@@ -74,8 +75,7 @@ def with_noise(light: Singles, full_well_e: float, read_noise_e: float, rng: np.
 
 def encoded(linear: Singles) -> Singles:
     """sRGB's tone curve (IEC 61966-2-1), 0 to 1."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055).astype(np.float32)
+    return srgb.encoded(np.clip(linear, 0, 1)).astype(np.float32)
 
 
 def jpeg_of(linear: Singles, quality: int) -> bytes:

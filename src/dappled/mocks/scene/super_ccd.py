@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from dappled.decode import srgb
 from dappled.decode.array_types import Singles
 from dappled.mocks.scene.chip_faults import encoded, jpeg_of
 
@@ -33,9 +34,7 @@ class SuperCcdBody:
         grey = interpolated(light) @ np.array([0.299, 0.587, 0.114], dtype=np.float32)
         tone = encoded(grey)
         tone = tone + self.sharpening * (tone - ndimage.uniform_filter(tone, 3, mode="mirror"))
-        x = np.clip(tone, 0, 1)
-        linear = np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
-        return jpeg_of(linear, self.quality)
+        return jpeg_of(srgb.decoded(np.clip(tone, 0, 1)).astype(np.float32), self.quality)
 
 
 def sampled(light: Singles) -> tuple[Singles, NDArray[np.int8]]:

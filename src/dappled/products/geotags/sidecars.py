@@ -66,7 +66,7 @@ def _of_tag(tag: Tag, utc_ns: int | None) -> dict[str, str | None]:
     pose = tag.pose
     return {
         "xmp:CreatorTool": _MARK,
-        "exif:GPSTimeStamp": None if utc_ns is None else _stamp(utc_ns),
+        "exif:GPSTimeStamp": None if utc_ns is None else stamp(utc_ns),
         "dappled:ImageIndex": str(tag.index),
         "dappled:FrameSha256": tag.frame_sha256,
         "dappled:MidExposureUtcNs": None if utc_ns is None else str(utc_ns),
@@ -129,7 +129,8 @@ def _of_place(tag: Tag, camera: CameraPose) -> dict[str, str | None]:
     return words
 
 
-def _stamp(utc_ns: int) -> str:
+def stamp(utc_ns: int) -> str:
+    """A time as ISO 8601 has it, to the microsecond."""
     taken = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
     return f"{taken}.{utc_ns % 10**9 // 1000:06d}Z"
 

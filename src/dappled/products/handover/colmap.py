@@ -62,7 +62,7 @@ def write_model(folder: Path, frames: Sequence[FrameCameras]) -> list[Path]:
     with replacing(final) as part:
         part.mkdir()
         for name, text in texts.items():
-            (part / name).write_bytes(text.encode())
+            durable.write_file(part / name, text.encode())
     return [final / name for name in texts]
 
 

@@ -5,16 +5,15 @@ https://docs.nerf.studio/quickstart/data_conventions.html: camera axes right, up
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dappled import durable
 from dappled.products.handover import view_cameras, view_files
 from dappled.products.handover.view_cameras import FrameCameras
+from dappled.products.whole_files import write_json
 
 _TO_OPENGL = np.diag([1.0, -1.0, -1.0])  # right, down, forward → right, up, backward
 
@@ -51,5 +50,4 @@ def write_transforms(folder: Path, frames: Sequence[FrameCameras]) -> list[Path]
             )
     origin = {**world.said(), "views": view_cameras.provisos(frames)}
     said = {"camera_model": "OPENCV", "origin": origin, "frames": entries}
-    durable.write_file(folder / "transforms.json", (json.dumps(said, indent=1, allow_nan=False) + "\n").encode())
-    return [folder / "transforms.json"]
+    return [write_json(folder / "transforms.json", said)]

@@ -6,9 +6,7 @@ up, backward.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +15,12 @@ import numpy as np
 from dappled import durable
 from dappled.bounds.parsing import parse_json
 from dappled.errors import DappledError
+from dappled.products.geotags import sidecars
 from dappled.products.handover import view_cameras
 from dappled.products.maps import map_files, map_grid
 from dappled.products.maps.georeference import Survey
 from dappled.products.maps.photographs import Photograph, Station
+from dappled.products.whole_files import write_json
 
 _VERSION = "1.1.0"
 _EXTENSIONS = [
@@ -46,9 +46,7 @@ def write_item(
     name = station.name
     durable.make_folder(folder / name)
     image = map_files.frame_cog(made, one, folder / name / f"{name}.tif", gain)
-    path = folder / name / f"{name}.json"
-    durable.write_file(path, _encoded(_item(made, one, station, utc_ns)))
-    return [image, path]
+    return [image, write_json(folder / name / f"{name}.json", _item(made, one, station, utc_ns))]
 
 
 def write_collection(folder: Path, flight: str, names: Sequence[str]) -> list[Path]:
@@ -74,8 +72,7 @@ def write_collection(folder: Path, flight: str, names: Sequence[str]) -> list[Pa
             *(_link("item", f"./{name}/{name}.json", "application/geo+json") for name in names),
         ],
     }
-    durable.write_file(folder / "collection.json", _encoded(collection))
-    return [folder / "collection.json"]
+    return [write_json(folder / "collection.json", collection)]
 
 
 def _item(made: Survey, one: Photograph, station: Station, utc_ns: int) -> Json:
@@ -103,7 +100,7 @@ def _item(made: Survey, one: Photograph, station: Station, utc_ns: int) -> Json:
         "geometry": feature["geometry"],
         "bbox": _box(feature["geometry"]),
         "properties": {
-            "datetime": _time(utc_ns),
+            "datetime": sidecars.stamp(utc_ns),
             "gsd": made.gsd_m,
             "instruments": [station.tag.camera],
             **system,
@@ -148,17 +145,8 @@ def _box(geometry: Json) -> list[float]:
     return [float(west), float(lows[:, 1].min()), float(east), float(highs[:, 1].max())]
 
 
-def _time(utc_ns: int) -> str:
-    whole = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    return f"{whole}.{utc_ns % 10**9 // 1000:06d}Z"
-
-
 def _link(relation: str, href: str, kind: str = "application/json") -> Json:
     return {"rel": relation, "href": href, "type": kind}
-
-
-def _encoded(value: Json) -> bytes:
-    return (json.dumps(value, indent=1, allow_nan=False) + "\n").encode()
 
 
 def _read(path: Path) -> Json:

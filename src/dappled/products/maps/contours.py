@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from scipy import ndimage
 
-from dappled import durable
 from dappled.decode.array_types import Floats
 from dappled.errors import CallError
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, geojson_line
 from dappled.products.maps.heights import HeightRaster
+from dappled.products.whole_files import write_json
 
 MOST_HEIGHTS = 5000
 _HEIGHTS = 20.0  # over the relief, where no interval is asked for
@@ -91,5 +90,4 @@ def write(contours: Sequence[Contour], projection: Projection, interval_m: float
         }
         for one, line in zip(contours, lines, strict=True)
     ]
-    made = {"type": "FeatureCollection", "features": features}
-    durable.write_file(path.absolute(), (json.dumps(made, allow_nan=False) + "\n").encode())
+    write_json(path, {"type": "FeatureCollection", "features": features}, indent=None)

@@ -21,10 +21,10 @@ from dappled.findings import Code, Finding, Level, Subject, finding, text
 from dappled.flight import LedgerReader, layout
 from dappled.products.maps import ground as grounds
 from dappled.products.maps.earth import EarthError, Projection, utm
-from dappled.products.maps.eye import Eye, EyeError, intrinsics, look
+from dappled.products.maps.eye import Eye, EyeError
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.map_grid import MapError, MapGrid, around, footprint
-from dappled.products.maps.photographs import PhotographError, Station, lens_of, stations
+from dappled.products.maps.photographs import PhotographError, Station, home_m, lens_of, stations
 from dappled.products.mounting import Mounting
 
 CELLS = 500  # on the longer side, where no cell is asked for
@@ -36,7 +36,6 @@ _DOUBTFUL = 0.25  # of a footprint's shorter side: a frame that is placed less w
 _SILENT_MS = 2000.0  # a receiver's fix of longer ago says nothing about the exposure
 _FIX_3D = 3  # GPS_FIX_TYPE
 _ALIKE = 0.05  # sensors whose sides differ by less see the same ground
-_WHOLE = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # the grid of a sensor's own pixels
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,13 +193,14 @@ def _ground(
     corners: Sequence[Floats],
 ) -> Ground:
     if ground_m is None:
-        homes = [one.ground_m for one in placed if one.ground_m is not None]
-        if not homes and terrain is None:
+        ground_m = home_m(placed)
+        if ground_m is None and terrain is None:
             raise DappledError(
                 "the height of the ground is not known (the telemetry has no height above home): give --ground or "
                 "--terrain"
             )
-        ground_m = float(np.median(homes)) if homes else min(one.camera.altitude_msl_m for one in placed) - 100
+    if ground_m is None:
+        ground_m = min(one.camera.altitude_msl_m for one in placed) - 100
     flat = Flat(ground_m)
     if terrain is None:
         return flat
@@ -244,15 +244,7 @@ def eye_of(station: Station, projection: Projection, sensor: Sensor | None = Non
     with _sized(station):
         profile = profiles.camera(station.tag.camera)
     sensor = sensor or profile.raw[0].sensor
-    lens, camera = lens_of(profile, focal_mm), station.camera
-    eye = look(
-        intrinsics(sensor, lens, _WHOLE),
-        lens,
-        shape=sensor.shape,
-        at=projection.at(camera.latitude_deg, camera.longitude_deg),
-        height_m=camera.altitude_msl_m,
-        camera_to_ned=station.camera_to_ned,
-    )
+    eye = station.eye(projection, sensor, lens_of(profile, focal_mm), np.eye(2, 3), sensor.shape)
     eye.check_horizon(station.frame.name)
     return eye
 

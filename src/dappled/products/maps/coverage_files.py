@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from dappled.products.maps import cog
 from dappled.products.maps.coverage import Coverage
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.map_grid import unwrapped
+from dappled.products.whole_files import write_json
 
 MOST_SHOWN = 8  # more frames than these are drawn and listed as so many
 _HOLE = (214, 40, 40)
@@ -50,8 +50,7 @@ def write_geojson(covered: Coverage, projection: Projection, path: Path, *, leas
         for where, hole in ((covered.planned & ~covered.holes(least), False), (covered.holes(least), True))
         for feature in _features(covered, projection, counts, where, hole=hole)
     ]
-    made = {"type": "FeatureCollection", "features": features}
-    durable.write_file(path.absolute(), (json.dumps(made, allow_nan=False) + "\n").encode())
+    write_json(path, {"type": "FeatureCollection", "features": features}, indent=None)
 
 
 def _features(

@@ -14,6 +14,7 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError
 from dappled.products.maps import cog, heights, map_grid
 from dappled.products.maps.georeference import Survey
+from dappled.products.maps.ground import level_shown
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.terrain import TerrainModel
 
@@ -162,8 +163,7 @@ def _place_sigma_m(made: Survey) -> float:
     for one in made.photographs:
         facts = made.facts.get(one.name, {})
         refined = facts.get("position_sigma_m") if facts.get("refined") else None
-        middle = np.array([[(one.eye.shape[1] - 1) / 2, (one.eye.shape[0] - 1) / 2]])
-        away = float(one.eye.centre[2] - made.ground.meet(one.eye, middle)[0, 2])
+        away = float(one.eye.centre[2]) - level_shown(made.ground, one.eye)
         found.append(math.hypot(one.position_sigma_m, away * one.attitude_sigma_rad) if refined is None else refined)
     return float(np.nanmedian(found))
 
@@ -187,17 +187,10 @@ def _shared(grids: Sequence[MapGrid]) -> tuple[MapGrid, list[tuple[slice, slice]
     one = grids[0]
     if any(abs(grid.step_x - one.step_x) > 1e-9 * one.step_x for grid in grids):
         raise DifferenceError("the flights have cells of different sizes: give one --gsd")
-    tops = [round((one.north - grid.north) / one.step_y) for grid in grids]  # rows below the first's top
-    lefts = [round((grid.west - one.west) / one.step_x) for grid in grids]
-    top, left = max(tops), max(lefts)
-    bottom = min(first + grid.shape[0] for first, grid in zip(tops, grids, strict=True))
-    right = min(first + grid.shape[1] for first, grid in zip(lefts, grids, strict=True))
-    if top >= bottom or left >= right:
+    parts = map_grid.shared(grids)
+    if parts is None:
         raise DifferenceError("the flights have no ground in common")
-    parts = [
-        (slice(top - up, bottom - up), slice(left - west, right - west)) for up, west in zip(tops, lefts, strict=True)
-    ]
-    return one.part(slice(top, bottom), slice(left, right)), parts
+    return one.part(*parts[0]), parts
 
 
 def _common(first: Survey, second: Survey) -> MapGrid:
@@ -207,12 +200,10 @@ def _common(first: Survey, second: Survey) -> MapGrid:
         )
     step = max(first.gsd_m, second.gsd_m)
     a, b = (map_grid.grid_of(one.photographs, one.ground, one.projection, step) for one in (first, second))
-    top, left = max(0, round((a.north - b.north) / step)), max(0, round((b.west - a.west) / step))
-    bottom = min(a.shape[0], round((a.north - b.bounds[1]) / step))
-    right = min(a.shape[1], round((b.bounds[2] - a.west) / step))
-    if top >= bottom or left >= right:
+    parts = map_grid.shared([a, b])
+    if parts is None:
         raise DifferenceError(f"{first.flight} and {second.flight} have no ground in common")
-    return a.part(slice(top, bottom), slice(left, right))
+    return a.part(*parts[0])
 
 
 def _whole(made: Survey, grid: MapGrid) -> Singles:

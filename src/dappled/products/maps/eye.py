@@ -14,12 +14,13 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from dappled.config.profiles import Lens
 from dappled.decode.array_types import Floats
 from dappled.decode.optics import Sensor
 from dappled.errors import DappledError
-from dappled.products.maps.earth import GridAt
 
 _LOWEST = math.sin(math.radians(3))  # a ray that dips less counts as above the horizon
 
@@ -52,6 +53,10 @@ class Eye:
         at = self.project(points)
         rows, columns = self.shape
         return np.where(((at >= 0) & (at <= [columns - 1, rows - 1])).all(axis=1, keepdims=True), at, np.nan)
+
+    def shows(self, points: Floats) -> NDArray[np.bool_]:
+        """(n,): which map points (n, 3) are in the picture."""
+        return np.isfinite(self.shown_at(points)[:, 0])
 
     def pixels(self, seen: Floats) -> Floats:
         """(n, 2) pixels of points (n, 3) in camera axes; NaN behind the camera."""
@@ -86,6 +91,12 @@ class Eye:
         rows, columns = self.shape
         return np.array([[0, 0], [columns, 0], [columns, rows], [0, rows]], dtype=np.float64) - 0.5
 
+    @property
+    def middle(self) -> Floats:
+        """(1, 2): the middle pixel."""
+        rows, columns = self.shape
+        return np.array([[(columns - 1) / 2, (rows - 1) / 2]])
+
     def border(self, steps: int = 16) -> Floats:
         """(4·steps, 2): points along the border, in the corners' order."""
         corners = self.corners()
@@ -105,9 +116,7 @@ class Eye:
 
     def gsd_m(self, ground_m: float) -> float:
         """Ground metres that a pixel in the middle of the view covers, along its shorter side."""
-        rows, columns = self.shape
-        middle = np.array([[(columns - 1) / 2, (rows - 1) / 2]])
-        places = [self.on_plane(middle + step, ground_m)[0] for step in ((0, 0), (1, 0), (0, 1))]
+        places = [self.on_plane(self.middle + step, ground_m)[0] for step in ((0, 0), (1, 0), (0, 1))]
         return float(min(np.linalg.norm(place - places[0]) for place in places[1:]) / self.scale)
 
     def on_plane(self, pixels: Floats, height_m: float | Floats) -> Floats:
@@ -147,20 +156,6 @@ def _to_chip(sensor: Sensor, grid: Floats) -> tuple[Floats, Floats]:
     chip = np.array([[sensor.column_mm[1], sensor.row_mm[1]], [sensor.column_mm[0], sensor.row_mm[0]]])  # (c, r) → mm
     flip = grid[::-1, [1, 0, 2]]  # (x, y, 1) of the view → (column, row)
     return chip @ flip[:, :2], chip @ (flip[:, 2] - [(columns - 1) / 2, (rows - 1) / 2])
-
-
-def look(
-    matrix: Floats,
-    lens: Lens,
-    *,
-    shape: tuple[int, int],
-    at: GridAt,
-    height_m: float,
-    camera_to_ned: Floats,
-) -> Eye:
-    """The eye of a camera at a place of the map, `camera_to_ned` (3, 3) its attitude against true north."""
-    centre = np.array([at.east, at.north, height_m])
-    return Eye(matrix, lens.distortion, at.from_ned() @ camera_to_ned, centre, at.scale, shape)
 
 
 def through(eye: Eye, aperture_m: tuple[float, float], focus_m: float = math.inf) -> Eye:
@@ -215,10 +210,5 @@ def undistorted(bent: Floats, numbers: tuple[float, float, float, float, float])
 
 
 def turn(vector: Floats) -> Floats:
-    """The rotation by a vector of radians (Rodrigues)."""
-    angle = float(np.linalg.norm(vector))
-    x, y, z = vector
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    if angle < 1e-12:
-        return np.asarray(np.eye(3) + cross)
-    return np.asarray(np.eye(3) + math.sin(angle) / angle * cross + (1 - math.cos(angle)) / angle**2 * cross @ cross)
+    """The rotation by a vector of radians."""
+    return np.asarray(Rotation.from_rotvec(vector).as_matrix())

@@ -25,7 +25,7 @@ from dappled.products import processes
 from dappled.products.maps import map_grid, photographs, references, refine, self_calibration
 from dappled.products.maps.earth import Geoid, Projection, utm
 from dappled.products.maps.eye import EyeError
-from dappled.products.maps.ground import Flat, Ground, Raster
+from dappled.products.maps.ground import Flat, Ground, Raster, level_shown
 from dappled.products.maps.ground import check as check_ground
 from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.laboratory import MEAN, Laboratory, ShadowAsked, exposures, laboratory, shadows
@@ -94,7 +94,7 @@ class Survey:
     def coarse(self) -> Survey:
         """The survey in pictures that heights are searched in: as fine as its own map where that was chosen coarser
         than the pictures, else of `_SWEPT_PX`: what a search takes grows with the cube of their fineness."""
-        finest = min(one.eye.gsd_m(_below(one, self.ground)) for one in self.photographs)
+        finest = min(one.eye.gsd_m(level_shown(self.ground, one.eye)) for one in self.photographs)
         chosen = self.gsd_m / finest
         largest = max(math.prod(one.eye.shape) for one in self.photographs)
         step = round(math.sqrt(largest / _SWEPT_PX))
@@ -287,7 +287,7 @@ def on_ground(
         kept = sieve(kept, ground)
     if not kept:
         raise DappledError(f"no frame of {flight} can be put on a map: {out[-1][1] if out else 'it has none'}")
-    gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(_below(one, ground)) for one in kept))
+    gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(level_shown(ground, one.eye)) for one in kept))
     return Survey(flight, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(out))
 
 
@@ -306,8 +306,7 @@ def refined(
     raster = None if base is None else BaseMap(base, made.projection, made.gsd_m)
     if raster is not None:
         raster.check(np.concatenate([map_grid.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
-    points = [] if control is None else references.read_control_points(control, made.projection)
-    points, unseen = references.sighted(points, {one.name for one in made.photographs})
+    points, unseen = references.control_of(control, made.projection, made.photographs)
     photos, judged = refine.refine(
         made.photographs,
         made.ground,
@@ -338,8 +337,7 @@ def with_own_lens(
 ) -> Survey:
     """The survey with the lens that its own frames tell, and the poses that go with it. Raises DappledError where they
     don't tell it, or the control points can't be used."""
-    points = [] if control is None else references.read_control_points(control, made.projection)
-    points, unseen = references.sighted(points, {one.name for one in made.photographs})
+    points, unseen = references.control_of(control, made.projection, made.photographs)
     found = self_calibration.find(made.photographs, made.ground, control=points, sigmas=sigmas, progress=progress)
     photos = self_calibration.with_lens(made.photographs, found)
     return replace(made, photographs=tuple(photos), notes=(*made.notes, *unseen), lens=found)
@@ -365,10 +363,10 @@ def level_of(stations: Sequence[Station], options: Options) -> float:
     """The height of flat ground above sea level. Raises DappledError where it isn't known."""
     if options.ground_m is not None:
         return options.ground_m
-    homes = [one.ground_m for one in stations if one.ground_m is not None]
-    if not homes and options.terrain is None:
+    home = photographs.home_m(stations)
+    if home is None and options.terrain is None:
         raise DappledError("the flight has no height above ground: give the ground's height with --ground or --terrain")
-    return float(np.median(homes)) if homes else min(one.camera.altitude_msl_m for one in stations) - 1.0
+    return min(one.camera.altitude_msl_m for one in stations) - 1.0 if home is None else home
 
 
 def _terrain(
@@ -380,11 +378,6 @@ def _terrain(
     margin = 0.25 * float(np.max(high - low)) + 5.0  # rays meet hills elsewhere than flat ground
     bounds = (low[0] - margin, low[1] - margin, high[0] + margin, high[1] + margin)
     return load_ground(path, projection, bounds, geoid=geoid)
-
-
-def _below(one: Photograph, ground: Ground) -> float:
-    middle = np.array([[(one.eye.shape[1] - 1) / 2, (one.eye.shape[0] - 1) / 2]])
-    return float(ground.meet(one.eye, middle)[0, 2])
 
 
 def _two_digits(value: float) -> float:

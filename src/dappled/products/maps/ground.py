@@ -12,6 +12,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from dappled.bounds import claims
 from dappled.decode.array_types import Floats
@@ -44,6 +45,11 @@ class Ground(Protocol):
 
     def sees(self, eye: Eye, east: Floats, north: Floats, height: Floats) -> NDArray[np.bool_]:
         """Whether places of any shape are visible, not hidden by the ground."""
+
+
+def level_shown(ground: Ground, eye: Eye) -> float:
+    """The height of the ground in the middle of a view; NaN where it misses it."""
+    return float(ground.meet(eye, eye.middle)[0, 2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,16 +89,10 @@ class Raster:
 
     def heights(self, east: Floats, north: Floats) -> Floats:
         """Bilinear between the nodes."""
-        column, row = (east - self.west) / self.step_m, (self.north - north) / self.step_m
-        rows, columns = self.values.shape
-        inside = (row >= 0) & (row <= rows - 1) & (column >= 0) & (column <= columns - 1)
-        top = np.clip(np.floor(np.where(inside, row, 0)).astype(np.intp), 0, rows - 2)
-        left = np.clip(np.floor(np.where(inside, column, 0)).astype(np.intp), 0, columns - 2)
-        down, aside = row - top, column - left
-        v = self.values
-        upper = v[top, left] * (1 - aside) + v[top, left + 1] * aside
-        lower = v[top + 1, left] * (1 - aside) + v[top + 1, left + 1] * aside
-        return np.asarray(np.where(inside, upper * (1 - down) + lower * down, np.nan))
+        row, column = np.broadcast_arrays((self.north - north) / self.step_m, (east - self.west) / self.step_m)
+        at = np.stack([row.ravel(), column.ravel()])
+        at[~np.isfinite(at)] = -1.0  # outside
+        return np.asarray(ndimage.map_coordinates(self.values, at, order=1, cval=np.nan)).reshape(row.shape)
 
     def meet(self, eye: Eye, pixels: Floats) -> Floats:
         rays = eye.rays(pixels)

@@ -138,19 +138,15 @@ def _partners(
     axis = np.linspace(0.02, 0.98, 12)
     east, north = np.meshgrid(low[0] + axis * (high[0] - low[0]), low[1] + axis * (high[1] - low[1]))
     places = np.stack([east.ravel(), north.ravel(), np.full(east.size, level_m)], axis=1)
-    mine = _inside(one, places)
+    mine = one.eye.shows(places)
     shared = []
     for other in _near(number, boxes):
         two = photographs[other]
-        share = float(np.sum(mine & _inside(two, places))) / max(1, int(mine.sum()))
+        share = float(np.sum(mine & two.eye.shows(places))) / max(1, int(mine.sum()))
         if share >= least:
             baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2]))
             shared.append((baseline * math.sqrt(share), int(other)))
     return [photographs[other] for _, other in sorted(shared, reverse=True)[:_MOST_PARTNERS]]
-
-
-def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:
-    return np.isfinite(one.eye.shown_at(places)[:, 0])
 
 
 def _under(one: Photograph, grid: MapGrid, levels: tuple[float, ...]) -> tuple[slice, slice] | None:
@@ -180,7 +176,7 @@ def _sweep(
     slope = max(_parallax(one, two, east, north, sum(heights) / 2) for two in partners)  # px a metre
     count = int(np.clip(math.ceil((heights[1] - heights[0]) * slope / _STEP_PX), 3, 400)) + 1
     levels = np.linspace(*heights, count)
-    grey = [_grey(photo) for photo in (one, *partners)]
+    grey = [photo.grey for photo in (one, *partners)]
     scores = np.full((count, *part.shape), -1.0, dtype=np.float32)
     for number, level in enumerate(levels):
         mine = _seen(one, grey[0], east, north, level)
@@ -238,8 +234,3 @@ def _correlation(a: Singles, b: Singles, window: int) -> Singles:
     floor = 1e-6 * np.maximum(mean_a * mean_b, 1e-12)
     score = (mean(a * b) - mean_a * mean_b) / np.sqrt(np.maximum(var_a, floor) * np.maximum(var_b, floor))
     return np.where(whole, np.clip(score, -1, 1), np.nan).astype(np.float32)
-
-
-def _grey(one: Photograph) -> Singles:
-    image = np.asarray(one.image, dtype=np.float32)
-    return np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]

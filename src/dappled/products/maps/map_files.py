@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dappled import codec, durable
+from dappled import codec
 from dappled.decode.array_types import Floats
 from dappled.products.maps import cog, kmz, map_grid
 from dappled.products.maps.earth import GEODETIC, Projection
@@ -19,6 +18,7 @@ from dappled.products.maps.ground import Ground
 from dappled.products.maps.kmz import Overlay
 from dappled.products.maps.map_grid import footprint, unwrapped
 from dappled.products.maps.photographs import Photograph
+from dappled.products.whole_files import write_json
 
 LARGEST_KMZ = 16_384  # cells on a side: an overlay is held in memory as a whole
 
@@ -90,10 +90,7 @@ def _bands(chosen: Sequence[Photograph]) -> int:
 def write_footprints(made: Survey, output: Path) -> Path:
     """Write footprints.geojson: what each frame covers."""
     features = [feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs]
-    path = output / "footprints.geojson"
-    durable.make_folder(output)
-    durable.write_file(path, _collection(features))
-    return path
+    return write_json(output / "footprints.geojson", {"type": "FeatureCollection", "features": features})
 
 
 def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
@@ -110,10 +107,7 @@ def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
         "lens": None if made.lens is None else made.lens.facts(),
         "files": [path.name for path in files],
     }
-    path = output / "report.json"
-    durable.make_folder(output)
-    durable.write_file(path, (json.dumps(facts, indent=1, allow_nan=False) + "\n").encode())
-    return path
+    return write_json(output / "report.json", facts)
 
 
 def feature(photograph: Photograph, ground: Ground, projection: Projection, facts: dict[str, Any]) -> dict[str, Any]:
@@ -127,11 +121,6 @@ def feature(photograph: Photograph, ground: Ground, projection: Projection, fact
         "properties": {"name": photograph.name, "utc_ns": photograph.utc_ns, "ground": ground.name, **facts},
         "geometry": _polygon(ring),
     }
-
-
-def _collection(features: Sequence[dict[str, Any]]) -> bytes:
-    """The file of some features."""
-    return (json.dumps({"type": "FeatureCollection", "features": list(features)}, indent=1) + "\n").encode()
 
 
 def _polygon(ring: Floats) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from dappled.errors import DappledError
 from dappled.products.extras import need
 from dappled.products.maps.earth import DEGREE_M, GEODETIC, Projection, wrapped
 from dappled.products.maps.eye import Eye
-from dappled.products.maps.ground import Flat, Ground
+from dappled.products.maps.ground import Flat, Ground, level_shown
 from dappled.products.maps.photographs import Photograph
 
 LARGEST = 30_000  # cells on a side
@@ -103,6 +103,21 @@ def around(points: Floats, crs: str, step_x: float, step_y: float) -> MapGrid:
     return MapGrid(crs, west * step_x, north * step_y, step_x, step_y, shape)
 
 
+def shared(grids: Sequence[MapGrid]) -> list[tuple[slice, slice]] | None:
+    """The rows and columns of each grid that all have in common, None where there are none; of grids with one step."""
+    one = grids[0]
+    tops = [round((one.north - grid.north) / one.step_y) for grid in grids]  # rows below the first's top
+    lefts = [round((grid.west - one.west) / one.step_x) for grid in grids]
+    bottom = min(top + grid.shape[0] for top, grid in zip(tops, grids, strict=True))
+    right = min(left + grid.shape[1] for left, grid in zip(lefts, grids, strict=True))
+    if max(tops) >= bottom or max(lefts) >= right:
+        return None
+    return [
+        (slice(max(tops) - top, bottom - top), slice(max(lefts) - left, right - left))
+        for top, left in zip(tops, lefts, strict=True)
+    ]
+
+
 def footprint(eye: Eye, ground: Ground, steps: int = 16) -> Floats:
     """(n, 3) east, north, height along the view's border, each side beginning with its corner. Raises MapError where a
     ray misses the ground."""
@@ -177,8 +192,7 @@ def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground) -> Singles
     """The image (h, w, c), smoothed where the map is much coarser."""
     if image.ndim == 2:
         image = image[..., None]
-    middle = np.array([[(eye.shape[1] - 1) / 2, (eye.shape[0] - 1) / 2]])
-    level = float(ground.meet(eye, middle)[0, 2])
+    level = level_shown(ground, eye)
     step_m = grid.step_y * DEGREE_M if grid.crs == GEODETIC else grid.step_y
     return smoothed_to(image, step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from dappled.products.extras import need
 
 _LIMIT = 4000  # features per picture
 _PATCHES = 600  # per picture, about
+_REACH = 6  # pictures ahead that are tried as neighbours
 _RATIO = 0.85  # at most, of the best match's distance to the second best's
 
 
@@ -40,6 +42,22 @@ def features(image: NDArray[np.floating], known: NDArray[np.bool_] | None = None
     if descriptors is None:
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     return Features(np.array([point.pt for point in points], dtype=np.float64), descriptors)
+
+
+def of_all(images: Sequence[NDArray[np.floating]], progress: Callable[[str, int, int], None]) -> list[Features]:
+    """The features of each picture."""
+    found = []
+    for number, image in enumerate(images):
+        progress("find features", number, len(images))
+        found.append(features(image))
+    return found
+
+
+def neighbours(count: int, progress: Callable[[str, int, int], None]) -> Iterator[tuple[int, int]]:
+    """The pairs of so many pictures in a row that are near enough to each other to be tried."""
+    for number in range(count):
+        progress("match neighbours", number, count)
+        yield from ((number, other) for other in range(number + 1, min(number + 1 + _REACH, count)))
 
 
 def matched(a: Features, b: Features) -> NDArray[np.intp]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.config.profiles import CameraProfile, Lens
-from dappled.decode.array_types import Singles
+from dappled.decode.array_types import Floats, Singles
 from dappled.decode.geometry import Pose, camera_pose
 from dappled.decode.geometry.camera_pose import CameraPose, Matrix
 from dappled.decode.lightfield import LightField
+from dappled.decode.optics import Sensor
 from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.drivers.raw.reading import RawFile
@@ -21,7 +23,7 @@ from dappled.errors import DappledError
 from dappled.findings import FRAME, Finding, Level
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
-from dappled.products.maps.eye import Eye, intrinsics, look, through
+from dappled.products.maps.eye import Eye, intrinsics, through
 from dappled.products.mounting import Mounting
 
 DEFAULT_POSITION_SIGMA_M = 3.0
@@ -54,6 +56,20 @@ class Station:
         """The height of home above sea level, from the autopilot; None where unknown."""
         height = self.camera.height_above_home_m
         return None if height is None else self.camera.altitude_msl_m - height
+
+    def eye(self, projection: Projection, sensor: Sensor, lens: Lens, grid: Matrix, shape: tuple[int, int]) -> Eye:
+        """The eye on the map, for samples of this `shape` that lie on the sensor by `grid` (2, 3), as in `LightField`.
+        Raises EarthError."""
+        at = projection.at(self.camera.latitude_deg, self.camera.longitude_deg)
+        centre = np.array([at.east, at.north, self.camera.altitude_msl_m])
+        rotation = at.from_ned() @ self.camera_to_ned
+        return Eye(intrinsics(sensor, lens, grid), lens.distortion, rotation, centre, at.scale, shape)
+
+
+def home_m(stations: Sequence[Station]) -> float | None:
+    """The height of home above sea level, the middle one of what the stations tell; None where none does."""
+    told = [one.ground_m for one in stations if one.ground_m is not None]
+    return float(np.median(told)) if told else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +106,17 @@ class Photograph:
     doubts: tuple[Finding, ...] = ()
     lens: Lens | None = None
     mask_nats: float | None = None
+
+    @property
+    def grey(self) -> Singles:
+        """The image (h, w, 1), the mean of its colours."""
+        image = np.asarray(self.image, dtype=np.float32)
+        return np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]
+
+    def at(self, sensor_px: Floats) -> Floats:
+        """(n, 2): the pixels (x, y) at which this shows the sensor's (n, 2), as (column, row)."""
+        there = (sensor_px[:, ::-1] - self.grid[:, 2]) @ np.linalg.inv(self.grid[:, :2]).T
+        return np.asarray(there[:, ::-1])
 
     def eye_on(self, grid: Matrix, shape: tuple[int, int]) -> Eye:
         """The same eye for samples that lie elsewhere on the sensor: `grid` (2, 3) and their `shape`, as in
@@ -181,7 +208,7 @@ def eye_of(
     rows, columns = field.attributes["shape"]
     lens = lens_of(profile, _focal_length_mm(station, field.attributes.get("focal_length_mm")), focus_m)
     sensor, shape = profile.sensor((int(rows), int(columns))), (field.slices.shape[1], field.slices.shape[2])
-    return _eye(station, lens, intrinsics(sensor, lens, field.grid), shape, projection)
+    return station.eye(projection, sensor, lens, field.grid, shape)
 
 
 def foreseen(
@@ -192,21 +219,9 @@ def foreseen(
     sensor = max((known.sensor for known in profile.raw), key=lambda one: math.prod(one.size_mm))
     lens = lens_of(profile, _focal_length_mm(station, focal_length_mm), focus_m)
     grid: Matrix = np.eye(2, 3)
-    eye = _eye(station, lens, intrinsics(sensor, lens, grid), sensor.shape, projection)
+    eye = station.eye(projection, sensor, lens, grid, sensor.shape)
     nothing = np.empty((0, 0), np.float32)
     return Photograph(station.name, station.tag.utc_ns, nothing, eye, *_sigmas(station.tag.pose), grid, lens=lens)
-
-
-def _eye(station: Station, lens: Lens, matrix: Matrix, shape: tuple[int, int], projection: Projection) -> Eye:
-    camera = station.camera
-    return look(
-        matrix,
-        lens,
-        shape=shape,
-        at=projection.at(camera.latitude_deg, camera.longitude_deg),
-        height_m=camera.altitude_msl_m,
-        camera_to_ned=station.camera_to_ned,
-    )
 
 
 def of_picture(
@@ -222,7 +237,7 @@ def of_picture(
     lens = lens_of(profile, _focal_length_mm(station, made.focal_length_mm), focus_m)
     shape = made.picture.shadow.shape
     grid: Matrix = np.eye(2, 3)
-    eye = _eye(station, lens, intrinsics(made.sensor, lens, grid), shape, projection)
+    eye = station.eye(projection, made.sensor, lens, grid, shape)
     doubts = tuple(replace(one, subject=FRAME) for one in made.findings if one.level > Level.NOTE)
     return Photograph(
         station.name, station.tag.utc_ns, developing.linear(made, colour=colour), eye, *_sigmas(station.tag.pose), grid,

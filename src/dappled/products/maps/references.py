@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +18,7 @@ from dappled.products import csv_tables
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, touch
 from dappled.products.maps.map_grid import MapGrid, around
+from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.rasters import opened, step_m
 
 _MOST_MASK = 256_000_000  # cells
@@ -136,8 +137,14 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
     return found
 
 
-def sighted(points: Sequence[ControlPoint], frames: Collection[str]) -> tuple[list[ControlPoint], list[str]]:
-    """The points on these frames, and a sentence for each other point. Raises DappledError where none is left."""
+def control_of(
+    path: Path | None, projection: Projection, photographs: Sequence[Photograph]
+) -> tuple[list[ControlPoint], list[str]]:
+    """The points of a file on these frames, and a sentence for each other point.
+
+    Raises DappledError where none is left, and as `read_control_points`."""
+    points = [] if path is None else read_control_points(path, projection)
+    frames = {one.name for one in photographs}
     kept = [point for point in points if point.frame in frames]
     if points and not kept:
         raise DappledError(

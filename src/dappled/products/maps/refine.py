@@ -32,7 +32,6 @@ _SIFT_PX = 0.6
 _PATCH_PX = 0.4
 _NODE = 3  # pixels between rays
 _CLICK_PX = 0.5  # of a view: a control point that was marked by eye in the frame
-_REACH = 6  # frames ahead that are tried as neighbours
 _LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 1.0, math.radians(0.5)  # a base map may overrule overconfident telemetry
 _FARTHEST = 5.0  # sigmas
 
@@ -70,10 +69,7 @@ def refine(
     `search_m` is the distance over which the base map is searched; `sigmas` (m, rad) replace the recorded ones.
     """
     doubts = _doubts(photographs, sigmas, loose=base is not None or bool(control))
-    found: list[Features] = []
-    for number, one in enumerate(photographs):
-        progress("find features", number, len(photographs))
-        found.append(matching.features(one.image))
+    found = matching.of_all([one.image for one in photographs], progress)
     groups: list[Marks | Ties] = []
     tried = np.zeros(len(photographs), dtype=int)
     if base is not None:
@@ -83,14 +79,10 @@ def refine(
             tried[number] += matches
             groups += [] if marks is None else [marks]
     if neighbours:
-        for number in range(len(photographs)):
-            progress("match neighbours", number, len(photographs))
-            for other in range(number + 1, min(number + 1 + _REACH, len(photographs))):
-                ties, matches = _to_neighbour(
-                    (number, other), photographs, found, ground, float(np.max(doubts[[number, other], :3]))
-                )
-                tried[[number, other]] += matches
-                groups += [] if ties is None else [ties]
+        for pair in matching.neighbours(len(photographs), progress):
+            ties, matches = _to_neighbour(pair, photographs, found, ground, float(np.max(doubts[[*pair], :3])))
+            tried[[*pair]] += matches
+            groups += [] if ties is None else [ties]
     groups += _to_control(photographs, control)
     eyes = [one.eye for one in photographs]
     solution = adjust(eyes, groups, ground, sigmas=doubts)
@@ -226,11 +218,9 @@ def _to_control(photographs: Sequence[Photograph], control: Sequence[ControlPoin
     for name, number in numbers.items():
         mine = [point for point in control if point.frame == name]
         if mine:
-            grid = photographs[number].grid
-            sensor = np.array([(row, column) for column, row in (point.pixel for point in mine)])
-            view = (sensor - grid[:, 2]) @ np.linalg.inv(grid[:, :2]).T  # (y, x)
+            pixels = photographs[number].at(np.array([point.pixel for point in mine]))
             places = np.array([point.place for point in mine])
-            groups.append(Marks(number, view[:, ::-1], places, _CLICK_PX, 0.02, 1e-6, by_hand=True))
+            groups.append(Marks(number, pixels, places, _CLICK_PX, 0.02, 1e-6, by_hand=True))
     return groups
 
 

@@ -6,7 +6,6 @@ The format (version 1, mission version 2): docs.qgroundcontrol.com, developer gu
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from dappled import durable
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
 from dappled.products.maps.coverage import Coverage, FramesSeen
+from dappled.products.maps.photographs import home_m
+from dappled.products.whole_files import write_json
 
 _ARDUPILOT, _QUADROTOR, _RELATIVE = 3, 2, 1  # MAV_AUTOPILOT, MAV_TYPE, QGroundControl's altitude mode
 _TAKEOFF, _WAYPOINT, _RETURN, _SPEED, _TRIGGER_DISTANCE = 22, 16, 20, 178, 206  # MAV_CMD
@@ -88,10 +88,10 @@ def plan(
         )
     _check_near(seen, covered, holes)
     heights = [h for one in seen.stations if (h := one.camera.height_above_home_m) is not None]
-    home_m = [one.ground_m for one in seen.stations if one.ground_m is not None]
-    if not heights or not home_m:
+    base = home_m(seen.stations)
+    if not heights or base is None:
         raise DappledError("the flight's height above home is not known, so that no mission can be given a height")
-    altitude, base = float(np.median(heights)), float(np.median(home_m))
+    altitude = float(np.median(heights))
     first = seen.stations[0].camera
     home = np.array(seen.projection.to_map(first.latitude_deg, first.longitude_deg))
     above = base + altitude - _highest(seen, *_places(covered, holes))
@@ -301,5 +301,4 @@ def qgc_plan(made: Refly) -> dict[str, Any]:
 
 def write(made: Refly, path: Path) -> None:
     """Write the plan, whole or not at all."""
-    durable.make_folder(path.absolute().parent)
-    durable.write_file(path.absolute(), (json.dumps(qgc_plan(made), indent=4, allow_nan=False) + "\n").encode())
+    write_json(path, qgc_plan(made), indent=4)

@@ -21,7 +21,6 @@ from dappled.products.maps.lens_solution import NAMES, LensSolution, Sightings
 from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.references import ControlPoint
 
-_REACH = 6  # frames ahead that are tried as neighbours
 _PLANE_PX = 12.0  # generous, as houses rise above the plane of the homography
 _LEAST_FRAMES, _LEAST_POINTS, _LEAST_MATCHES = 2, 60, 15
 _V_SHARE, _POINT_SHARE = 0.05, 0.02  # sigmas of the lens as given, as a share of v
@@ -151,20 +150,15 @@ def sightings(
     progress: Callable[[str, int, int], None],
 ) -> Sightings:
     """Features that two or more frames show, and control points. Raises DappledError for too few."""
-    found = []
-    for number, one in enumerate(photographs):
-        progress("find features", number, len(photographs))
-        found.append(matching.features(one.image))
+    found = matching.of_all([one.image for one in photographs], progress)
     joined = _Joined()
-    for number in range(len(photographs)):
-        progress("match neighbours", number, len(photographs))
-        for other in range(number + 1, min(number + 1 + _REACH, len(photographs))):
-            pairs = matching.matched(found[number], found[other])
-            good = matching.on_one_plane(found[number].pixels[pairs[:, 0]], found[other].pixels[pairs[:, 1]], _PLANE_PX)
-            if good.sum() < _LEAST_MATCHES:  # so few agree by chance
-                continue
-            for a, b in pairs[good]:
-                joined.join((number, int(a)), (other, int(b)))
+    for number, other in matching.neighbours(len(photographs), progress):
+        pairs = matching.matched(found[number], found[other])
+        good = matching.on_one_plane(found[number].pixels[pairs[:, 0]], found[other].pixels[pairs[:, 1]], _PLANE_PX)
+        if good.sum() < _LEAST_MATCHES:  # so few agree by chance
+            continue
+        for a, b in pairs[good]:
+            joined.join((number, int(a)), (other, int(b)))
     frames, points = list[int](), list[int]()
     pixels, places, place_sigmas = list[Floats](), list[Floats](), list[float]()
     for track in joined.tracks():
@@ -186,12 +180,9 @@ def sightings(
         by_name[point.name].append(point)
     for same in by_name.values():
         for point in same:
-            one = photographs[numbers[point.frame]]
-            column, row = point.pixel
-            y, x = np.linalg.solve(one.grid[:, :2], np.array([row, column]) - one.grid[:, 2])
             frames.append(numbers[point.frame])
             points.append(len(places))
-            pixels.append(np.array([x, y]))
+            pixels.append(photographs[numbers[point.frame]].at(np.array([point.pixel]))[0])
         places.append(np.array(same[0].place))
         place_sigmas.append(_CONTROL_SIGMA_M)
     return Sightings(

@@ -37,7 +37,7 @@ _MARGIN, _MARGIN_M = (
 _REACH = (1, 2, 4, 8, 16)  # cells: holes are filled from the nearest heights first, and from no farther than the last
 _LEAST_KNOWN = 0.05  # share of a hole's surroundings that must be known
 _FADE = 8.0  # cells over which found heights fade into the given ground
-_SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
+SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,25 +55,31 @@ def of(
     made = made.coarse()
     grid = map_grid.grid_of(made.photographs, made.ground, made.projection, CELL * made.gsd_m)
     east, north = grid.places(made.projection)
-    given = made.ground.heights(east, north)
-    low, high = _searched(made, given, lowest_m, highest_m)
+    low, high = searched(made, made.ground.heights(east, north), lowest_m, highest_m)
     surface = hyperstereo.surface(
         made.photographs, grid, made.projection, lowest_m=low, highest_m=high, progress=progress
     )
-    flat = isinstance(made.ground, Flat)
-    return TerrainModel(surface, None if flat else (surface.height_m - given).astype(np.float32))
+    return over(made, surface)
+
+
+def over(made: Survey, surface: Surface) -> TerrainModel:
+    """A surface over the survey's given ground."""
+    if isinstance(made.ground, Flat):
+        return TerrainModel(surface, None)
+    given = made.ground.heights(*surface.grid.places(made.projection))
+    return TerrainModel(surface, (surface.height_m - given).astype(np.float32))
 
 
 def check(made: Survey, *, lowest_m: float | None = None, highest_m: float | None = None) -> None:
     """Raise HyperstereoError where poses alone tell that there will be no heights; `made` needs no pictures."""
     given = np.concatenate([map_grid.footprint(one.eye, made.ground)[:, 2] for one in made.photographs])
-    hyperstereo.check_overlap(made.photographs, sum(_searched(made, given, lowest_m, highest_m)) / 2)
+    hyperstereo.check_overlap(made.photographs, sum(searched(made, given, lowest_m, highest_m)) / 2)
 
 
-def _searched(made: Survey, given: Floats, lowest_m: float | None, highest_m: float | None) -> tuple[float, float]:
+def searched(made: Survey, given: Floats, lowest_m: float | None, highest_m: float | None) -> tuple[float, float]:
     """The lowest and highest height to look for, around the given ground's."""
-    low = float(np.nanmin(given)) - _SEARCH_M[0] if lowest_m is None else lowest_m
-    high = float(np.nanmax(given)) + _SEARCH_M[1] if highest_m is None else highest_m
+    low = float(np.nanmin(given)) - SEARCH_M[0] if lowest_m is None else lowest_m
+    high = float(np.nanmax(given)) + SEARCH_M[1] if highest_m is None else highest_m
     lowest_eye = min(float(one.eye.centre[2]) for one in made.photographs)
     return low, min(high, low + 0.8 * (lowest_eye - low))  # nothing nearer to it than a fifth of its height
 

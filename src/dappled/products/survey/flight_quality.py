@@ -153,7 +153,7 @@ def _shared(eye: Eye, following: Eye, level_m: float) -> float:
     across, down = np.meshgrid(np.linspace(0, columns - 1, _GRID), np.linspace(0, rows - 1, _GRID))
     pixels = np.stack([across.ravel(), down.ravel()], axis=1)
     places = np.column_stack([eye.on_plane(pixels, level_m), np.full(len(pixels), level_m)])
-    return float(np.isfinite(following.shown_at(places)[:, 0]).mean())
+    return float(following.shows(places).mean())
 
 
 def _spread(values: Sequence[float], unit: str, *, worst: Callable[[Sequence[float]], float] = max) -> str:

@@ -14,9 +14,8 @@ import numpy as np
 from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
-from dappled.products.maps import hyperstereo, map_grid
+from dappled.products.maps import hyperstereo, map_grid, terrain
 from dappled.products.maps.georeference import Progress, Survey
-from dappled.products.maps.ground import Flat
 from dappled.products.maps.hyperstereo import WINDOW, HyperstereoError, Surface, peaks
 from dappled.products.maps.map_grid import sample
 from dappled.products.maps.photographs import Photograph
@@ -28,14 +27,13 @@ _MOST_LEVELS = 200
 _PIXEL_SIGMA = 0.12  # of a match, in pixels
 _LEAST_SCORE = 0.7  # the mean correlation of a cell's frames: lower ones are wrong more often than not
 _LEAST_TEXTURE = 1e-3  # standard deviation in a window, of its mean
-_SEARCH_M = (3.0, 12.0)  # below the lowest and above the highest of the given ground
 _APART = "no two frames of the flight show the same ground from two places"
 
 
 def check(made: Survey) -> None:
     """Raise HyperstereoError where poses alone tell that no cell will be seen twice; `made` needs no pictures."""
     lowest = min(float(map_grid.footprint(one.eye, made.ground)[:, 2].min()) for one in made.photographs)
-    if not hyperstereo.meet(made.photographs, lowest - _SEARCH_M[0]):
+    if not hyperstereo.meet(made.photographs, lowest - terrain.SEARCH_M[0]):
         raise HyperstereoError(_APART)
 
 
@@ -56,9 +54,7 @@ def surface(
     photos = made.photographs
     grid = map_grid.grid_of(photos, made.ground, made.projection, cell_m or CELL * made.gsd_m)
     east, north = grid.places(made.projection)
-    given = made.ground.heights(east, north)
-    low, high = between or (float(np.nanmin(given)) - _SEARCH_M[0], float(np.nanmax(given)) + _SEARCH_M[1])
-    high = min(high, low + 0.8 * (min(float(one.eye.centre[2]) for one in photos) - low))
+    low, high = terrain.searched(made, made.ground.heights(east, north), *(between or (None, None)))
     middle = (low + high) / 2
     sigmas = _height_sigmas(made, east, north, middle)
     if not np.isfinite(sigmas).any():
@@ -81,13 +77,6 @@ def surface(
         np.where(known, score, np.nan).astype(np.float32),
         float(np.median([one.position_sigma_m for one in photos])),
     )  # fmt: skip
-
-
-def difference(made: Survey, found: Surface) -> Singles | None:
-    """Heights above the given terrain; None without one."""
-    if isinstance(made.ground, Flat):
-        return None
-    return (found.height_m - made.ground.heights(*found.grid.places(made.projection))).astype(np.float32)
 
 
 def _agreement(
@@ -154,6 +143,4 @@ def _height_sigmas(made: Survey, east: Floats, north: Floats, level: float) -> F
 
 def _grey(one: Photograph, cell_m: float, level: float) -> Singles:
     """The frame in grey, smoothed for the map's cells."""
-    image = np.asarray(one.image, dtype=np.float32)
-    grey = np.ascontiguousarray(image.mean(axis=2) if image.ndim == 3 else image)[..., None]
-    return map_grid.smoothed_to(grey, cell_m / one.eye.gsd_m(level))
+    return map_grid.smoothed_to(one.grey, cell_m / one.eye.gsd_m(level))

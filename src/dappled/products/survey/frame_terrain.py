@@ -23,7 +23,7 @@ from dappled.decode.depth.depth_map import CONTRAST_WINDOW
 from dappled.errors import DappledError, counted
 from dappled.products.maps import cog, map_grid
 from dappled.products.maps.georeference import Progress, Survey
-from dappled.products.maps.ground import Flat
+from dappled.products.maps.ground import Flat, level_shown
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.photographs import Photograph
 from dappled.products.survey.frame_depths import InverseDepth
@@ -77,13 +77,13 @@ def of(
     if not seen:
         raise FrameTerrainError("no frame has distances of its own, so single frames give no heights")
     photos = [one for one, _ in seen]
-    gsd_m = min(one.eye.gsd_m(_level(one, made)) for one in photos)
+    gsd_m = min(one.eye.gsd_m(level_shown(made.ground, one.eye)) for one in photos)
     grid = map_grid.grid_of(photos, made.ground, made.projection, cell_m or CELL * gsd_m)
     found = np.full((4, *grid.shape), np.nan, dtype=np.float32)
     given = np.full(grid.shape, np.nan)
     shift = np.full(grid.shape, np.nan)
     rows = max(1, _TILE // (len(seen) * grid.shape[1]))
-    smooth = {one.name: _smoothed(one, depth, grid, _level(one, made)) for one, depth in seen}
+    smooth = {one.name: _smoothed(one, depth, grid, level_shown(made.ground, one.eye)) for one, depth in seen}
     for top in range(0, grid.shape[0], rows):
         progress("terrain of single frames", top, grid.shape[0])
         tile = slice(top, min(top + rows, grid.shape[0]))
@@ -104,7 +104,7 @@ def of(
     focus = told + float(np.nanmedian(shift[known])) if np.isfinite(shift[known]).any() else told
     return FrameTerrain(
         grid, height, sigma, single, frames, None if isinstance(made.ground, Flat) else above,
-        float(np.median([_level_sigma(one, depth, _level(one, made)) for one, depth in seen])),
+        float(np.median([_level_sigma(one, depth, level_shown(made.ground, one.eye)) for one, depth in seen])),
         float(np.nanmedian(above)), 1 / focus if focus > 0 else math.inf, seen[0][1].ranging.source,
         CONTRAST_WINDOW * gsd_m,
     )  # fmt: skip
@@ -143,7 +143,9 @@ def summary(made: Survey, terrain: FrameTerrain) -> dict[str, Any]:
         return float(np.median(band[known]))
 
     return {
-        "above_ground_m": float(np.median([one.eye.centre[2] - _level(one, made) for one in made.photographs])),
+        "above_ground_m": float(
+            np.median([one.eye.centre[2] - level_shown(made.ground, one.eye) for one in made.photographs])
+        ),
         "known": float(known.mean()),
         "frames": middle(terrain.frames),
         "sigma_m": middle(terrain.sigma_m),
@@ -282,12 +284,6 @@ def _smoothed(one: Photograph, depth: InverseDepth, grid: MapGrid, level_m: floa
     free = np.maximum(1.0, share * (width / CONTRAST_WINDOW) ** 2)
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(enough, summed / total, np.nan), np.where(enough, np.sqrt(share / total / free), np.nan)
-
-
-def _level(one: Photograph, made: Survey) -> float:
-    """The height of the given ground in a frame's middle."""
-    middle = np.array([[(one.eye.shape[1] - 1) / 2, (one.eye.shape[0] - 1) / 2]])
-    return float(made.ground.meet(one.eye, middle)[0, 2])
 
 
 def _level_sigma(one: Photograph, depth: InverseDepth, level_m: float) -> float:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.lightfield.refocus import StereoPair
@@ -95,13 +94,9 @@ def _worth(made: Survey, one: Photograph, two: Photograph, least: float = _LEAST
     share = np.linspace(0, 1, _PROBES)
     east, north = np.meshgrid(*(low[k] + share * (high[k] - low[k]) for k in (0, 1)))
     places = np.stack([east, north, made.ground.heights(east, north)], axis=-1).reshape(-1, 3)
-    mine, theirs = _inside(one, places), _inside(two, places)
+    mine, theirs = one.eye.shows(places), two.eye.shows(places)
     common = float((mine & theirs).sum()) / max(1, int(mine.sum()))
     return steep * common if common >= least else 0.0
-
-
-def _inside(one: Photograph, places: Floats) -> NDArray[np.bool_]:
-    return np.isfinite(one.eye.shown_at(places)[:, 0])
 
 
 def _mapped(made: Survey, one: Photograph, places: Floats, size: float) -> Singles:

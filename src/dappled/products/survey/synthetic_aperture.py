@@ -19,7 +19,7 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.errors import DappledError, counted
 from dappled.products.maps import cog, map_grid
 from dappled.products.maps.georeference import Progress, Survey
-from dappled.products.maps.ground import Flat, Ground, Raster
+from dappled.products.maps.ground import Flat, Ground, Raster, level_shown
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.photographs import Photograph
 
@@ -59,7 +59,7 @@ def refocus(
     photos = made.photographs
     check(made)
     ground = raised(made.ground, above_m)
-    levels = [float(ground.meet(one.eye, _middle(one))[0, 2]) for one in photos]
+    levels = [level_shown(ground, one.eye) for one in photos]
     low = [one.name for one, level in zip(photos, levels, strict=True) if not one.eye.centre[2] - level > 0.1]
     if low:
         raise DappledError(
@@ -129,19 +129,11 @@ def write_raster(made: Survey, found: RefocusedGround, path: Path) -> Path:
 def alike(found: Sequence[RefocusedGround]) -> list[Singles]:
     """The pictures cut to the ground that all of them have, (h, w) or (h, w, 3) each: planes at other heights reach
     farther or less far."""
-    grids = [one.grid for one in found]
-    step_x, step_y = grids[0].step_x, grids[0].step_y
-    west, north = max(grid.west for grid in grids), min(grid.north for grid in grids)
-    east, south = min(grid.bounds[2] for grid in grids), max(grid.bounds[1] for grid in grids)
-    rows, columns = round((north - south) / step_y), round((east - west) / step_x)
-    if rows < 1 or columns < 1:
+    parts = map_grid.shared([one.grid for one in found])
+    if parts is None:
         raise DappledError("the planes show no ground in common: choose heights nearer to each other")
-    cut = []
-    for one in found:
-        top, left = round((one.grid.north - north) / step_y), round((west - one.grid.west) / step_x)
-        part = one.picture[top : top + rows, left : left + columns]
-        cut.append(part[..., 0] if part.shape[2] == 1 else part)
-    return cut
+    cut = [one.picture[part] for one, part in zip(found, parts, strict=True)]
+    return [one[..., 0] if one.shape[2] == 1 else one for one in cut]
 
 
 def summary(found: RefocusedGround) -> dict[str, Any]:
@@ -197,7 +189,3 @@ def _median(seen: Singles) -> Singles:
         np.take_along_axis(ranked, np.maximum(at, 0)[None], axis=0)[0] for at in ((count - 1) // 2, count // 2)
     )
     return np.where(count > 0, (low + np.where(count > 0, high, low)) / 2, np.nan).astype(np.float32)
-
-
-def _middle(one: Photograph) -> Any:
-    return np.array([[(one.eye.shape[1] - 1) / 2, (one.eye.shape[0] - 1) / 2]])
