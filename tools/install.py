@@ -24,8 +24,13 @@ MANIFEST = "lib/dappled/installed.json"
 BUILD_LOCK = ("--build-constraints", str(ROOT / "requirements-build.lock"), "--require-hashes")
 COMMAND = '#!/bin/sh\nPYTHONPATH={home} exec {python} -P -m dappled "$@"\n'
 """`-P`, and no PYTHONPATH but its own: a folder that somebody else filled must not lend it modules."""
-FLOWN = "import dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process"
-"""Makes bytecode of what a flight loads, not of every dialect of MAVLink: the service itself may not write there."""
+FLOWN = (
+    "import compileall, dappled.cli.run, dappled.daemon.pipeline.decode_worker, dappled.drivers.gphoto2.process, "
+    "libusb_package, usb.backend.libusb1, scipy.optimize, scipy.spatial; "
+    "compileall.compile_dir(dappled.__path__[0], quiet=1)"
+)
+"""Makes bytecode of dappled and of what a flight loads, not of every dialect of MAVLink: the service itself may not
+write there, and what has none is compiled at each start."""
 
 
 def main() -> int:
