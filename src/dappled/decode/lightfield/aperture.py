@@ -216,8 +216,8 @@ class UsedAperture:
     `aperture` says how light comes through: beams, filled cells, or a round stop. `share` is κ over the nominal one,
     where that is farther off than f-number and distance should be, or where the frame agrees with no aperture (NaN);
     None where there is no such reason for doubt. `unexplained` is the rms of what the means of the slices differ from
-    those of this aperture, as a share of the plane's mean: clipped pixels and a stop of another shape leave it. `cost`
-    is the sum of their squared deviations, with those of their phases, which no stop turns; 0 where it is not fitted.
+    those of this aperture, as a share of the plane's mean: clipped pixels and a stop of another shape leave it.
+    `phases` is the sum of their squared deviations from the phases of a mask in its place, which no stop turns.
     """
 
     kappa: float
@@ -226,11 +226,11 @@ class UsedAperture:
     aperture: Aperture
     share: float | None = None
     unexplained: float = 0.0
-    cost: float = 0.0
+    phases: float = 0.0
 
     def contradicts(self, other: UsedAperture) -> bool:
         """Whether the means agree with it far less than with an `other`, of a mask that has not moved."""
-        return not self.fits or self.cost > other.cost + _MOVED
+        return not self.fits or self.phases > other.phases + _MOVED
 
     @property
     def fits(self) -> bool:
@@ -286,7 +286,7 @@ def used_aperture(
             best, least = found, cost
     if best is None:
         return replace(nominal, share=math.nan)
-    best = replace(best, cost=least + float(((complex_means.imag / error) ** 2).sum()))
+    best = replace(best, phases=float(((complex_means.imag / error) ** 2).sum()))
     share = best.kappa / nominal_kappa
     return replace(best, share=share) if abs(math.log(share)) > far else best
 
