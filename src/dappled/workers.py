@@ -100,7 +100,8 @@ class Worker(Loop, Generic[Item]):
     """One thread that does `work` on each item, in order, behind a bounded queue.
 
     Policy of a full queue: `refuse` turns the new item away, `drop oldest` removes its oldest item. Either way
-    `on_drop` gets the item. An exception in `work` ends that item only: it is counted, and `on_failure` is called.
+    `on_drop` gets the item. An exception in `work` ends that item only: it is counted, and
+    `on_failure`, which knows what the item is, reports it; without one the worker does.
     """
 
     def __init__(
@@ -188,9 +189,10 @@ class Worker(Loop, Generic[Item]):
             try:
                 self._work(item)
             except Exception as error:  # noqa: BLE001  # one bad item must not end the worker; it is counted
-                report(log, self.name, error)
                 with self._changed:
                     self._failed += 1
+                if self._on_failure is None:
+                    report(log, self.name, error)
                 self._call(self._on_failure, item, error)
             else:
                 with self._changed:

@@ -258,7 +258,7 @@ def test_a_verdict_that_no_ledger_can_hold_costs_no_frame(tmp_path: Path) -> Non
         assert "could not be judged" in str(text(found.verdict.reasons[0]))
 
 
-def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path) -> None:
+def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with rig(tmp_path) as one:
         assert one.decoder is not None
 
@@ -276,6 +276,9 @@ def test_frames_that_do_not_decode_are_counted_until_one_does(tmp_path: Path) ->
             if index == 3:
                 assert failures() == (2, 0, "too dark")
         assert failures() == (3, 1, "no carriers")
+    assert [line for line in caplog.messages if line.startswith("decode")] == [
+        "decode of frame 1: no carriers", "decode of frame 2: too dark", "decode of frame 4: no carriers"
+    ]  # fmt: skip
 
 
 def test_frames_are_told_as_left_undecoded_where_that_was_switched_off(tmp_path: Path) -> None:

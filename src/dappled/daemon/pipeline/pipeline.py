@@ -199,6 +199,7 @@ class Decoding:
             pending.verdict = self.judge.count(pending.shot.index, found)
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
+        report(log, f"decode of frame {pending.shot.index}", error)
         self.failures = self.failures.after(sentence(error))
         self._unjudged(pending, "it could not be decoded")
         self.ends.leave(pending, Code.FRAME_UNDECODED, sentence(error))

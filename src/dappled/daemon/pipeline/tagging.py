@@ -148,6 +148,7 @@ class Tagging:
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         """A frame that can't be tagged."""
+        report(log, f"tag of frame {pending.shot.index}", error)
         self._ends.tell(self._ends.observer.tagged, pending)
         self._ends.leave(pending, Code.FRAME_UNTAGGED, sentence(error))
 

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 from dappled.clock import Clock
 from dappled.daemon.stream.publisher import Reply
 from dappled.daemon.stream.wire import DecodedSlices, Message, WireError, frame_header, slices_header
-from dappled.errors import sentence
+from dappled.errors import report, sentence
 from dappled.flight import Frame, Tag
 from dappled.workers import OneThread, Worker
 
+log = logging.getLogger(__name__)
 WAITING = 32
 
 
@@ -91,4 +93,5 @@ class Answers(OneThread):
         return Message("slices", slices_header(tag, decoded), decoded.body)
 
     def _failed(self, item: tuple[Mapping[str, Any], Reply], error: Exception) -> None:
+        report(log, "answers", error)
         item[1](Message("error", {"error": sentence(error)}))
