@@ -18,7 +18,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import beside, forked, left_behind, shared
+from tests import forked, left_behind, shared
 
 # No test fails for the speed of the machine it runs on, nor by chance: by default the examples are the same each time.
 settings.register_profile("many", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=300)
@@ -145,14 +145,8 @@ def types_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    """What `tests/beside.py` is told."""
-    beside.pytest_addoption(parser)
-
-
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure() -> None:
     """Processes may be forked from here on."""
-    beside.pytest_configure(config)
     _forks.install()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import pickle
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,15 +12,13 @@ from typing import TypeVar
 
 import pytest
 
-from tests import beside
-
 Made = TypeVar("Made")
 
 
 def folder_of_run(factory: pytest.TempPathFactory) -> Path:
     """A folder that all workers of this run of tests have in common."""
     base = factory.getbasetemp()
-    folder = (base.parent if base.name.startswith((beside.FOLDER, "popen-")) else base) / "shared"
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "shared"
     folder.mkdir(exist_ok=True)
     return folder
 
