@@ -94,6 +94,10 @@ def test_orders_that_are_a_thousandth_of_the_mean_are_found_where_the_scene_has_
     assert judged(draw()[number]).short_db > least_db
 
 
+def test_ghosts_end_where_parallax_over_the_stop_blurs_what_they_are_of() -> None:
+    assert judged(draw()[134]).short_db > 6
+
+
 def test_a_shadow_that_is_not_seen_is_not_known_to_be_none() -> None:
     shot = draw()[120]
     _, shadow, _ = shadow_in(shot)

@@ -33,7 +33,7 @@ _AROUND = ((-0.5, -0.5), (-0.5, 0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0), (0.5, 
 _ALONG = 60.0  # times what is on diagonals: edges along rows or columns have all their detail on a line of carriers
 _WAVES = 0.3  # a period: the mean frequency of slopes within the band
 _MARGIN_PERIODS = 4  # reflected around the frame before it is transformed
-_FALL = -1.0
+_FALL = -1.0  # exponent of a ghost's power around its carrier
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,7 +116,7 @@ def mixed(samples: Sequence[Sharp], pattern: NDArray[np.bool_], shadow: Shadow) 
     usual = float(noise.mean(dtype=np.float64)) / fill
     share = noise_share([(one.place, one.picture) for one in samples], usual)
     ghosts, lengths = _ghosts(samples, bands, rest, shadow)
-    spectra = _spectra(shadow, pattern, share.exponent)
+    spectra = _spectra(shadow, pattern)
     found = filtered(rest, Disturbed(noise * np.float32(share.least), ghosts * fill, spectra, lengths))
     counts = found.noise_left.shape
     smooth = [
@@ -208,12 +208,12 @@ def _apart(carriers: Floats, places: list[PatternPlace], shadow: Shadow) -> NDAr
     return made
 
 
-def _spectra(shadow: Shadow, pattern: NDArray[np.bool_], exponent: float) -> Singles:
-    """(K, SIDE, SIDE // 2 + 1) how a ghost's power lies around its carriers, mean 1: as that of slopes of f^-exponent
-    does within the band, wherever the pattern of samples repeats it."""
+def _spectra(shadow: Shadow, pattern: NDArray[np.bool_]) -> Singles:
+    """(K, SIDE, SIDE // 2 + 1) how a ghost's power lies around its carriers, mean 1 within the band
+    around each, wherever the pattern of samples repeats it. Slopes of detail that parallax over the stop blurs fall off
+    beyond it, however they lie within."""
     matrix = shadow.lattice.matrix()
     inverse, half = np.linalg.inv(matrix), 0.5 / SIDE
-    fall = float(np.clip(2 - exponent, _FALL, 0))
     fy, fx = np.meshgrid(fft.fftfreq(SIDE), fft.fftfreq(SIDE), indexing="ij")
     repeats = np.abs(fft.fft2(pattern)) ** 2
     made = np.zeros((len(shadow.orders), SIDE, SIDE))
@@ -224,7 +224,7 @@ def _spectra(shadow: Shadow, pattern: NDArray[np.bool_], exponent: float) -> Sin
             for sign in (1, -1):
                 y, x = fy - sign * carrier[0] - down / len(repeats), fx - sign * carrier[1] - across / repeats.shape[1]
                 y, x = y - np.round(y), x - np.round(x)
-                around = np.maximum(np.hypot(y, x), half) ** fall
+                around = np.maximum(np.hypot(y, x), half) ** _FALL
                 inside = np.abs(np.stack([y, x], axis=-1) @ inverse).max(axis=-1) < 0.5
                 made[index] += weight * around / around[inside].sum()
     made *= SIDE**2 / (2 * repeats.sum())

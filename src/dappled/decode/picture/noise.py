@@ -42,13 +42,10 @@ _ROUNDS = 10  # of the least squares
 
 @dataclass(frozen=True, slots=True)
 class NoiseShare:
-    """Of what is taken for noise, the shares that are noise at least, as a mean over all that is likely, and at most;
-    and the exponent of the likeliest plain power law that detail falls with (power, over frequency)."""
+    """Of what is taken for noise, the shares that are noise at least, and as a mean over all that is likely."""
 
     least: float
     mean: float
-    most: float
-    exponent: float
 
 
 def noise_of(made: Singles, shadow: Singles) -> tuple[float, float]:
@@ -87,7 +84,7 @@ def noise_share(pictures: Sequence[tuple[PatternPlace, Singles]], variance: floa
     all of one step."""
     side = min(_SIDE, *(min(one.shape) for _, one in pictures))
     if side < _LEAST_SIDE or variance <= 0:
-        return NoiseShare(1.0, 1.0, 1.0, float(_EXPONENTS[len(_EXPONENTS) // 4]))
+        return NoiseShare(1.0, 1.0)
     power = np.mean([_spectrum(one, side) for _, one in pictures], axis=0)
     across = fft.rfftfreq(side)
     known = np.hypot(fft.fftfreq(side)[:, None], across) > _LOWEST / side
@@ -109,12 +106,11 @@ def noise_share(pictures: Sequence[tuple[PatternPlace, Singles]], variance: floa
     unlikely = (twice * (seen / made + np.log(made))).sum(axis=1)
     likely = unlikely - unlikely.min() < _LIKELY
     shares, best = np.clip(noise / variance, 0, _MOST), int(np.argmin(unlikely))
-    exponent = float(_EXPONENTS[np.argmin(unlikely[:: len(_BLURS_PX)])])  # those of no blur
-    least, most = float(shares[likely].min()), float(shares[likely].max())
+    least = float(shares[likely].min())
     if float((twice * (seen / made[best] - 1) ** 2).sum() / twice.sum()) > _POOR:
-        return NoiseShare(min(least, 1.0), 1.0, 1.0, exponent)
+        return NoiseShare(min(least, 1.0), 1.0)
     odds = np.exp((unlikely[best] - unlikely) / 2)
-    return NoiseShare(least, float(shares @ odds / odds.sum()), most, exponent)
+    return NoiseShare(least, float(shares @ odds / odds.sum()))
 
 
 def _spectrum(image: Singles, side: int) -> Floats:
