@@ -41,6 +41,7 @@ F_NUMBER, CALIBRATED_AT = 7.44, 29.76
 BAND = 0.063  # cycles/pixel: inside the band of a slice
 LARGEST_PX = 5.0  # from view to view
 BORDER = 8  # samples of a view
+LEAST_TURN = 6e-4  # radians: slices of a mask turned by less may be taken as they are
 INSIDE = (..., slice(BORDER, -BORDER), slice(BORDER, -BORDER))
 SNR_100, SNR_50 = 28_600.0, 7_150.0  # electrons of a full well, whose 0.35 is the mean
 
@@ -256,7 +257,7 @@ def reached(frame: Frame, f_number: float, disparity: NDArray[np.float32] | None
         known = (told & np.isfinite(truth))[INSIDE]
         within = float((np.abs(joint.views - truth) < there)[INSIDE][known].mean())
     given, place = float("nan"), joint.attributes["mask_place"]
-    if disparity is not None and not clipped.any() and not (place and place["turn_rad"]):
+    if disparity is not None and not clipped.any() and not (place and abs(place["turn_rad"]) > LEAST_TURN):
         reach = FOCAL_MM / f_number / PITCH_MM  # columns of the sensor over the aperture
         given = psnr(views_given(joint, disparity * reach), truth)
     where_told = np.where(told, truth, np.float32(np.nan))

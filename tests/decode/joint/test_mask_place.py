@@ -7,7 +7,7 @@ import pytest
 
 from dappled.decode.array_types import Complexes
 from dappled.decode.calibration.calibration import moved
-from dappled.decode.joint.mask_place import MaskPlace, cycles_per_radian, mask_place
+from dappled.decode.joint.mask_place import MaskPlace, carrier_changes, mask_place
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from dappled.decode.optics import Lattice, Sensor
@@ -17,13 +17,14 @@ ORDERS = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) >= (0, 0)
 SHAPE, SAMPLE_PX = (120, 132), 6.5
 SENSOR = Sensor((780, 858), (0.01, 0.0), (0.0, 0.01))
 LATTICE = Lattice((0.1535, 0.0), (0.0, 0.1535))
-TURNED = cycles_per_radian(LATTICE, SENSOR)
+CHANGES = carrier_changes(LATTICE, SENSOR)
 MAGNITUDES = np.array([1.0 if order == (0, 0) else 0.3 for order in ORDERS], dtype=np.complex128)
 ANGULAR = angular_frequencies(ORDERS, 1.0, 0.0)  # the ideal aperture: the means of all carriers are 0
 
 
-def _slices(seed: int, *, disparities: tuple[float, float] = (-4.0, 6.0)) -> Complexes:
-    """Left and right halves at two disparities (sensor columns over the aperture), and noise."""
+def _slices(seed: int, *, disparities: tuple[float, float] = (-4.0, 6.0), kappa: float = 1.0) -> Complexes:
+    """Left and right halves at two disparities (sensor columns over the aperture), and noise, through an aperture of so
+    many periods of the mask."""
     chance = np.random.default_rng(seed)
     made = np.zeros((len(ORDERS), *SHAPE), dtype=np.complex128)
     f = np.stack(np.meshgrid(*(np.fft.fftfreq(side, SAMPLE_PX) for side in SHAPE), indexing="ij"), axis=-1)
@@ -33,33 +34,34 @@ def _slices(seed: int, *, disparities: tuple[float, float] = (-4.0, 6.0)) -> Com
         scene *= 0.06 / np.fft.ifft2(scene).real.std()
         scene[0, 0] = 0.3 * scene.size
         part = slice(66 * half, 66 * (half + 1))
-        for n, (angular, size) in enumerate(zip(ANGULAR, MAGNITUDES, strict=True)):
+        for n, (angular, size) in enumerate(zip(kappa * ANGULAR, MAGNITUDES, strict=True)):
             through = np.sinc(angular - disparity * f).prod(axis=-1)
             made[n, :, part] = np.fft.ifft2(size * through * scene)[:, part]
     noise = chance.normal(size=(2, *made.shape))
     return np.asarray(made + 2e-4 * (noise[0] + 1j * noise[1]), dtype=np.complex64)
 
 
-def _moved(slices: Complexes, periods: tuple[float, float], turn_rad: float) -> Complexes:
-    """As a mask elsewhere makes them: a turn moves its waves in proportion to the distance from the middle."""
+def _moved(slices: Complexes, periods: tuple[float, float], turn_rad: float, off: float = 0.0) -> Complexes:
+    """As a mask elsewhere makes them: a turn moves its waves in proportion to the distance from the middle, another
+    scale, too."""
     rows, columns = ((np.arange(side) - (side - 1) / 2) * SAMPLE_PX for side in SHAPE)
     y, x = np.meshgrid(rows, columns, indexing="ij")
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     waves = np.array(ORDERS) @ LATTICE.matrix()
-    moved = waves @ np.array([[c, s], [-s, c]]) - waves
+    moved = (1 + off) * waves @ np.array([[c, s], [-s, c]]) - waves
     cycles = moved[:, :1, None] * y + moved[:, 1:, None] * x + (np.array(ORDERS) @ periods)[:, None, None]
     return np.asarray(slices * np.exp(2j * np.pi * cycles), dtype=np.complex64)
 
 
-def _place(slices: Complexes) -> MaskPlace:
+def _place(slices: Complexes, kappa: float = 1.0) -> MaskPlace:
     carriers = np.array(ORDERS) @ LATTICE.matrix()
     found = mask_place(
         slices,
-        SliceModel.of_half(ORDERS, MAGNITUDES, ANGULAR, carriers, Aperture(5)),
+        SliceModel.of_half(ORDERS, MAGNITUDES, kappa * ANGULAR, carriers, Aperture(5, "filled")),
         samples_px=(SAMPLE_PX, SAMPLE_PX),
         noise=np.full(len(ORDERS), 8e-8),
         reach=5 * SAMPLE_PX,
-        turned=TURNED,
+        changes=CHANGES,
         steps_px=(SAMPLE_PX, SAMPLE_PX),
     )
     assert found is not None
@@ -73,7 +75,7 @@ def test_a_mask_that_moved_and_turned_is_placed_where_its_carriers_average_out()
     assert found.periods == pytest.approx((0.24, -0.11), abs=0.01)
     assert found.turn_rad == pytest.approx(0.002, abs=2e-4)
     assert max(found.periods_sigma) < 0.01
-    back = found.undone(away, ORDERS, TURNED, (SAMPLE_PX, SAMPLE_PX))
+    back = found.undone(away, ORDERS, CHANGES, (SAMPLE_PX, SAMPLE_PX))
     turned_back = _moved(slices, found.periods, 0.0)
     assert np.abs(back - turned_back)[1:].mean() < 0.1 * np.abs(away - turned_back)[1:].mean()
     shifted, turned = moved(found.periods, found.turn_rad, 15.5)
@@ -83,9 +85,30 @@ def test_a_mask_that_moved_and_turned_is_placed_where_its_carriers_average_out()
     assert turned.facts["by_deg"] == pytest.approx(0.11, abs=0.01)
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.004])
+def test_another_scale_is_found_where_no_carrier_is_seen(turn: float) -> None:
+    away = _moved(_slices(4), (0.2, 0.1), turn, -0.003)
+    found = _place(away)
+    assert found.off == pytest.approx(-0.003, abs=4 * found.off_sigma)
+    assert found.off_sigma < 1e-4
+    assert found.turn_rad == pytest.approx(turn, abs=2e-4)
+    assert found.periods == pytest.approx((0.2, 0.1), abs=0.01)
+    back = found.undone(away, ORDERS, CHANGES, (SAMPLE_PX, SAMPLE_PX))
+    right = _moved(_slices(4), found.periods, 0.0)
+    assert np.abs(back - right)[1:].mean() < 0.1 * np.abs(away - right)[1:].mean()
+
+
+@pytest.mark.parametrize("periods", [(-0.008, 0.03), (0.06, -0.02)])
+def test_means_of_patches_place_a_mask_that_has_hardly_moved(periods: tuple[float, float]) -> None:
+    """Their light is much brighter than texture: that of a mask elsewhere is no texture, but is at once its place."""
+    found = _place(_moved(_slices(6, kappa=0.9), periods, 0.0), kappa=0.9)
+    assert found.periods == pytest.approx(periods, abs=0.002)
+    assert max(found.periods_sigma) < 0.002
+
+
 def test_a_mask_in_its_place_is_left_there() -> None:
     found = _place(_slices(2))
-    assert not found.moved
+    assert not found.far().moved
     assert found.seen
     assert found.nats > 2 * found.patches
     assert moved(found.periods, found.turn_rad, 15.5) == ()
@@ -106,7 +129,7 @@ def test_a_scene_alone_shows_no_mask() -> None:
 def test_no_scene_moves_a_mask(seed: int) -> None:
     chance = np.random.default_rng(seed)
     near, far = (float(one) for one in chance.uniform(-25, 25, 2))
-    assert not _place(_slices(seed, disparities=(near, far))).moved
+    assert not _place(_slices(seed, disparities=(near, far))).far().moved
 
 
 def test_small_slices_tell_nothing() -> None:
@@ -117,7 +140,7 @@ def test_small_slices_tell_nothing() -> None:
         samples_px=(SAMPLE_PX, SAMPLE_PX),
         noise=np.full(len(ORDERS), 8e-8),
         reach=5 * SAMPLE_PX,
-        turned=TURNED,
+        changes=CHANGES,
         steps_px=(SAMPLE_PX, SAMPLE_PX),
     )
     assert small is None

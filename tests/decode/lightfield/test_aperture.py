@@ -114,14 +114,3 @@ def test_what_tells_nothing_leaves_the_f_number_s_word() -> None:
     for slices, transfers in ((black, TRANSFERS), (_slices(1.0, 0.0, Aperture(5), 0.0), np.eye(13)[0] + 0j)):
         found = used_aperture(slices, transfers, ORDERS, nominal_kappa=1.02, rotation_rad=0.0, aperture=Aperture(5))
         assert (found.kappa, found.fitted) == (1.02, False)
-
-
-@pytest.mark.parametrize("moved", [0.0, 0.14])
-def test_the_phases_of_the_means_contradict_a_mask_elsewhere(moved: float) -> None:
-    there = transfer(ORDERS, [1.0] * 13, (0.0, moved))
-    slices = (_slices(0.9, 0.0, Aperture(5), texture=0.01) * there[:, None, None]).astype(np.complex64)
-    still, away = (
-        used_aperture(slices, TRANSFERS * turns, ORDERS, nominal_kappa=0.9, rotation_rad=0.0, aperture=Aperture(5))
-        for turns in (np.ones(13), transfer(ORDERS, [1.0] * 13, (0.0, 0.14)))
-    )
-    assert away.contradicts(still) is (moved == 0)

@@ -163,7 +163,7 @@ class TakenSlices:
 
 
 def place_of(
-    taken: TakenSlices, turned: Floats, steps_px: tuple[float, float], *, workers: int = 1
+    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, workers: int = 1
 ) -> MaskPlace | None:
     """Where the slices place the mask (see `mask_place`); None where the joint model is not for them."""
     if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
@@ -174,7 +174,7 @@ def place_of(
         samples_px=taken.samples,
         noise=taken.noise(),
         reach=taken.reach,
-        turned=turned,
+        changes=changes,
         steps_px=steps_px,
         workers=workers,
     )

@@ -1,12 +1,15 @@
 """Find how far a mask lies from its calibrated place by the likelihood of a frame's slices.
 
-A mask moved by δ periods turns slice k by 2πk·δ, one turned by φ makes that phase run across the frame. The model of
-the light field (`patch_model`) gives the slices' covariance C(f) in a patch, so the log likelihood of its spectra y is
+A mask moved by δ periods turns slice k by 2πk·δ; one turned, or of another scale (a lens refocused, a focal length told
+wrong, a film that took up water), makes that phase run across the frame. The model of the light field (`patch_model`)
+gives the slices' covariance C(f) in a patch, so the log likelihood of its spectra y is, but for what no δ changes,
 
     −Σ_f w_f Σ_ab conj(y_a) C⁻¹_ab y_b exp(2πi (k_a − k_b)·δ) = Re Σ_m c_m exp(2πi m·δ):
 
 a polynomial of few terms, m the differences of orders. Parallax tells δ even where the stop averages all carriers away
 (an even square stop at the mask's ideal aperture): slices of a shifted mask are those of views that change places.
+A patch's mean light is much brighter than its texture. In a slice of an unmoved mask it is μ_k, known by the stop, and
+y turns with it: y − μ exp(2πi k·δ) is left, which adds terms 2w conj(μ_a) C⁻¹_ab y_b at m = −k_b.
 
 Without a mask a slice is detail of the scene alone, whose phases are as random as the places of its edges: each patch
 places the mask somewhere, with L(δ) over its mean over all δ as sharply as with a mask. So the odds of one place for
@@ -17,6 +20,7 @@ holds no trace of a mask, and tells none from its absence.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -24,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from dappled.decode.array_types import Complexes, Floats, Singles
+from dappled.decode.array_types import Complexes, Floats
 from dappled.decode.joint.patch_model import (
     AT_REST,
     KINDS,
@@ -52,13 +56,9 @@ _AT_A_TIME = 50  # patches
 _FAINT = 0.3  # of the mean texture: fainter patches are not scaled up to it, noise and all
 _TRIED = 3  # of so many frequencies one is looked at to choose the kind of witnesses
 _STEPS = 48  # of a period: how finely moves are tried, up to half a period
-_MOST_TURN, _TURNS = 0.007, 81  # radians to either side, and how many are tried
+_MOST, _CHANGES = 0.007, 81  # of a turn in radians and of the scale, to either side, and how many are tried
 _ROUNDS = 8  # of Newton's method, from the best that was tried
-_LEAST_PERIODS, _LEAST_TURN = 0.03, 6e-4  # clean frames reach 0.017 periods and 3e-4 radians
-_SURE = 3.0  # standard deviations: patches that are more probable with the move, beyond half of all
-_LEAST_NATS = 3.0  # that the median patch must gain
-_LIKELY, _MANY_NATS = 2.0, 30.0  # or both of these: clean frames gain 14 nats at most, moved ones 33 and more
-_AT_EDGE = 0.95  # of the farthest turn: beyond it the best is elsewhere
+_FAR_PERIODS, _FAR = 0.03, 6e-4  # clean frames reach 0.017 periods, and 3e-4 in turn and scale
 # Of the patches may lie in anything that places no mask, edges between depths or no parallax: any share is as probable.
 _ASTRAY = (np.arange(32) + 0.5) / 32
 _SEEN_ELSEWHERE = 1.5  # nats of each patch: turned and moved masks have 3 to 5, one 0.3 % off in scale 0.7
@@ -68,48 +68,55 @@ _OVERLAP = 2.0  # patches that count as one measurement: they overlap by half
 @dataclass(frozen=True, slots=True)
 class MaskPlace:
     """Where a frame's own slices place the mask, from where its calibration has it: `periods` (ky, kx) at the frame's
-    middle and `turn_rad`, 0 where the calibration's place explains the frame as well; and their standard errors.
-    `nats` are the log odds of a mask there against none, by `patches`."""
+    middle, `turn_rad`, and `off`, the share by which carriers stand farther out, 0 where the calibration's place
+    explains the frame as well; and their standard errors. `nats` are the log odds of a mask there against none, by
+    `patches`."""
 
     periods: tuple[float, float]
     periods_sigma: tuple[float, float]
     turn_rad: float
     turn_sigma_rad: float
+    off: float
+    off_sigma: float
     nats: float
     patches: int
 
     @property
     def moved(self) -> bool:
         """Whether it is anywhere else."""
-        return bool(any(self.periods) or self.turn_rad)
+        return bool(any(self.periods) or self.turn_rad or self.off)
 
-    @property
-    def at_edge(self) -> bool:
-        """Whether the turn is as far as was searched: it may be farther."""
-        return abs(self.turn_rad) > _AT_EDGE * _MOST_TURN
+    def far(self) -> MaskPlace:
+        """It with what is so far from the calibrated place that frames of a mask in it don't show it."""
+        return replace(
+            self,
+            periods=self.periods if math.hypot(*self.periods) >= _FAR_PERIODS else (0.0, 0.0),
+            turn_rad=self.turn_rad if abs(self.turn_rad) >= _FAR else 0.0,
+            off=self.off if abs(self.off) >= _FAR else 0.0,
+        )
 
     @property
     def seen(self) -> bool:
         """Whether the patches agree on this place: else there is no mask, or nothing has parallax or texture."""
         return self.nats > SEEN_NATS
 
-    def beyond(self, periods: tuple[float, float], *, alone: bool = False) -> MaskPlace:
-        """The place by slices of a mask that had moved by so many periods before; `alone`: nothing but that."""
-        rest, turn = ((0.0, 0.0), 0.0) if alone else (self.periods, self.turn_rad)
-        y, x = (one + other - round(one + other) for one, other in zip(rest, periods, strict=True))
-        return replace(self, periods=(float(y), float(x)), turn_rad=turn)
+    def beyond(self, periods: tuple[float, float], turn_rad: float = 0.0, off: float = 0.0) -> MaskPlace:
+        """The place by slices that were turned back to one so far off before."""
+        y, x = (one + other - round(one + other) for one, other in zip(self.periods, periods, strict=True))
+        return replace(self, periods=(float(y), float(x)), turn_rad=self.turn_rad + turn_rad, off=self.off + off)
 
-    def nowhere(self, nats: float) -> MaskPlace:
-        """It without any move, and with these odds: a turn at the search's edge that led nowhere."""
-        return replace(self, periods=(0.0, 0.0), turn_rad=0.0, nats=nats)
+    def nowhere(self) -> MaskPlace:
+        """It without any move: a search that led nowhere."""
+        return self.beyond((-self.periods[0], -self.periods[1]), -self.turn_rad, -self.off)
 
     def undone(
-        self, slices: Complexes, orders: Sequence[Order], turned: Floats, steps_px: tuple[float, float]
+        self, slices: Complexes, orders: Sequence[Order], changes: Floats, steps_px: tuple[float, float]
     ) -> Complexes:
-        """Slices as a mask without the turn would make them; `turned` and `steps_px` as in `mask_place`."""
-        if not self.turn_rad:
+        """Slices as a mask without turn and scale would make them; `changes` and `steps_px` as in `mask_place`."""
+        if not (self.turn_rad or self.off):
             return slices
-        cycles = self.turn_rad * np.array(orders, dtype=np.float64) @ turned  # (K, 2) for each sensor pixel
+        away = self.turn_rad * changes[0] + self.off * changes[1]
+        cycles = np.array(orders, dtype=np.float64) @ away  # (K, 2) for each sensor pixel
         down, across = (
             np.exp(-2j * np.pi * np.outer(along, (np.arange(side) - (side - 1) / 2) * px)).astype(np.complex64)
             for along, side, px in zip(cycles.T, slices.shape[1:], steps_px, strict=True)
@@ -117,11 +124,13 @@ class MaskPlace:
         return np.asarray(slices * down[:, :, None] * across[:, None, :])
 
 
-def cycles_per_radian(lattice: Lattice, sensor: Sensor) -> Floats:
-    """(2, 2) by how many cycles per sensor pixel (rows ky and kx) carriers move as the mask turns by a small angle."""
+def carrier_changes(lattice: Lattice, sensor: Sensor) -> Floats:
+    """(2, 2, 2) by how many cycles per sensor pixel (rows ky and kx) carriers move for each radian of a small turn of
+    the mask, and for each unit of its scale."""
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])
     quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    return np.asarray(lattice.matrix() @ np.linalg.inv(to_sensor).T @ quarter @ to_sensor.T)
+    turned = lattice.matrix() @ np.linalg.inv(to_sensor).T @ quarter @ to_sensor.T
+    return np.stack([turned, lattice.matrix()])
 
 
 def mask_place(
@@ -131,14 +140,14 @@ def mask_place(
     samples_px: tuple[float, float],
     noise: Floats,
     reach: float,
-    turned: Floats,
+    changes: Floats,
     steps_px: tuple[float, float],
     workers: int = 1,
 ) -> MaskPlace | None:
     """The mask's place by slices complex64 (K, h, w), the half plane of `model`, DC first; None for too small ones.
 
-    `samples_px`, `noise` and `reach` as for `joint_views`. `turned` (2, 2) is by how many cycles per sensor pixel (rows
-    ky and kx) the carriers move for each radian of turn, `steps_px` by how many rows and columns of it a sample steps.
+    `samples_px`, `noise` and `reach` as for `joint_views`. `changes` (2, 2, 2) are `carrier_changes`, `steps_px` is by
+    how many rows and columns of the sensor a sample steps.
     """
     shape = (slices.shape[1], slices.shape[2])
     witness = MaskWitness.of(shape, model, samples_px=samples_px, reach=reach, workers=workers)
@@ -161,8 +170,9 @@ def mask_place(
         if found.max() <= likely:
             break
         likely = float(found.max())
-        differences, terms = _terms(model.orders, wholes[int(found.argmax())], frame.weights, spectra, workers)
-        place = _Likelihood(differences, terms, (middles * np.array(steps_px)) @ turned.T).place()
+        differences, terms = _terms(seen, wholes[int(found.argmax())], workers)
+        away = (middles * np.array(steps_px)) @ changes.swapaxes(1, 2)
+        place = _Likelihood(differences, terms, away).place()
         if place.seen:
             break
     return place
@@ -202,14 +212,16 @@ class MaskWitness:
         wholes = [rests.whole(number, detail[few], few) for number in range(len(kinds))]
         found = likelihoods(wholes, spectra[few], frame.weights[few], workers).sum(axis=1)
         whole = rests.whole(int(found.argmax()), detail)
-        differences, terms = _terms(frame.model.orders, whole, frame.weights, spectra, workers)
-        return _Likelihood(differences, terms, np.zeros((len(terms), 2))).nats(np.zeros(3))
+        # By parallax alone: by its means a mask that has moved by little would be no mask.
+        differences, terms = _terms(replace(seen, lit=np.zeros_like(seen.lit)), whole, workers)
+        return _Likelihood(differences, terms, np.zeros((2, len(terms), 2))).nats(np.zeros(4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Textured:
     """The `patches` (N,) of a frame with the most texture: its model, the power of their texture, `own` (F,) at their
-    frequencies, the root of their mean square `mean`, and their `spectra` (F, A, N), so that none outvotes the others.
+    frequencies, the root of their mean square `mean`, and their `spectra` (F, A, N), so that none outvotes the others,
+    less those of their means: `lit` (N,) of them in the slice (0, 0) times `flat` (F,) and what is common to all.
     """
 
     patches: NDArray[np.intp]
@@ -218,6 +230,8 @@ class _Textured:
     own: Floats
     mean: float
     spectra: Complexes
+    lit: Floats
+    flat: Complexes
 
     @classmethod
     def of(cls, witness: MaskWitness, slices: Complexes, noise: Floats, most: int) -> _Textured:
@@ -233,31 +247,40 @@ class _Textured:
         spectrum = TexturePower.of(np.maximum(power.mean(axis=1) - frame.noise[0], 0), radius)
         own = spectrum.at(radius)
         strength = (power[1:] / (own + frame.noise[0])[1:, None]).mean(axis=0)
-        spectra /= np.asarray(np.sqrt(np.maximum(strength, _FAINT)), dtype=np.float32)
-        return cls(best, frame, spectrum, own, float(np.sqrt(np.mean(means**2))), spectra)
+        root = np.sqrt(np.maximum(strength, _FAINT))
+        spectra /= np.asarray(root, dtype=np.float32)
+        flat = patches.spectra(np.ones((1, 1, SIDE, SIDE), dtype=np.complex64))[:, 0, 0]
+        return cls(best, frame, spectrum, own, float(np.sqrt(np.mean(means**2))), spectra, means / root, flat)
 
 
-def _terms(
-    orders: NDArray[np.int64], whole: Complexes, weights: Singles, spectra: Complexes, workers: int
-) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
-    """The differences m (M, 2) of `orders` (A, 2) in a half plane, without 0, which tells nothing, and the terms c
-    (N, M), twice as large for it, of each patch (F, A, N) whose covariance is the `whole` (F, A, A), by frequencies'
-    `weights` (F,)."""
-    inverse = (np.linalg.inv(whole.astype(np.complex128)) * (-2 * weights[:, None, None])).astype(np.complex64)
+def _terms(seen: _Textured, whole: Complexes, workers: int) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
+    """The differences m (M, 2) of orders in a half plane, without 0, which tells nothing, and the terms c (N, M), twice
+    as large for it, of each patch whose covariance is the `whole` (F, A, A)."""
+    orders, common = seen.frame.model.orders, seen.frame.model.common().astype(np.complex64)
+    inverse = (np.linalg.inv(whole.astype(np.complex128)) * (-2 * seen.frame.weights[:, None, None])).astype(
+        np.complex64
+    )
     apart = orders[:, None] - orders[None, :]
     ahead = (apart[..., 0] > 0) | ((apart[..., 0] == 0) & (apart[..., 1] > 0))
     differences, found = np.unique(apart[ahead], axis=0, return_inverse=True)
     place = np.zeros(ahead.shape, dtype=np.intp)
     place[ahead] = found.ravel()
-    terms = np.zeros((spectra.shape[2], len(differences)), dtype=np.complex128)
+    terms = np.zeros((seen.spectra.shape[2], len(differences)), dtype=np.complex128)
+    common[0] = 0  # the mean of the slice (0, 0) stays where it is, and was taken out
+    of_means = seen.flat.conj()[:, None] * np.einsum("a,fab->fb", common.conj(), inverse)
+    first = ahead[:, 0]  # the half plane's orders, whose conjugates hold the same
 
     def add(some: slice) -> None:
-        here = np.ascontiguousarray(spectra[:, :, some].transpose(1, 0, 2))
+        means = seen.flat[:, None, None] * common[:, None] * seen.lit[some].astype(np.float32)
+        here = np.ascontiguousarray((seen.spectra[:, :, some] + means).transpose(1, 0, 2))
         conjugate = here.conj()
         for b, with_b in enumerate(ahead.T):
             column = inverse[:, with_b, b].T[:, None]
             products = (column @ (conjugate[with_b] * here[b]))[:, 0]
             terms[some, place[with_b, b]] += products.T  # for one b every a has a difference of its own
+        alone = seen.lit[some, None] * np.einsum("fb,bfn->nb", of_means, here)
+        terms[some, place[first, 0]] -= alone[:, first].conj()
+        terms[some, place[0, ahead[0]]] -= alone[:, ahead[0]]
 
     each(add, spans(len(terms), _AT_A_TIME), workers)
     return differences, terms
@@ -271,37 +294,32 @@ def _tried() -> Floats:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Likelihood:
-    """Log likelihood of N patches over moves: `terms` (N, M) at `differences` (M, 2), and by how many periods `turned`
-    (N, 2) a turn of one radian moves the mask at each patch."""
+    """Log likelihood of N patches over moves (ky, kx, radians, scale): `terms` (N, M) at `differences` (M, 2), and by
+    how many periods a turn of one radian and a scale twice as large move the mask at each patch, `changed` (2, N, 2).
+    """
 
     differences: NDArray[np.int64]
     terms: NDArray[np.complex128]
-    turned: Floats
+    changed: Floats
 
     def place(self) -> MaskPlace:
         """The most probable place; what is not sure, or small, is 0."""
-        still = self._best(turns=np.zeros(1))
-        both = self._best(turns=np.linspace(-_MOST_TURN, _MOST_TURN, _TURNS))
-        found = still
-        if abs(both[2]) >= _LEAST_TURN and self._sure(both, still):
-            found = both
-            apart = np.array([0.0, 0.0, found[2]])
-        else:
-            apart = np.zeros(3)
-        if np.hypot(*found[:2]) < _LEAST_PERIODS or not self._sure(found, apart):
-            found = apart
-        nats = self.nats(found)
-        if (
-            found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP
-        ):  # patches that gain, each for a reason of its own
-            found = np.zeros(3)
+        found, nats = np.zeros(4), self.nats(np.zeros(4))
+        still = self._best(np.zeros((1, 4)))
+        for one in (still, self._changed()):
+            if (more := self.nats(one)) > nats + SEEN_NATS:
+                found, nats = one, more
+        if found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP:
+            found = np.zeros(4)  # patches that gain, each for a reason of its own
             nats = self.nats(found)
-        sigma = self._sigma(found)
+        periods, sigma = found.tolist(), self._sigma(found).tolist()
         return MaskPlace(
-            (float(found[0]), float(found[1])),
-            (float(sigma[0]), float(sigma[1])),
-            float(found[2]),
-            float(sigma[2]),
+            (periods[0], periods[1]),
+            (sigma[0], sigma[1]),
+            periods[2],
+            sigma[2],
+            periods[3],
+            sigma[3],
             nats,
             len(self.terms),
         )
@@ -319,24 +337,33 @@ class _Likelihood:
         return float(np.logaddexp.reduce(shares) - np.log(len(shares)))
 
     def patches(self, move: Floats) -> Floats:
-        """(N,) log likelihoods at (ky, kx, radians)."""
+        """(N,) log likelihoods at a move (4,)."""
         return np.asarray(self._waves(move).real.sum(axis=1))
 
     def _waves(self, move: Floats) -> NDArray[np.complex128]:
-        at = move[:2] + move[2] * self.turned
+        at = move[:2] + np.tensordot(move[2:], self.changed, axes=1)
         return np.asarray(self.terms * np.exp(2j * np.pi * at @ self.differences.T))
 
-    def _best(self, turns: Floats) -> Floats:
-        """The most probable move with one of these turns, or near it: (ky, kx, radians)."""
+    def _changed(self) -> Floats:
+        """The most probable move with a turn and another scale."""
+        along = np.linspace(-_MOST, _MOST, _CHANGES)[:, None]
+        turns, scales = along * np.eye(4)[2], along * np.eye(4)[3]
+        first = self._best(np.concatenate([turns, scales]))
+        scaled = abs(first[3]) > abs(first[2])
+        return self._best(turns + first * (0, 0, 0, 1) if scaled else scales + first * (0, 0, 1, 0))
+
+    def _best(self, changes: Floats) -> Floats:
+        """The most probable move (4,) with one of these turns and scales (T, 4), or near it; where one of these is 0 in
+        all, it stays so."""
         tried = _tried()
-        sums = np.stack([self._waves(np.array([0.0, 0.0, turn])).sum(axis=0) for turn in turns], axis=1)
+        sums = np.stack([self._waves(one * (0, 0, 1, 1)).sum(axis=0) for one in changes], axis=1)
         found = (np.exp(2j * np.pi * tried @ self.differences.T) @ sums).real
-        shift, turn = np.unravel_index(int(found.argmax()), found.shape)
-        move = np.array([*tried[shift], turns[turn]])
-        free = slice(0, 3 if len(turns) > 1 else 2)
+        shift, change = np.unravel_index(int(found.argmax()), found.shape)
+        move = np.array([*tried[shift], *changes[change, 2:]])
+        free = np.flatnonzero(np.append([True, True], changes[:, 2:].any(axis=0)))
         for _ in range(_ROUNDS):
             gradient, curvature = self._slopes(move)
-            step = np.linalg.lstsq(curvature[free, free], gradient.sum(axis=0)[free], rcond=None)[0]
+            step = np.linalg.lstsq(curvature[np.ix_(free, free)], gradient.sum(axis=0)[free], rcond=None)[0]
             new = move.copy()
             new[free] += step
             if self.patches(new).sum() <= self.patches(move).sum():
@@ -345,25 +372,17 @@ class _Likelihood:
         return move
 
     def _slopes(self, move: Floats) -> tuple[Floats, Floats]:
-        """(N, 3) gradients of the patches, and (3, 3) the sum's curvature, its sign turned."""
+        """(N, 4) gradients of the patches, and (4, 4) the sum's curvature, its sign turned."""
         waves = self._waves(move)
         along = np.stack(
-            [*np.broadcast_to(self.differences.T[:, None], (2, *waves.shape)), self.turned @ self.differences.T]
+            [*np.broadcast_to(self.differences.T[:, None], (2, *waves.shape)), *(self.changed @ self.differences.T)]
         )
         gradient = (2j * np.pi * waves * along).sum(axis=2).real.T
         curvature = np.einsum("anm,bnm,nm->ab", along, along, waves.real) * (2 * np.pi) ** 2
         return gradient, np.asarray(curvature)
 
-    def _sure(self, one: Floats, other: Floats) -> bool:
-        """Whether so many patches are more probable with one move than with another that it is no chance."""
-        gains = self.patches(one) - self.patches(other)
-        count = len(gains) / _OVERLAP
-        chance = (2 * float(np.mean(gains > 0)) - 1) * np.sqrt(count)
-        gain = float(np.median(gains))
-        return bool((chance > _SURE and gain > _LEAST_NATS) or (chance > _LIKELY and gain > _MANY_NATS))
-
     def _sigma(self, move: Floats) -> Floats:
-        """(3,) standard errors, from the scatter of the patches' own gradients: whatever a likelihood's scale."""
+        """(4,) standard errors, from the scatter of the patches' own gradients: whatever a likelihood's scale."""
         gradient, curvature = self._slopes(move)
         back = np.linalg.pinv(curvature)
         return np.asarray(np.sqrt(np.maximum(np.diag(back @ (gradient.T @ gradient) @ back) * _OVERLAP, 0)))

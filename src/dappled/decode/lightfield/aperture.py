@@ -217,7 +217,6 @@ class UsedAperture:
     where that is farther off than f-number and distance should be, or where the frame agrees with no aperture (NaN);
     None where there is no such reason for doubt. `unexplained` is the rms of what the means of the slices differ from
     those of this aperture, as a share of the plane's mean: clipped pixels and a stop of another shape leave it.
-    `phases` is the sum of their squared deviations from the phases of a mask in its place, which no stop turns.
     """
 
     kappa: float
@@ -226,11 +225,6 @@ class UsedAperture:
     aperture: Aperture
     share: float | None = None
     unexplained: float = 0.0
-    phases: float = 0.0
-
-    def contradicts(self, other: UsedAperture) -> bool:
-        """Whether the means agree with it far less than with an `other`, of a mask that has not moved."""
-        return not self.fits or self.phases > other.phases + _MOVED
 
     @property
     def fits(self) -> bool:
@@ -267,14 +261,13 @@ def used_aperture(
     shown = _shown_means(slices, transfers, orders)
     if shown is None:
         return nominal
-    wanted, complex_means, error = shown
-    seen = complex_means.real
+    wanted, seen, error = shown
     off, prior = _kappas(sigma)
     best: UsedAperture | None = None
     least = math.inf
     for shape in SHAPES:
         found, cost = _fitted(
-            seen,
+            seen.real,
             error,
             wanted,
             nominal_kappa * np.exp(off),
@@ -286,7 +279,6 @@ def used_aperture(
             best, least = found, cost
     if best is None:
         return replace(nominal, share=math.nan)
-    best = replace(best, phases=float(((complex_means.imag / error) ** 2).sum()))
     share = best.kappa / nominal_kappa
     return replace(best, share=share) if abs(math.log(share)) > far else best
 
