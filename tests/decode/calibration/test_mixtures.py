@@ -99,6 +99,15 @@ def test_another_scale_and_a_small_move_are_made_good_where_no_carriers_measure_
         assert _views(one)[0] > least, changed
 
 
+@pytest.mark.slow
+def test_an_f_number_told_two_stops_wrong_is_no_mask_that_moved() -> None:
+    one = Mixture.disturbed(92)
+    assert one.changed == "told_f"
+    views, mean, doubts = _views(one)
+    assert views > mean
+    assert doubts == ["aperture.disagrees"]
+
+
 @pytest.mark.long
 def test_what_changed_since_the_calibration_spoils_no_views_without_a_doubt() -> None:
     changed = [one for one in map(Mixture.disturbed, range(_LONG)) if one.changed]

@@ -114,3 +114,11 @@ def test_what_tells_nothing_leaves_the_f_number_s_word() -> None:
     for slices, transfers in ((black, TRANSFERS), (_slices(1.0, 0.0, Aperture(5), 0.0), np.eye(13)[0] + 0j)):
         found = used_aperture(slices, transfers, ORDERS, nominal_kappa=1.02, rotation_rad=0.0, aperture=Aperture(5))
         assert (found.kappa, found.fitted) == (1.02, False)
+
+
+@pytest.mark.parametrize("told", [0.5, 2.0])
+def test_an_f_number_told_two_stops_wrong_is_found(told: float) -> None:
+    slices = _slices(0.7, 0.0, Aperture(5), texture=0.01)
+    found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.7 * told, rotation_rad=0.0, aperture=Aperture(5))
+    assert found.kappa == pytest.approx(0.7, rel=0.003)
+    assert found.share == pytest.approx(1 / told, rel=0.003)

@@ -35,7 +35,7 @@ Shape = Literal["beams", "filled", "round"]
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
 _PARTS = 15  # of a cell's side, where a circle cuts through cells
-SEARCHED = 1.7  # times or a fraction of the nominal κ: an f-number told a third wrong, and a distance of a tenth
+SEARCHED = 2.3  # times or a fraction of the nominal κ: an f-number told two stops wrong, and a distance of a tenth
 _STEP = 5e-4  # relative: of the search
 _NOMINAL_SIGMA = 0.02  # relative: the error of an f-number (nominal f/22 is 22.6, f/3.5 is 3.56)
 _UNKNOWN_SIGMA = 0.2  # relative: the error of κ where the mask's distance was not fitted
