@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from pathlib import Path
 
+from dappled import workers
 from dappled.cli import paths
 from dappled.cli.calibrate import lens
 from dappled.cli.placing import Refining
@@ -174,23 +176,30 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         return terrain.of(made, output.show, lowest_m=low, highest_m=high)
 
     def _draw(self, made: Survey, folder: Path, output: Output) -> list[Path]:
-        files: list[Path] = []
-        maps = [kind for kind in _EACH if kind in self.kinds]
-        steps = len(maps) * (1 + len(made.photographs) * self.each)
-        if maps:
-            output.show("draw maps", 0, steps)
+        """Draw the maps, several at a time: each is one thread's, most of which is spent in libraries."""
         gain = map_files.gain_of(made)
-        if "kmz" in self.kinds:
-            files.append(map_files.mosaic_kmz(made, folder / "mosaic.kmz", gain))
-        if "cog" in self.kinds:
-            files.append(map_files.mosaic_cog(made, folder / "mosaic.tif", gain))
-        for number, one in enumerate(made.photographs if self.each else ()):
-            output.show("draw maps", len(maps) * (1 + number), steps)
+        whole = {"kmz": map_files.mosaic_kmz, "cog": map_files.mosaic_cog}
+        drawn: dict[Path, Callable[[], Path]] = {}
+        for kind, ending in _EACH.items():
+            if kind in self.kinds:
+                path = folder / f"mosaic{ending}"
+                drawn[path] = partial(whole[kind], made, path, gain)
+        for one in made.photographs if self.each else ():
             beside = folder / "frames" / one.name
             if "kmz" in self.kinds:
-                files.append(map_files.frame_kmz(made, one, beside.with_suffix(".kmz"), gain, quad=self.quad))
+                path = beside.with_suffix(".kmz")
+                drawn[path] = partial(map_files.frame_kmz, made, one, path, gain, quad=self.quad)
             if "cog" in self.kinds:
-                files.append(map_files.frame_cog(made, one, beside.with_suffix(".tif"), gain))
+                path = beside.with_suffix(".tif")
+                drawn[path] = partial(map_files.frame_cog, made, one, path, gain)
+        done = count()
+
+        def draw(path: Path) -> None:
+            output.show("draw maps", next(done), len(drawn))
+            drawn[path]()
+
+        workers.each(draw, drawn, self.workers)
+        files = list(drawn)
         if "footprints" in self.kinds:
             files.append(map_files.write_footprints(made, folder))
         return files

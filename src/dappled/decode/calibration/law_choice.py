@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import optimize
 
 from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
@@ -202,6 +201,8 @@ def _fit_geometric(
     lowest = np.array([0.5, 0.5, 0.0, -0.9 * shortest])[free]
     highest = np.array([2.0, 2.0, 0.99 * shortest, 10 * shortest])[free]
     scales = np.array([1e-3, 1e-3, stated_mm, 1.0])[free]
+    from scipy import optimize  # noqa: PLC0415  # a third of the start of verbs that fit no law
+
     found = optimize.least_squares(
         left, base[free], bounds=(lowest, highest), x_scale=scales, ftol=1e-14, xtol=1e-14, gtol=1e-14
     )

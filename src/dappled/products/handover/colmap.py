@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from dappled import durable
 from dappled.decode.array_types import Floats
@@ -163,6 +162,8 @@ def _from_world(one: FrameCameras, view: ViewCamera, world: LocalAxes) -> tuple[
     """Quaternion (w, x, y, z) and translation from world to a view's camera axes."""
     to_world, centre = world.place(one)
     place: Floats = centre + to_world @ np.array(view.centre_m)
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # an eighth of the start of `batch`
+
     x, y, z, w = Rotation.from_matrix(to_world.T).as_quat().tolist()
     return (w, x, y, z, *(-to_world.T @ place).tolist())
 

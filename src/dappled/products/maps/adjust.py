@@ -14,7 +14,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.sparse.linalg import spsolve
 
 from dappled.decode.array_types import Floats
 from dappled.products.maps.eye import Eye
@@ -78,6 +77,8 @@ def adjust(
     iterations: int = 20,
 ) -> Solution:
     """Adjust by Gauss-Newton from the given eyes, with `sigmas` (n, 6) of their shifts (m) and turns (rad)."""
+    from scipy.sparse.linalg import spsolve  # noqa: PLC0415  # an eighth of the start of verbs that adjust nothing
+
     given = list(eyes)
     count = len(given)
     changes = np.zeros((count, 6))

@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from dappled.config.profiles import Lens
 from dappled.decode.array_types import Floats
+from dappled.decode.geometry import camera_pose
 from dappled.decode.optics import Sensor
 from dappled.errors import DappledError
 
@@ -211,4 +211,6 @@ def undistorted(bent: Floats, numbers: tuple[float, float, float, float, float])
 
 def turn(vector: Floats) -> Floats:
     """The rotation by a vector of radians."""
-    return np.asarray(Rotation.from_rotvec(vector).as_matrix())
+    half = math.hypot(*vector) / 2
+    x, y, z = (float(np.sinc(half / math.pi)) / 2 * float(part) for part in vector)
+    return camera_pose.matrix_of((math.cos(half), x, y, z))

@@ -141,12 +141,15 @@ def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
 def sample(image: Singles, at: Floats) -> Singles:
     """float32 (rows, columns, c): an image (h, w, c) at pixels (rows, columns, 2); NaN where those are NaN."""
     cv2 = need("cv2")
-    inside = np.isfinite(at[..., 0])
-    if not inside.any():
-        return np.full((*inside.shape, image.shape[2]), np.nan, dtype=np.float32)
-    x, y = (np.where(inside, at[..., axis], 0).astype(np.float32) for axis in (0, 1))
-    values = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).reshape(*inside.shape, -1)
-    return np.where(inside[..., None], values, np.float32(np.nan)).astype(np.float32)
+    outside = ~np.isfinite(at[..., 0])
+    if outside.all():
+        return np.full((*outside.shape, image.shape[2]), np.nan, dtype=np.float32)
+    x, y = (at[..., axis].astype(np.float32) for axis in (0, 1))
+    x[outside] = y[outside] = 0
+    values = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).reshape(*outside.shape, -1)
+    seen = np.asarray(values, np.float32)
+    seen[outside] = np.nan
+    return seen
 
 
 def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> Floats:
@@ -161,14 +164,16 @@ def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> 
         at = eye.project(np.stack([east, north, height], axis=-1).reshape(-1, 3)).reshape(*grid.shape, 2)
         inside = ground.sees(eye, east, north, height)
     for axis, side in enumerate((columns, rows)):  # one after the other: NumPy is slow along an axis of two
-        inside = inside & (np.abs(at[..., axis] - (side - 1) / 2) <= side / 2)
-    at[~inside] = np.nan
+        inside &= (at[..., axis] >= -0.5) & (at[..., axis] <= side - 0.5)
+    outside = ~inside
+    for axis in (0, 1):
+        at[..., axis][outside] = np.nan
     return at
 
 
 def _on_flat(eye: Eye, grid: MapGrid, ground: Flat, projection: Projection) -> Floats:
-    """(rows, columns, 2): the pixel at which each cell of flat ground stands, also outside of the view; NaN behind the
-    camera."""
+    """(rows, columns, 2), x and y apart in memory: the pixel at which each cell of flat ground stands, also outside of
+    the view; NaN behind the camera."""
     axes = grid.axes()
     nodes = [np.linspace(axis[0], axis[-1], max(2, math.ceil(len(axis) / _FLAT_NODE) + 1)) for axis in axes]
     x, y = np.meshgrid(*nodes)
@@ -182,10 +187,7 @@ def _on_flat(eye: Eye, grid: MapGrid, ground: Flat, projection: Projection) -> F
     if bent:
         at = eye.imaged(at.reshape(-1, 2)).reshape(at.shape)
     aside, down = (between(axis, node) for axis, node in zip(axes, nodes, strict=True))
-    made = np.empty((*grid.shape, 2))
-    for axis in (0, 1):
-        np.matmul(down @ at[..., axis], aside.T, out=made[..., axis])
-    return made
+    return np.moveaxis(np.matmul(down @ np.moveaxis(at, -1, 0), aside.T), 0, -1)
 
 
 def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground) -> Singles:
@@ -250,8 +252,8 @@ def pieces(
             rows = slice(top, min(top + _TILE, grid.shape[0]))
             columns = slice(left, min(left + _TILE, grid.shape[1]))
             shape = rows.stop - rows.start, columns.stop - columns.start
-            total = np.zeros((*shape, colours), dtype=np.float32)
-            weight = np.zeros((*shape, 1), dtype=np.float32)
+            total = np.zeros((colours, *shape), dtype=np.float32)
+            weight = np.zeros(shape, dtype=np.float32)
             for one, box in zip(photographs, boxes, strict=True):
                 near = (
                     slice(max(box[0], top), min(box[1], rows.stop)),
@@ -264,25 +266,29 @@ def pieces(
                 for image, eye in layers:
                     at = seen_at(eye, grid.part(*near), ground, projection)
                     seen = sample(smoothed(image, eye, grid, ground), at)
-                    say = _say(at, eye.shape) / len(layers)
-                    say[~np.isfinite(seen[..., :1])] = 0
-                    seen[~np.isfinite(seen)] = 0
-                    total[inner] += seen * say
+                    say = _say(at, eye.shape) / np.float32(len(layers))
+                    unseen = ~np.isfinite(seen[..., 0])
+                    say[unseen] = 0
+                    seen[unseen] = 0
+                    for number in range(colours):  # one after the other: NumPy is slow along an axis of three
+                        total[number][inner] += seen[..., min(number, seen.shape[2] - 1)] * say
                     weight[inner] += say
             with np.errstate(invalid="ignore"):
-                yield rows, columns, np.where(weight > 0, total / weight, np.nan).astype(np.float32)
+                total /= weight  # NaN where none looks
+            yield rows, columns, np.ascontiguousarray(np.moveaxis(total, 0, -1))
 
 
 def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Singles:
-    """(rows, columns, 1): the weight of a view of this shape where its pixels (rows, columns, 2) are looked up."""
+    """(rows, columns): the weight of a view of this shape where its pixels (rows, columns, 2) are looked up; NaN where
+    those are NaN."""
     away = np.full(at.shape[:2], 0.5, dtype=np.float32)
     for axis, side in enumerate((shape[1], shape[0])):
         share = ((at[..., axis] + 0.5) / side).astype(np.float32)
         np.minimum(away, np.minimum(share, 1 - share), out=away)
-    weight = 2 * np.where(away > 0, away, np.float32(0)) + np.float32(1e-3)
+    weight = 2 * np.maximum(away, np.float32(0)) + np.float32(1e-3)
     for _ in range(_SQUARED):
         np.square(weight, out=weight)
-    return weight[..., None]
+    return weight
 
 
 def _cells(one: Photograph, grid: MapGrid, ground: Ground, projection: Projection) -> tuple[int, int, int, int]:
