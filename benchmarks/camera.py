@@ -149,7 +149,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
 
 
 def _weigh_session() -> None:
-    """Have a session of our own, with the unit's weight: a kernel that weighs sessions asks for niceness only inside."""
+    """Have a session of our own, with the unit's weight: a kernel that weighs sessions asks niceness only inside."""
     with contextlib.suppress(OSError):  # of a shell, the process leads the shell's job: it stays there
         os.setsid()
         Path("/proc/self/autogroup").write_text(str(_SESSION_NICE), encoding="ascii")
