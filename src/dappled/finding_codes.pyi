@@ -283,6 +283,7 @@ class Code(StrEnum):
     PICTURE_DEVELOPED = "picture.developed"
     PICTURE_EXPOSURE_UNKNOWN = "picture.exposure_unknown"
     PICTURE_NAMES_DISAGREE = "picture.names_disagree"
+    PICTURE_NOISE_UNKNOWN = "picture.noise_unknown"
     PICTURE_ON_CARD = "picture.on_card"
     PICTURE_PANEL_CLIPPED = "picture.panel_clipped"
     PICTURE_PANEL_DARK = "picture.panel_dark"

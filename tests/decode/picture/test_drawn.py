@@ -23,11 +23,13 @@ _SEEN = 2e-4  # of the mean, as frames' pictures are made
 @dataclass(frozen=True)
 class Judged:
     """`short_db`: how far the picture falls short of the better of raw over the true shadow and the band around the
-    mean; `depth` the shadow's standard deviation; `shares` of the pixels within 1 and 2 σ."""
+    mean; `depth` the shadow's standard deviation; `shares` of the pixels within 1 and 2 σ; `sure_noise` of the noise is
+    no detail."""
 
     short_db: float
     depth: float
     shares: tuple[float, float]
+    sure_noise: float
 
 
 def _masked(shot: Drawn) -> tuple[MosaicPlane, Lattice, list[Order]]:
@@ -64,6 +66,7 @@ def judged(shot: Drawn, beside: Sequence[ShadowEvidence] = ()) -> Judged:
         shot.psnr(made.plane) - max(others),
         float(shot.lights[2][shot.colour_at >= 0].std()),
         (float(np.mean(off < 1)), float(np.mean(off < 2))),
+        made.sure_noise,
     )
 
 
@@ -170,6 +173,16 @@ def test_blurred_detail_is_no_less_noise_and_ghosts_within_the_band_are_errors(n
     assert shares[1] > 0.8
 
 
+@pytest.mark.parametrize(
+    ("number", "sure"),
+    [(120, False), pytest.param(97, False, marks=pytest.mark.slow), (20, True), (150, True)],
+)
+def test_noise_that_may_be_detail_is_told_where_sigma_is_too_wide(number: int, sure: bool) -> None:
+    found = judged(draw()[number])
+    assert (found.sure_noise > 0.2) == sure
+    assert (found.shares[0] < 0.9) == sure
+
+
 @pytest.mark.long
 @pytest.mark.timeout(3600)
 def test_two_hundred_drawn_pictures() -> None:
@@ -184,3 +197,6 @@ def test_two_hundred_drawn_pictures() -> None:
         assert np.median(short) > 1, deep
         assert np.quantile(short, 0.1) > tenth, deep
         assert short.min() > -5.5, deep
+    known = np.array([one.shares for one in found if one.sure_noise > 0.2])
+    assert np.quantile(known[:, 0], 0.1) > 0.6
+    assert np.quantile(known[:, 0], 0.9) < 0.87

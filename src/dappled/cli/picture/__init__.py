@@ -172,6 +172,7 @@ def _facts(target: Path, made: MadePicture) -> dict[str, Any]:
         "lattice": shadow.lattice.matrix().tolist(),
         "dark_share": made.picture.dark_share,
         "soft_share": made.picture.soft_share,
+        "sure_noise_share": made.picture.sure_noise,
         "trusted_share": float(made.picture.trusted.mean()),
         "findings": [codec.plain(one) for one in findings.in_order(made.findings)],
     }

@@ -49,11 +49,12 @@ class Sharp:
 @dataclass(frozen=True, slots=True, eq=False)
 class Mixed:
     """The picture's samples without ghosts and noise, and the variances of what is left of both. `soft_share` of the
-    blocks lose more than half of their detail to ghosts."""
+    blocks lose more than half of their detail to ghosts; `sure_noise` of the noise's variance is no detail for sure."""
 
     pictures: list[Singles]
     variances: list[Singles]
     soft_share: float
+    sure_noise: float
 
 
 def bands_of(samples: Sequence[Sharp], shadow: Shadow) -> list[Singles]:
@@ -140,7 +141,7 @@ def mixed(samples: Sequence[Sharp], pattern: NDArray[np.bool_], shadow: Shadow) 
         noises, ghost = (down @ left.astype(np.float32) @ across.T for left in (noise_left, found.ghosts_left / fill))
         inside = wide[0][one.place.row :: step[0]] @ in_band @ wide[1][one.place.column :: step[1]].T
         variances.append(one.noise * noises + ghost + inside)
-    return Mixed(pictures, variances, float(np.mean(found.ghost_share > 0.5)))
+    return Mixed(pictures, variances, float(np.mean(found.ghost_share > 0.5)), share.sure)
 
 
 def _ghosts(

@@ -42,10 +42,12 @@ _ROUNDS = 10  # of the least squares
 
 @dataclass(frozen=True, slots=True)
 class NoiseShare:
-    """Of what is taken for noise, the shares that are noise at least, and as a mean over all that is likely."""
+    """Of what is taken for noise, the shares that are noise at least, and as a mean over all that is likely; of the
+    latter the share that no power law explains as detail, all of it where detail follows none."""
 
     least: float
     mean: float
+    sure: float
 
 
 def noise_of(made: Singles, shadow: Singles) -> tuple[float, float]:
@@ -84,7 +86,7 @@ def noise_share(pictures: Sequence[tuple[PatternPlace, Singles]], variance: floa
     all of one step."""
     side = min(_SIDE, *(min(one.shape) for _, one in pictures))
     if side < _LEAST_SIDE or variance <= 0:
-        return NoiseShare(1.0, 1.0)
+        return NoiseShare(1.0, 1.0, 1.0)
     power = np.mean([_spectrum(one, side) for _, one in pictures], axis=0)
     across = fft.rfftfreq(side)
     known = np.hypot(fft.fftfreq(side)[:, None], across) > _LOWEST / side
@@ -108,9 +110,10 @@ def noise_share(pictures: Sequence[tuple[PatternPlace, Singles]], variance: floa
     shares, best = np.clip(noise / variance, 0, _MOST), int(np.argmin(unlikely))
     least = float(shares[likely].min())
     if float((twice * (seen / made[best] - 1) ** 2).sum() / twice.sum()) > _POOR:
-        return NoiseShare(min(least, 1.0), 1.0)
+        return NoiseShare(min(least, 1.0), 1.0, 1.0)
     odds = np.exp((unlikely[best] - unlikely) / 2)
-    return NoiseShare(least, float(shares @ odds / odds.sum()))
+    mean = float(shares @ odds / odds.sum())
+    return NoiseShare(least, mean, least / max(mean, 1e-12))
 
 
 def _spectrum(image: Singles, side: int) -> Floats:

@@ -24,8 +24,8 @@ class UnmaskedPicture:
     colours (see `MosaicPlane`). `sigma` (H, W) is the standard error of each pixel: noise, the shadow's own, and what
     ghosts leave. `dark_share` of the pixels lie behind less than `DARK` of the mask's mean, in
     `soft_share` of the blocks more than half of the detail is left out, as they are out of focus (see `focus`).
-    `trusted` is False where the frame was clipped or the mask let less than `DARK` of its mean through, `valid` only
-    where it was clipped (None: nowhere)."""
+    `sure_noise` of the noise's variance in `sigma` can be no detail. `trusted` is False where the frame was clipped or
+    the mask let less than `DARK` of its mean through, `valid` only where it was clipped (None: nowhere)."""
 
     plane: Singles
     pattern: NDArray[np.intp]
@@ -34,6 +34,7 @@ class UnmaskedPicture:
     shadow: Shadow
     dark_share: float
     soft_share: float
+    sure_noise: float
     valid: NDArray[np.bool_] | None
 
 
@@ -65,7 +66,8 @@ def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPi
         off = image * np.float32(shadow.sigma[one.place.colour]) / known
         plane[one.place.cut], sigma[one.place.cut] = image, np.sqrt(variance + off * off)
     dark_share = dark / max(samples, 1)
-    return UnmaskedPicture(plane, mosaic.pattern, sigma, trusted, shadow, dark_share, shown.soft_share, mosaic.valid)
+    shares = (dark_share, shown.soft_share, shown.sure_noise)
+    return UnmaskedPicture(plane, mosaic.pattern, sigma, trusted, shadow, *shares, mosaic.valid)
 
 
 def interpolated(picture: UnmaskedPicture) -> Singles:

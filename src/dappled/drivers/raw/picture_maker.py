@@ -36,6 +36,7 @@ _DEEP = 0.03  # standard deviation of W: where as much is predicted at least, so
 _UNCERTAIN = 0.02  # standard error of W
 _TOLD_SIGMA = 0.02  # of a predicted W: f-number and stop
 _MANY_DARK = 0.01  # of the pixels
+_SURE_NOISE = 0.2  # of the noise's variance: where less is, more pixels lie within one sigma than should
 _BESIDE = 8  # frames whose shadows are averaged
 
 _Lens = tuple[float, float | None]
@@ -233,6 +234,8 @@ class PictureMaker:
             found.append(finding(Code.PICTURE_SHADOW_DIFFERS, subject, unlike=shadow.unlike, others=of_all))
         if made.dark_share > _MANY_DARK:
             found.append(finding(Code.PICTURE_DARK, subject, share=made.dark_share, below=DARK))
+        if made.sure_noise < _SURE_NOISE:
+            found.append(finding(Code.PICTURE_NOISE_UNKNOWN, subject, share=made.sure_noise))
         if made.soft_share > 0:
             found.append(finding(Code.PICTURE_SOFT, subject, share=made.soft_share))
         return tuple(found)
