@@ -91,6 +91,18 @@ def test_noise_makes_it_less_sure_not_wrong() -> None:
         assert np.mean(error > 0.25) < 0.05
 
 
+@pytest.mark.parametrize("rms", [0.04, 0.08])
+def test_the_error_of_noisy_views_has_what_contrast_enlarges(rms: float) -> None:
+    """Boards before each other: the part around a jump that is as near as what stands beside it is not left out."""
+    stack, truth = paint(boards(2, 160, 1.5, 6), (160, 160), 5)
+    found = estimate.estimate(evidence.of_views(noisy(stack, rms)))
+    error = np.abs(found.disparity - truth)[found.known] / found.sigma[found.known]
+    assert found.known_share() > 0.9
+    assert np.mean(error < 1) > 0.57
+    assert np.mean(error < 2) > 0.82
+    assert np.mean(error < 3) > 0.93
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_flat_scene_is_unknown_not_zero(method: str) -> None:
     if method == "stereo":

@@ -67,7 +67,7 @@ def depth(evidence: Evidence, search: Search) -> DepthMap:
     weight = np.float32(share / contrast.samples * _guessed(evidence) / variance)
     both = np.subtract(np.multiply(contrast.likelihood, weight, out=contrast.likelihood), cost, out=cost)
     samples = contrast.samples * box(_NARROW) ** 2
-    return _with_shared(_decided(_Seen(both, contrast.spread, samples), search, _NARROW, widen=True), evidence)
+    return _with_shared(_decided(_Seen(both, contrast.spread, samples), search), evidence)
 
 
 def _with_shared(found: DepthMap, evidence: Evidence) -> DepthMap:
@@ -142,16 +142,17 @@ class _Seen:
     samples: float
 
 
-def _decided(seen: _Seen, search: Search, window: int, *, widen: bool = False) -> DepthMap:
-    """The map of the peaks that neighbours select. `widen`: each peak is that of a window."""
+def _decided(seen: _Seen, search: Search) -> DepthMap:
+    """The map of the peaks that neighbours select, each that of a window. Contrast enlarges what is near by half of its
+    own: that far the error is that of a jump."""
     disparities = search.disparities()
     smooth = smoothed(-seen.likelihood, small=_SMALL, large=_LARGE, workers=search.workers)
     start = smooth.argmin(axis=0)
-    likelihood = windowed(seen.likelihood, window)[0] if widen else seen.likelihood
+    likelihood = windowed(seen.likelihood, _NARROW)[0]
     disparity, curvature = peaked(likelihood, disparities, start)
     best = np.take_along_axis(likelihood, start[None], axis=0)[0]
     sure = confidence(likelihood, best, seen.samples)
-    return judged(disparity, curvature, sure, spread=seen.spread, window=window, method="combined")
+    return judged(disparity, curvature, sure, spread=seen.spread, window=search.contrast_window, method="combined")
 
 
 def _by_contrast(evidence: Evidence, search: Search) -> _Seen:
