@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.array_types import Floats, Singles
@@ -103,21 +102,21 @@ def _weights(power: Singles, against: Singles) -> Singles:
 
 def _mean_of_bins(power: Singles) -> Singles:
     """Over `_NEAR` bins to each side along both axes."""
-    for axis in (1, 2):
-        made = power.copy()
-        for step in range(1, _NEAR + 1):
-            # A real picture's spectrum repeats along the one axis and is about even along the other.
-            made += np.roll(power, step, axis) if axis == 1 else power[:, :, _even(power.shape[2], step)]
-            made += np.roll(power, -step, axis) if axis == 1 else power[:, :, _even(power.shape[2], -step)]
-        power = made
-    power *= np.float32((2 * _NEAR + 1) ** -2)
-    return power
+    return np.asarray(_DOWN @ (power @ _ACROSS))
 
 
-def _even(count: int, step: int) -> NDArray[np.intp]:
-    """Indices `step` away, turned back at both ends."""
-    at = np.abs(np.arange(count) + step)
-    return np.asarray(np.where(at >= count, 2 * (count - 1) - at, at))
+def _near(count: int, whole: int) -> Singles:
+    """(count, count) the mean over `_NEAR` bins to each side, of the first `count` of `whole` bins: a real picture's
+    spectrum repeats, and where it is cut it is about even."""
+    steps = np.arange(-_NEAR, _NEAR + 1)
+    at = (np.arange(count) + steps[:, None]) % whole
+    at = np.where(at < count, at, whole - at)
+    made = np.zeros((count, count), dtype=np.float32)
+    np.add.at(made, (at, np.broadcast_to(np.arange(count), at.shape)), np.float32(1 / len(steps)))
+    return made
+
+
+_DOWN, _ACROSS = _near(SIDE, SIDE).T, _near(SIDE // 2 + 1, SIDE)
 
 
 def _in_blocks(values: Singles, weights: Floats, counts: list[int], over: int) -> Floats:
