@@ -251,6 +251,7 @@ class Code(StrEnum):
     MARKS_NOT_MOVED = "marks.not_moved"
     MARKS_UNPLACED = "marks.unplaced"
     MARKS_UNTIMED = "marks.untimed"
+    MASK_CONTRAST = "mask.contrast"
     MASK_NAMED = "mask.named"
     MASK_OVER_FLIGHT = "mask.over_flight"
     MASK_SHIFTED = "mask.shifted"

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer, used_aperture
 from dappled.decode.lightfield.views import from_slices
 from dappled.decode.optics.carriers import Mask
+from dappled.findings import Code
 
 ORDERS = Mask(15.5, 2).half_orders()
 TRANSFERS = transfer(ORDERS, [1.0, *[0.36] * 6, *[0.18] * 6], (0.31, -0.12))
@@ -122,3 +123,15 @@ def test_an_f_number_told_two_stops_wrong_is_found(told: float) -> None:
     found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.7 * told, rotation_rad=0.0, aperture=Aperture(5))
     assert found.kappa == pytest.approx(0.7, rel=0.003)
     assert found.share == pytest.approx(1 / told, rel=0.003)
+
+
+@pytest.mark.parametrize("contrast", [0.5, 0.8, 1.0])
+def test_a_shadow_of_less_contrast_is_told_from_another_stop(contrast: float) -> None:
+    slices = _slices(0.6, 0.0, Aperture(5, "round"), texture=0.01)
+    slices[1:] *= contrast
+    found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.61, rotation_rad=0.0, aperture=Aperture(5))
+    assert found.contrast == pytest.approx(contrast, abs=0.02)
+    assert found.kappa == pytest.approx(0.6, rel=0.01)
+    assert found.aperture == Aperture(5, "round")
+    doubt = found.finding(10.0)
+    assert (None if doubt is None else doubt.code) == (Code.MASK_CONTRAST if contrast < 1 else None)

@@ -108,8 +108,14 @@ class TakenSlices:
         return replace(self, transfers=self.transfers * turns)
 
     def through(self, width: UsedAperture) -> TakenSlices:
-        """The same, taken through this aperture."""
-        return replace(self, kappa_cycles=width.kappa, aperture=width.aperture, unexplained=width.unexplained)
+        """The same, taken through this aperture, with a shadow of its contrast."""
+        return replace(
+            self,
+            transfers=np.where(np.arange(len(self.transfers)) > 0, width.contrast, 1.0) * self.transfers,
+            kappa_cycles=width.kappa,
+            aperture=width.aperture,
+            unexplained=width.unexplained,
+        )
 
     def used_transfers(self) -> NDArray[np.complex128]:
         """(K,) T_k, 0 where a slice carries no information: the mask doesn't make its carrier."""

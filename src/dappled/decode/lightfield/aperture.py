@@ -53,6 +53,8 @@ _GAIN_SIGMA = 0.1  # relative: of a film's contrast; chosen by hand, as no print
 _DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
 _MOVES, _COARSER = 48, 10  # of a period: how finely moves are tried, and κ with them in steps
 _MOVED = 30.0  # squared deviations: a smaller gain is no move
+_FAINTEST, _STRONGEST = 0.3, 1.25  # contrast of a shadow over the calibrated one: less may be no mask
+_FADED = 0.1  # of the contrast: a smaller change is not told, six-bladed stops look like it
 _AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
 
 
@@ -217,6 +219,7 @@ class UsedAperture:
     where that is farther off than f-number and distance should be, or where the frame agrees with no aperture (NaN);
     None where there is no such reason for doubt. `unexplained` is the rms of what the means of the slices differ from
     those of this aperture, as a share of the plane's mean: clipped pixels and a stop of another shape leave it.
+    `contrast` is that of the mask's shadow over the calibrated one.
     """
 
     kappa: float
@@ -225,6 +228,7 @@ class UsedAperture:
     aperture: Aperture
     share: float | None = None
     unexplained: float = 0.0
+    contrast: float = 1.0
 
     @property
     def fits(self) -> bool:
@@ -232,9 +236,11 @@ class UsedAperture:
         return self.share is None or not math.isnan(self.share)
 
     def finding(self, f_number: float) -> Finding | None:
-        """What is strange about the aperture of a frame at a told f-number; None where nothing is."""
+        """What is strange about the aperture of a frame at a told f-number, or its mask's contrast; None where nothing
+        is."""
         if self.share is None:
-            return None
+            faded = abs(self.contrast - 1) > _FADED
+            return finding(Code.MASK_CONTRAST, FRAME, share=self.contrast) if faded else None
         if not self.fits:
             return finding(Code.APERTURE_UNEXPLAINED, FRAME, told=f_number)
         return finding(Code.APERTURE_DISAGREES, FRAME, shown=f_number / self.share, told=f_number)
@@ -254,7 +260,8 @@ def used_aperture(
 
     The most probable κ within a factor `SEARCHED` of `nominal_kappa`. An f-number is near the truth, or now and then
     told wrong altogether; where the mask's distance is only known to some percent (not `distance_known`), so is κ. The
-    nominal one where the means carry no information or fit no aperture.
+    nominal one where the means carry no information or fit no aperture. Another contrast of the shadow is taken only
+    where the means are far from those of all apertures with the calibrated one.
     """
     sigma, far = (_NOMINAL_SIGMA, _FAR_NOMINAL) if distance_known else (_UNKNOWN_SIGMA, _FAR_UNKNOWN)
     nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
@@ -265,7 +272,7 @@ def used_aperture(
     off, prior = _kappas(sigma)
     best: UsedAperture | None = None
     least = math.inf
-    for shape in SHAPES:
+    for faded, shape in itertools.product((False, True), SHAPES):
         found, cost = _fitted(
             seen.real,
             error,
@@ -274,6 +281,7 @@ def used_aperture(
             rotation_rad=rotation_rad,
             aperture=Aperture(aperture.views, shape),
             prior=prior,
+            faded=faded,
         )
         if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
             best, least = found, cost
@@ -411,15 +419,22 @@ def _fitted(
     rotation_rad: float,
     aperture: Aperture,
     prior: NDArray[np.float64],
+    faded: bool,
 ) -> tuple[UsedAperture | None, float]:
     """The most probable of `kappas`, evenly spaced in the logarithm, and its cost; None for no fit.
 
-    `prior` is what each costs before the frame is seen.
+    `prior` is what each costs before the frame is seen. `faded`: with the contrast that suits each best.
     """
     angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
     there = aperture.transform(np.concatenate(angular)).real.reshape(len(kappas), -1)
+    cost, contrast = prior, np.ones(len(kappas))
+    if faded:
+        contrast = (there * seen / error**2).sum(axis=1) / np.maximum((there**2 / error**2).sum(axis=1), 1e-30)
+        contrast = np.clip(contrast, _FAINTEST, _STRONGEST)
+        cost = cost + _MOVED
+        there = there * contrast[:, None]
     deviations = ((there - seen) / error) ** 2
-    cost = deviations.sum(axis=1) + prior
+    cost = deviations.sum(axis=1) + cost
     best = int(np.argmin(cost))
     if best in (0, len(kappas) - 1) or float(deviations[best].mean()) > _AGREEMENT**2:
         return None, math.inf
@@ -430,7 +445,7 @@ def _fitted(
     left = (there[best] - seen) * _TEXTURE / error
     unexplained = float(np.sqrt(np.mean(left**2)))
     sigma = kappa * step * math.sqrt(2 / curvature)
-    return UsedAperture(kappa, sigma, True, aperture, unexplained=unexplained), centre
+    return UsedAperture(kappa, sigma, True, aperture, None, unexplained, float(contrast[best])), centre
 
 
 def mean_of_slices(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
