@@ -17,7 +17,7 @@ from tests.benchmarks import FOLDER
 sys.path.insert(0, str(FOLDER))
 
 from limits import Limit, flat, read_limits  # once their folder is known
-from table import Row, added, main, measured, page, with_stored  # the same
+from table import TAIL, Row, added, main, measured, page, with_stored  # the same
 
 
 def limit(at_most: float | None = None, at_least: float | None = None, noise: float = 0.1) -> Limit:
@@ -121,6 +121,13 @@ def test_the_page_is_of_this_release_or_of_the_one_before() -> None:
     assert named
     assert len(named) == said.count("load before the run")
     assert set(named) <= recent
+
+
+def test_the_page_ends_with_what_the_next_one_would_say() -> None:
+    said = (FOLDER.parent / "docs" / "performance.md").read_text(encoding="utf-8")
+    begins, ends = TAIL.split("{cpu_s}")
+    assert begins in said
+    assert said.endswith(ends)
 
 
 def test_the_page_says_what_no_pi_told() -> None:
