@@ -103,6 +103,19 @@ def test_the_error_of_noisy_views_has_what_contrast_enlarges(rms: float) -> None
     assert np.mean(error < 3) > 0.93
 
 
+def test_what_is_too_faint_for_one_window_is_told_by_several() -> None:
+    """The right half has a fifth of the detail, not much more than noise: it is known, and right."""
+    stack, truth = paint([Board(0.6)], (100, 100), 9)
+    views, mean = stack.views.copy(), stack.views.mean()
+    views[..., 50:] = mean + 0.2 * (views[..., 50:] - mean)
+    faint = noisy(ViewStack(views, stack.row_steps, stack.column_steps), 0.01)
+    found = estimate.estimate(evidence.of_views(faint), between=(-1, 1))
+    part = (slice(10, -10), slice(60, -10))
+    known = found.known[part]
+    assert known.mean() > 0.7
+    assert np.mean(np.abs(found.disparity - truth)[part][known] > 0.07) < 0.01
+
+
 @pytest.mark.parametrize("method", METHODS)
 def test_a_flat_scene_is_unknown_not_zero(method: str) -> None:
     if method == "stereo":

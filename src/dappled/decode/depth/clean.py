@@ -28,6 +28,9 @@ _SMALL, _LARGE = 3.6, 11.0  # P1 and P2, in units of the log-likelihood
 _SPREAD = 0.055  # variance over information
 _DRAWN, _ASTRAY = 0.25, 0.5  # of a step: how far selected peaks are off; a peak of another surface
 _PULL = 0.3  # of how far neighbours moved the peak
+# px: what is too faint for a window to tell, so many together may. Of three scenes by another renderer 1 to 19 % fewer
+# pixels are wrong or unknown; with 7 px more are, and of bare boards 6 to 33 % are known, not 5 to 17.
+_TOGETHER = 5
 # The variance is so much of what the peak tells, and of that by which neighbours scatter about a plane, a jump counting
 # as so much of a step, over so many px. On seeds 1 to 6 each scene has 65 to 76 % within σ, 93 to 97 % within 2 σ.
 _TOLD, _SCATTER, _MOST_SCATTER, _SCATTER_REACH = 0.3, 1.05, 0.5, 1.5
@@ -116,7 +119,12 @@ def depth(stack: ViewStack, lines: Lines, search: Search, told: Agreement) -> De
     selected, _ = peaked(smooth, disparities, start)
     own, curvature = peaked(cost, disparities, start)
     best = np.take_along_axis(cost, start[None], axis=0)[0]
-    sure = confidence(cost, best, compared(stack) / window**2)
+    samples = compared(stack) / window**2
+    sure = confidence(cost, best, samples)
+    side = max(window, _TOGETHER)
+    wide = ndimage.uniform_filter(cost, (0, side, side), output=cost)
+    best_wide = np.take_along_axis(wide, start[None], axis=0)[0]
+    sure = np.maximum(sure, confidence(wide, best_wide, samples * (window / side) ** 2))
     # Where even the best disparity leaves more than noise (gloss, edges), its error is as much larger.
     curvature /= np.maximum(best / (-0.5 * compared(stack)), 1)
     # The selected peak is drawn towards the disparities that were tried, a pixel's own one has more noise.
