@@ -135,3 +135,11 @@ def test_a_shadow_of_less_contrast_is_told_from_another_stop(contrast: float) ->
     assert found.aperture == Aperture(5, "round")
     doubt = found.finding(10.0)
     assert (None if doubt is None else doubt.code) == (Code.MASK_CONTRAST if contrast < 1 else None)
+
+
+def test_what_no_contrast_explains_either_is_no_contrast() -> None:
+    slices = _slices(0.6, 0.0, Aperture(5, "round"), texture=0.01)
+    slices[1::2] *= 0.87
+    slices[2::2] *= 0.79
+    found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.61, rotation_rad=0.0, aperture=Aperture(5))
+    assert found.contrast == 1.0

@@ -54,6 +54,7 @@ _DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
 _MOVES, _COARSER = 48, 10  # of a period: how finely moves are tried, and κ with them in steps
 _MOVED = 30.0  # squared deviations: a smaller gain is no move
 _FAINTEST, _STRONGEST = 0.3, 1.25  # contrast of a shadow over the calibrated one: less may be no mask
+_EXPLAINED = 2.0  # mean squared deviation that may be left: what no contrast explains either speaks for none
 _FADED = 0.1  # of the contrast: a smaller change is not told, six-bladed stops look like it
 _AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
 
@@ -261,7 +262,7 @@ def used_aperture(
     The most probable κ within a factor `SEARCHED` of `nominal_kappa`. An f-number is near the truth, or now and then
     told wrong altogether; where the mask's distance is only known to some percent (not `distance_known`), so is κ. The
     nominal one where the means carry no information or fit no aperture. Another contrast of the shadow is taken only
-    where the means are far from those of all apertures with the calibrated one.
+    where it explains the means, which are far from those of all apertures with the calibrated one.
     """
     sigma, far = (_NOMINAL_SIGMA, _FAR_NOMINAL) if distance_known else (_UNKNOWN_SIGMA, _FAR_UNKNOWN)
     nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
@@ -427,8 +428,9 @@ def _fitted(
     """
     angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
     there = aperture.transform(np.concatenate(angular)).real.reshape(len(kappas), -1)
-    cost, contrast = prior, np.ones(len(kappas))
+    cost, contrast, agreement = prior, np.ones(len(kappas)), _AGREEMENT**2
     if faded:
+        agreement = _EXPLAINED
         contrast = (there * seen / error**2).sum(axis=1) / np.maximum((there**2 / error**2).sum(axis=1), 1e-30)
         contrast = np.clip(contrast, _FAINTEST, _STRONGEST)
         cost = cost + _MOVED
@@ -436,7 +438,7 @@ def _fitted(
     deviations = ((there - seen) / error) ** 2
     cost = deviations.sum(axis=1) + cost
     best = int(np.argmin(cost))
-    if best in (0, len(kappas) - 1) or float(deviations[best].mean()) > _AGREEMENT**2:
+    if best in (0, len(kappas) - 1) or float(deviations[best].mean()) > agreement:
         return None, math.inf
     below, centre, above = (float(c) for c in cost[best - 1 : best + 2])
     curvature = below - 2 * centre + above
