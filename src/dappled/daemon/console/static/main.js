@@ -15,7 +15,7 @@ let token = null, tokenAt = 0;   // the daemon's clock, and when it was heard
 let chosen = null, heardAt = 0, utcAt = null, connected = false, ended = null, flight = null, lastLine = 0;
 let isRecording = false;   // of `dappled open`: there is no daemon
 let interval = null, lastFindings = null, wasStale = false, sending = false, stopping = false, unconfirmed = null;
-let following = null;   // a new page is told all frames at once: only the last of them is looked at
+let following = null;   // of frames that come at once only the last is looked at; of those that a new page is told, when it has all
 let stoppedMs = null;   // by the daemon's clock: what began until then was ended by Stop here, and the page says so
 let sequence = Math.floor(Math.random() * 2 ** 30);
 
@@ -24,7 +24,7 @@ const handlers = {
   start(event) { began(event.start); },
   state(event) { token = event.token; tokenAt = performance.now(); if (event.health) showState(event); tick(); },
   frame: showFrame,
-  ready() { connected = true; },
+  ready() { connected = true; lookAtNewest(); },
   log(event) { showLog(event.lines); },
   end(event) { ended = event.shots ?? {}; tick(); },
 };
@@ -204,12 +204,16 @@ function showFrame(event) {
   if (frames.size > 400) frames.delete(frames.keys().next().value);
   map.setFrame(index, frame.corners, frame.thumb);
   showThumb(index, frame);
-  const newest = [...frames].filter(([, one]) => one.thumb).at(-1) ?? [...frames].at(-1);
   if (chosen === index) choose(index);
-  else if (chosen === null || ($("follow").checked && newest[0] === index)) {
+  else if (connected) {
     clearTimeout(following);
-    following = setTimeout(choose, BURST_MS, newest[0]);
+    following = setTimeout(lookAtNewest, BURST_MS);
   }
+}
+
+function lookAtNewest() {
+  const newest = [...frames].filter(([, one]) => one.thumb).at(-1) ?? [...frames].at(-1);
+  if (newest && newest[0] !== chosen && (chosen === null || $("follow").checked)) choose(newest[0]);
 }
 
 function showThumb(index, frame) {
