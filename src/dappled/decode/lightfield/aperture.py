@@ -52,7 +52,7 @@ _GAINS = np.linspace(0.8, 1.25, 10)  # of all carriers of a print: its film's co
 _GAIN_SIGMA = 0.1  # relative: of a film's contrast; chosen by hand, as no print was measured
 _DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
 _MOVES, _COARSER = 48, 10  # of a period: how finely moves are tried, and κ with them in steps
-_MOVED = 30.0  # squared deviations: a smaller gain is no move
+_MOVED = 30.0  # squared deviations: a smaller gain is no move, and no other contrast
 _FAINTEST, _STRONGEST = 0.3, 1.25  # contrast of a shadow over the calibrated one: less may be no mask
 _EXPLAINED = 2.0  # mean squared deviation that may be left: what no contrast explains either speaks for none
 _FADED = 0.1  # of the contrast: a smaller change is not told, six-bladed stops look like it
@@ -273,19 +273,16 @@ def used_aperture(
     off, prior = _kappas(sigma)
     best: UsedAperture | None = None
     least = math.inf
-    for faded, shape in itertools.product((False, True), SHAPES):
-        found, cost = _fitted(
-            seen.real,
-            error,
-            wanted,
-            nominal_kappa * np.exp(off),
-            rotation_rad=rotation_rad,
-            aperture=Aperture(aperture.views, shape),
-            prior=prior,
-            faded=faded,
-        )
-        if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
-            best, least = found, cost
+    kappas = nominal_kappa * np.exp(off)
+    there = _expected(wanted, kappas, rotation_rad, aperture.views)
+    for faded in (False, True):
+        if faded and least <= _MOVED:
+            break  # another contrast costs as much
+        for shape, means in zip(SHAPES, there, strict=True):
+            at = Aperture(aperture.views, shape)
+            found, cost = _fitted(seen.real, error, means, kappas, aperture=at, prior=prior, faded=faded)
+            if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
+                best, least = found, cost
     if best is None:
         return replace(nominal, share=math.nan)
     share = best.kappa / nominal_kappa
@@ -313,9 +310,8 @@ def shift_shown(
     wanted, seen, error = shown
     off, prior = _kappas(_NOMINAL_SIGMA if distance_known else _UNKNOWN_SIGMA)
     off, prior = off[::_COARSER], prior[::_COARSER]
-    angular = [angular_frequencies(wanted, nominal_kappa * math.exp(one), rotation_rad) for one in off]
-    there = np.concatenate([Aperture(aperture.views, one).transform(np.concatenate(angular)).real for one in SHAPES])
-    there = there.reshape(-1, len(wanted)) / error
+    kappas = nominal_kappa * np.exp(off)
+    there = _expected(wanted, kappas, rotation_rad, aperture.views).reshape(-1, len(wanted)) / error
     alone = (there**2).sum(axis=1) + np.tile(prior, len(SHAPES)) + float((np.abs(seen / error) ** 2).sum())
 
     def costs(moves: NDArray[np.float64], some: slice = slice(None)) -> NDArray[np.float64]:
@@ -347,6 +343,15 @@ def _shown_means(
         return None
     wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
     return wanted, means[known] / means[0].real / transfers[known], _TEXTURE / np.abs(transfers[known])
+
+
+def _expected(
+    orders: Sequence[Order], kappas: NDArray[np.float64], rotation_rad: float, views: int
+) -> NDArray[np.float64]:
+    """(S, n, K) the means of K slices, over their transfers, behind a stop of each of `SHAPES` and κ."""
+    angular = np.concatenate([angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas])
+    means = [Aperture(views, shape).transform(angular).real for shape in SHAPES]
+    return np.reshape(means, (len(SHAPES), len(kappas), -1))
 
 
 def _kappas(sigma: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -385,12 +390,9 @@ def shown_aperture(
     real = (relative * np.conj(transfer(wanted, np.ones(len(wanted)), origin))).real
     off, prior = _kappas(_NOMINAL_SIGMA)
     steps = len(off) // 2
-    angular = np.concatenate(
-        [angular_frequencies(wanted, float(kappa), rotation_rad) for kappa in nominal_kappa * np.exp(off)]
-    )
+    expected = _expected(wanted, nominal_kappa * np.exp(off), rotation_rad, aperture.views)
     best, least, told = nominal, math.inf, math.inf
-    for shape in SHAPES:
-        there = Aperture(aperture.views, shape).transform(angular).real.reshape(len(off), -1)
+    for shape, there in zip(SHAPES, expected, strict=True):
         for design, gain in itertools.product(designs, _GAINS):
             error = np.hypot(_TEXTURE, _PRINTED * np.abs(real))
             deviations = ((gain * design[drawn] * there - real) / error) ** 2
@@ -414,20 +416,18 @@ def shown_aperture(
 def _fitted(
     seen: NDArray[np.float64],
     error: NDArray[np.float64],
-    orders: Sequence[Order],
+    there: NDArray[np.float64],
     kappas: NDArray[np.float64],
     *,
-    rotation_rad: float,
     aperture: Aperture,
     prior: NDArray[np.float64],
     faded: bool,
 ) -> tuple[UsedAperture | None, float]:
     """The most probable of `kappas`, evenly spaced in the logarithm, and its cost; None for no fit.
 
-    `prior` is what each costs before the frame is seen. `faded`: with the contrast that suits each best.
+    `there` are the means through the aperture (see `_expected`), `prior` is what each costs before the frame is seen.
+    `faded`: with the contrast that suits each best.
     """
-    angular = [angular_frequencies(orders, float(kappa), rotation_rad) for kappa in kappas]
-    there = aperture.transform(np.concatenate(angular)).real.reshape(len(kappas), -1)
     cost, contrast, agreement = prior, np.ones(len(kappas)), _AGREEMENT**2
     if faded:
         agreement = _EXPLAINED
@@ -447,7 +447,7 @@ def _fitted(
     left = (there[best] - seen) * _TEXTURE / error
     unexplained = float(np.sqrt(np.mean(left**2)))
     sigma = kappa * step * math.sqrt(2 / curvature)
-    return UsedAperture(kappa, sigma, True, aperture, None, unexplained, float(contrast[best])), centre
+    return UsedAperture(kappa, sigma, True, aperture, unexplained=unexplained, contrast=float(contrast[best])), centre
 
 
 def mean_of_slices(slices: NDArray[np.complex64]) -> NDArray[np.complex128]:
