@@ -107,7 +107,7 @@ class MaskPlace:
 
     def nowhere(self) -> MaskPlace:
         """It without any move: a search that led nowhere."""
-        return self.beyond((-self.periods[0], -self.periods[1]), -self.turn_rad, -self.off)
+        return replace(self, periods=(0.0, 0.0), turn_rad=0.0, off=0.0)
 
     def undone(
         self, slices: Complexes, orders: Sequence[Order], changes: Floats, steps_px: tuple[float, float]
@@ -303,7 +303,7 @@ class _Likelihood:
     changed: Floats
 
     def place(self) -> MaskPlace:
-        """The most probable place; what is not sure, or small, is 0."""
+        """The most probable place: the calibrated one where no other is surer."""
         found, nats = np.zeros(4), self.nats(np.zeros(4))
         still = self._best(np.zeros((1, 4)))
         for one in (still, self._changed()):
