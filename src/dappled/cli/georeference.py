@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -192,11 +193,14 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
             if "cog" in self.kinds:
                 path = beside.with_suffix(".tif")
                 drawn[path] = partial(map_files.frame_cog, made, one, path, gain)
-        done = count()
+        if drawn:
+            output.show("draw maps", 0, len(drawn))  # the bar begins here: threads only move it, one at a time
+        done, telling = count(1), threading.Lock()
 
         def draw(path: Path) -> None:
-            output.show("draw maps", next(done), len(drawn))
             drawn[path]()
+            with telling:
+                output.show("draw maps", next(done), len(drawn))
 
         workers.each(draw, drawn, self.workers)
         files = list(drawn)
