@@ -159,7 +159,12 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         )
 
     def _foresee(self, told: list[str], output: Output, planned: Survey) -> None:
-        """Say what will be missing by poses alone, and add it to `told`. Raises HyperstereoError where that is all."""
+        """Say what will be missing by poses alone, and add it to `told`. Raises HyperstereoError where that is all, and
+        MapError for maps that the chosen cells make too large: how fine the frames are, only their files say."""
+        if self.gsd is not None and "kmz" in self.kinds:
+            map_files.overlay_grid(planned, planned.photographs)
+        if self.gsd is not None and "cog" in self.kinds:
+            map_files.mosaic_grid(planned)
         if "terrain" not in self.kinds:
             return
         need("laspy")

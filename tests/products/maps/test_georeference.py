@@ -319,6 +319,8 @@ def test_maps_of_pictures_tell_what_the_flight_saw_of_its_mask(
     ("asked", "why"),
     [
         ("georeference FLIGHT --as terrain", "no two frames of the flight overlap by a fifth"),
+        ("georeference FLIGHT --as kmz --gsd 0.025", "choose a larger --gsd for the KMZ"),
+        ("georeference FLIGHT --as cog --gsd 0.0001", "choose a larger --gsd, or fewer frames"),
         ("georeference FLIGHT --solve-lens OUT/lens.toml", "neighbouring frames have 0 points in common"),
         ("georeference FLIGHT --gcp FLIGHT/flight.toml", "flight.toml"),
         ("georeference FLIGHT --terrain FLIGHT/flight.toml", "flight.toml can't be read"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import itertools
 import json
+import math
 import re
 import shutil
 import subprocess
@@ -80,6 +82,21 @@ def test_every_cell_shows_the_ground_that_lies_there(ground: Ground, colour: boo
     )  # cubic, and half a pixel beyond the last one at the rim
     inside = map_grid.seen_at(eye, grid, ground, made.projection)
     assert np.array_equal(np.isfinite(inside[..., 0]), known)
+
+
+def test_a_part_of_a_coarse_map_is_the_same_where_a_part_of_the_picture_is_smoothed() -> None:
+    eye, ground, projection = eye_at(height_m=100.0), Flat(0.0), Projection("EPSG:32615")
+    noise = np.random.default_rng(3).random((*eye.shape, 3), dtype=np.float32)
+    whole = map_grid.grid_of([photograph(eye, noise)], ground, projection, 3 * eye.gsd_m(0.0))
+    smooth = map_grid.smoothed(noise, eye, whole, ground)
+    shown = 0
+    for top, left in itertools.product(*(range(0, side, 32) for side in whole.shape)):
+        grid = whole.part(slice(top, top + 32), slice(left, left + 32))
+        at = map_grid.seen_at(eye, grid, ground, projection)
+        part = map_grid.sample(map_grid.smoothed(noise, eye, grid, ground, at), at)
+        np.testing.assert_array_equal(part, map_grid.sample(smooth, at))
+        shown += np.isfinite(part[..., 0]).sum()
+    assert shown > 0.3 * math.prod(whole.shape)
 
 
 def test_a_map_in_degrees_shows_the_same() -> None:

@@ -16,16 +16,21 @@ from dappled.products.maps.earth import GEODETIC, Projection
 from dappled.products.maps.georeference import Survey
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.kmz import Overlay
-from dappled.products.maps.map_grid import footprint, unwrapped
+from dappled.products.maps.map_grid import MapGrid, footprint, unwrapped
 from dappled.products.maps.photographs import Photograph
 from dappled.products.whole_files import write_json
 
 LARGEST_KMZ = 16_384  # cells on a side: an overlay is held in memory as a whole
 
 
+def mosaic_grid(made: Survey) -> MapGrid:
+    """The grid of all frames on the survey's projection. Raises MapError for one that is too large."""
+    return map_grid.grid_of(made.photographs, made.ground, made.projection, made.gsd_m)
+
+
 def mosaic_cog(made: Survey, path: Path, gain: float | None = None) -> Path:
     """Write all frames as one COG on the survey's projection. Raises MapError."""
-    grid = map_grid.grid_of(made.photographs, made.ground, made.projection, made.gsd_m)
+    grid = mosaic_grid(made)
     shown = gain_of(made) if gain is None else gain
     pieces = (
         (rows, columns, cog.display(values, shown))
@@ -61,13 +66,19 @@ def gain_of(made: Survey) -> float:
     return cog.gain_of([one.image[::4, ::4] for one in made.photographs])
 
 
-def _overlay(made: Survey, chosen: Sequence[Photograph], name: str, gain: float) -> Overlay:
+def overlay_grid(made: Survey, chosen: Sequence[Photograph]) -> MapGrid:
+    """The grid of these frames' overlay. Raises MapError for one that is too large."""
     grid = map_grid.grid_of(chosen, made.ground, made.projection, made.gsd_m, degrees=True)
     if max(grid.shape) > LARGEST_KMZ:
         raise map_grid.MapError(
             f"the overlay would have {grid.shape[0]} × {grid.shape[1]} cells: choose a larger --gsd for the KMZ"
         )
     assert grid.crs == GEODETIC
+    return grid
+
+
+def _overlay(made: Survey, chosen: Sequence[Photograph], name: str, gain: float) -> Overlay:
+    grid = overlay_grid(made, chosen)
     picture = np.zeros((*grid.shape, _bands(chosen)), dtype=np.uint8)
     for rows, columns, values in map_grid.pieces(chosen, grid, made.ground, made.projection, made.focus_m):
         picture[rows, columns] = cog.display(values, gain)

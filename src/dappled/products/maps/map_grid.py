@@ -29,6 +29,9 @@ _FLAT_NODE = (
 # misses by 0.003 px of a picture, and by 0.02 px of a view, at 45°
 _SQUARED = 3  # times: a frame's weight is its distance from the rim, to a power, so that one shows at each place
 _TILE = 1024
+_COARSER = 1.5  # times the picture's sample: a map's cell that is larger is a mean of pixels
+_STEPS = 64  # pixels: OpenCV works on a power of two of them at once
+_CUBIC = 2  # pixels beside the one that is looked up
 _MARGIN = 8  # cells: the rim's points are joined by straight lines
 
 
@@ -190,21 +193,47 @@ def _on_flat(eye: Eye, grid: MapGrid, ground: Flat, projection: Projection) -> F
     return np.moveaxis(np.matmul(down @ np.moveaxis(at, -1, 0), aside.T), 0, -1)
 
 
-def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground) -> Singles:
-    """The image (h, w, c), smoothed where the map is much coarser."""
+def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground, at: Floats | None = None) -> Singles:
+    """The image (h, w, c), smoothed where the map is much coarser; only around its pixels (rows, columns, 2) `at`, if
+    they are given, and elsewhere undefined."""
     if image.ndim == 2:
         image = image[..., None]
     level = level_shown(ground, eye)
     step_m = grid.step_y * DEGREE_M if grid.crs == GEODETIC else grid.step_y
-    return smoothed_to(image, step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0)
+    ratio = step_m / eye.gsd_m(level) if math.isfinite(level) else 1.0
+    if at is None or ratio < _COARSER:
+        return smoothed_to(image, ratio)
+    made = np.empty_like(image)  # untouched, it takes no memory
+    used = [_reached(at[..., axis], side, _CUBIC) for axis, side in ((1, image.shape[0]), (0, image.shape[1]))]
+    beside = math.ceil(4 * _sigma(ratio)) + 1
+    # Where a part begins, its rows are worked on in the same steps as the whole: rounding is the same.
+    wide = [
+        slice(max(0, one.start - beside) // _STEPS * _STEPS, min(side, one.stop + beside))
+        for one, side in zip(used, image.shape, strict=False)
+    ]
+    inner = tuple(slice(one.start - more.start, one.stop - more.start) for one, more in zip(used, wide, strict=True))
+    made[tuple(used)] = smoothed_to(image[tuple(wide)], ratio)[inner]
+    return made
+
+
+def _reached(at: Floats, side: int, beside: int) -> slice:
+    """The rows, or columns, of a picture that are looked at, and those beside them."""
+    known = at[np.isfinite(at)]
+    if not known.size:
+        return slice(0, 0)
+    return slice(max(0, math.floor(known.min()) - beside), min(side, math.ceil(known.max()) + 1 + beside))
+
+
+def _sigma(ratio: float) -> float:
+    return 0.5 * math.sqrt(ratio**2 - 1)
 
 
 def smoothed_to(image: Singles, ratio: float) -> Singles:
     """The image, smoothed for sampling at every `ratio`-th pixel; unchanged below 1.5."""
-    if ratio < 1.5:
+    if ratio < _COARSER or not image.size:
         return image
     cv2 = need("cv2")
-    smooth = cv2.GaussianBlur(image, (0, 0), 0.5 * math.sqrt(ratio**2 - 1), borderType=cv2.BORDER_REPLICATE)
+    smooth = cv2.GaussianBlur(image, (0, 0), _sigma(ratio), borderType=cv2.BORDER_REPLICATE)
     return np.asarray(smooth, np.float32).reshape(image.shape)
 
 
@@ -265,7 +294,7 @@ def pieces(
                 layers = one.layers(focus_m)
                 for image, eye in layers:
                     at = seen_at(eye, grid.part(*near), ground, projection)
-                    seen = sample(smoothed(image, eye, grid, ground), at)
+                    seen = sample(smoothed(image, eye, grid, ground, at), at)
                     say = _say(at, eye.shape) / np.float32(len(layers))
                     unseen = ~np.isfinite(seen[..., 0])
                     say[unseen] = 0
