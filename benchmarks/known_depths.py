@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from dappled.decode.joint.patch_model import SIDE, FrameModel, PatchKind, TexturePower, rests_of
 from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
+from dappled.decode.joint.view_pairs import paired, views_of
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.lightfield.light_field import LightField
 
@@ -47,7 +48,7 @@ def views_given(field: LightField, disparity: NDArray[np.floating]) -> NDArray[n
         for one in alike:
             there = _disparities(disparity, field.grid, patches, int(one))
             made[:, :, one] = _views(frame, own, rests, spectra[:, :, one], there)
-    windowed = patches.images(made) + (means[:, None, None] * patches.window).astype(np.float32)[:, None]
+    windowed = patches.images(views_of(made)) + (means[:, None, None] * patches.window).astype(np.float32)[:, None]
     return patches.joined(windowed).reshape(count, count, *slices.shape[1:])
 
 
@@ -87,11 +88,11 @@ def _views(
     spectra: NDArray[np.complex64],
     there: tuple[Floats, Floats],
 ) -> NDArray[np.complex64]:
-    """The spectra (F, V·U) of a patch's views."""
+    """The spectra (F, V·U) of a patch's views, in pairs."""
     disparities, shares = there
     size = np.sqrt(own[:, None, None] * shares[:, None])
     seen = frame.model.seen(frame.frequencies, disparities).transpose(1, 0, 2) * size
-    viewed = frame.model.viewed(frame.frequencies, disparities).transpose(1, 0, 2) * size
+    viewed = paired(frame.model.viewed(frame.frequencies, disparities)).transpose(1, 0, 2) * size
     detail = seen.transpose(0, 2, 1) @ seen.conj()
     shared = viewed.transpose(0, 2, 1) @ seen.conj()
     some = slice(None, None, TRIED)

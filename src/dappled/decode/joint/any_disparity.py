@@ -27,12 +27,16 @@ from dappled.decode.joint.patch_model import (
     SIDE,
     WITHIN,
     DisparityRange,
+    Doubles,
     FrameModel,
+    single,
+    times,
     whitener_of,
 )
+from dappled.decode.joint.slice_model import Terms
+from dappled.decode.joint.small_eigh import eigh
 from dappled.workers import spans
 
-Doubles = NDArray[np.complex128]
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
 # Of a patch's texture, times the mean power of patches like it: chosen by hand, two decades down and one up; measured
@@ -51,18 +55,18 @@ _ROUNDS = 3  # of how often each disparity occurs; chosen by hand, measured by b
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchBackground:
     """What is not the band's own detail at one disparity: `whitener` L⁻¹ (F, A, A) of its covariance, `unmixed`
-    (F, V·U, A) what views have alone, of the slices, and `left` (F, V·U) its variance that is left."""
+    (F, V·U, A) what views have alone, of the slices, and `left` (F, V·U) its variance that is left; views in pairs."""
 
     whitener: Doubles
-    unmixed: Complexes
+    unmixed: Terms
     left: Floats
 
     @classmethod
-    def of(cls, covariance: Complexes, alone: Complexes, power: Floats) -> PatchBackground:
-        """From `alone` (F, A, V·U), how the slices hold what each view has alone, of `power` (F,)."""
+    def of(cls, covariance: Terms, alone: Terms, power: Floats) -> PatchBackground:
+        """From `alone` (A, V·U), how the slices hold what each view has alone, of `power` (F,)."""
         whitener = whitener_of(covariance)
         white = whitener @ alone
-        unmixed = (white.conj().transpose(0, 2, 1) @ whitener * power[:, None, None]).astype(np.complex64)
+        unmixed = single(white.conj().transpose(0, 2, 1) @ whitener * power[:, None, None])
         explained = power[:, None] * (np.abs(white) ** 2).sum(axis=1)
         return cls(whitener, unmixed, power[:, None] * np.maximum(1 - explained, 0))
 
@@ -73,7 +77,7 @@ class _Directions:
     white, and `rows` (F, D, R, r) are the range's own spectra there."""
 
     rows: Doubles
-    projector: Complexes
+    projector: Terms
 
     @classmethod
     def of(cls, some: DisparityRange, own: Floats, whitener: Doubles) -> _Directions:
@@ -81,7 +85,7 @@ class _Directions:
         size = np.sqrt(own / len(WITHIN))[:, None, None]
         turn, reduced = np.linalg.qr(whitener @ (some.basis * size).swapaxes(1, 2))
         rows = some.within.reshape(len(own), -1, some.within.shape[3]) @ reduced.swapaxes(1, 2)
-        projector = (turn.conj().swapaxes(1, 2) @ whitener).astype(np.complex64)
+        projector = single(turn.conj().swapaxes(1, 2) @ whitener)
         return cls(rows.reshape(some.within.shape), projector)
 
 
@@ -89,11 +93,11 @@ class _Directions:
 class _Hypothesis:
     """The band's own detail under a hypothesis, diagonalised: `strength` λ (F, R), `rows` (F, q, r) that make Hᴴy of
     the q degrees of freedom that slices show of projected patches, and `viewed` (F, R, V·U) of each degree of freedom,
-    less what the slices' view alone would hold of it; the strongest come last."""
+    less what the slices' view alone would hold of it, views in pairs; the strongest come last."""
 
     strength: Floats
-    rows: Complexes
-    viewed: Complexes
+    rows: Terms
+    viewed: Terms
 
     def gains(self, low: Complexes, weights: Singles) -> Floats:
         """(strengths, N) log likelihoods of projected patches (F, r, N) over that of no detail at all, by frequencies'
@@ -102,26 +106,26 @@ class _Hypothesis:
         scaled = STRENGTHS[:, None, None].astype(np.float64)
         shrunk = (weights[:, None] * scaled / (1 + scaled * strength)).reshape(len(STRENGTHS), -1)
         volume = (weights[:, None] * np.log1p(scaled * strength)).sum(axis=(1, 2))
-        projected = self.rows @ low
+        projected = times(self.rows, low)
         power = (projected.real**2 + projected.imag**2).reshape(shrunk.shape[1], -1)
         return np.asarray(shrunk @ power - volume[:, None], dtype=np.float64)
 
 
-def _each_of(rows: Doubles, beside: Complexes) -> list[_Hypothesis]:
+def _each_of(rows: Doubles, beside: Terms) -> list[_Hypothesis]:
     """One of each disparity, from `rows` (F, D, R, r) and `beside` (F, D, R, V·U)."""
-    strength, turn = np.linalg.eigh(rows.conj() @ rows.swapaxes(2, 3))
+    strength, turn = eigh(rows.conj() @ rows.swapaxes(2, 3))
     strength = np.maximum(strength, 0)
     turned = turn.swapaxes(2, 3)
     shown = max(1, int((strength > _UNSEEN).any(axis=(0, 1)).sum()))
-    made = (turned[:, :, -shown:] @ rows).conj().astype(np.complex64)
-    viewed = turned.astype(np.complex64) @ beside
+    made = single((turned[:, :, -shown:] @ rows).conj())
+    viewed = single(turned) @ beside
     return [
         _Hypothesis(*(np.ascontiguousarray(part[:, d]) for part in (strength, made, viewed)))
         for d in range(rows.shape[1])
     ]
 
 
-def _together(directions: _Directions, beside: Complexes, share: Floats) -> _Hypothesis:
+def _together(directions: _Directions, beside: Terms, share: Floats) -> _Hypothesis:
     """All disparities at once, in shares (D,) of the texture."""
     scale = np.sqrt(share)[None, :, None, None]
     rows = (directions.rows * scale).reshape(len(beside), -1, directions.rows.shape[3])
@@ -131,24 +135,22 @@ def _together(directions: _Directions, beside: Complexes, share: Floats) -> _Hyp
     strength = np.where(strength > _ROUNDING * strength[:, -1:], strength, 0)
     inverse = np.where(strength > 0, 1 / np.sqrt(np.maximum(strength, LEAST_NOISE)), 0)
     turn = rows.conj() @ left * inverse[:, None, :]
-    viewed = turn.swapaxes(1, 2).astype(np.complex64) @ (beside * scale.astype(np.float32)).reshape(
-        len(beside), rows.shape[1], -1
-    )
+    viewed = single(turn.swapaxes(1, 2)) @ (beside * scale.astype(np.float32)).reshape(len(beside), rows.shape[1], -1)
     made = np.sqrt(strength)[:, :, None] * left.conj().swapaxes(1, 2)
-    return _Hypothesis(strength, made.astype(np.complex64), viewed)
+    return _Hypothesis(strength, single(made), viewed)
 
 
 def views_at_any(
     frame: FrameModel, some: DisparityRange, own: Floats, background: PatchBackground, spectra: Complexes
 ) -> Iterator[tuple[slice, Complexes, Floats]]:
-    """The views' spectra (F, V·U, n), and their variance (V·U, n) a pixel but for what each has alone, of patches
-    (F, A, N) in a range and before a background, a few patches at a time."""
+    """The views' spectra (F, V·U, n), and their variance (V·U, n) a pixel but for what each has alone, views in pairs,
+    of patches (F, A, N) in a range and before a background, a few patches at a time."""
     size = np.sqrt(own / len(WITHIN)).astype(np.float32)[:, None, None, None]
     seen = some.seen * size
     alone = seen.reshape(len(seen), -1, seen.shape[3]) @ background.unmixed.swapaxes(1, 2)
-    beside = np.asarray(some.viewed * size - alone.reshape(some.viewed.shape), dtype=np.complex64)
+    beside = some.viewed * size - alone.reshape(some.viewed.shape)
     directions = _Directions.of(some, own, background.whitener)
-    low = directions.projector @ spectra
+    low = times(directions.projector, spectra)
     likely = _likely(directions, low, frame.weights)
     looked = np.flatnonzero(likely.any(axis=1))
     single = _each_of(directions.rows[:, looked], beside[:, looked])
@@ -162,7 +164,7 @@ def views_at_any(
     odds, _ = _weighed(gains, np.concatenate([0.8 * prior, np.full(count, 0.2 / count)]))
     for few in spans(spectra.shape[2], AT_A_TIME):
         moved, variance = _expected(frame, [*single, together], odds[:, few], low[:, :, few])
-        moved += background.unmixed @ spectra[:, :, few]
+        moved += times(background.unmixed, spectra[:, :, few])
         yield few, moved, variance
 
 
@@ -170,7 +172,7 @@ def _likely(directions: _Directions, low: Complexes, weights: Singles) -> NDArra
     """(D, N) which disparities projected patches (F, r, N) may have, by a few frequencies."""
     few = slice(None, None, _TRIED)
     rows = directions.rows[few]
-    no_views = np.zeros((*rows.shape[:3], 0), dtype=np.complex64)
+    no_views = np.zeros((*rows.shape[:3], 0), dtype=np.float32)
     best = np.stack([one.gains(low[few], weights[few]).max(axis=0) for one in _each_of(rows, no_views)])
     return np.asarray(best >= best.max(axis=0) - _LIKELY_NATS)
 
@@ -220,9 +222,9 @@ def _expected(
         shares = scaled / (1 + scaled * one.strength)  # (strengths, F, R)
         shown = one.rows.shape[1]
         shrunk = np.tensordot(shares[:, :, -shown:], odd[:, used], axes=(0, 0)).astype(np.float32)
-        found = shrunk * (one.rows @ low[:, :, used])
+        found = shrunk * times(one.rows, low[:, :, used])
         viewed = one.viewed[:, -shown:]
-        moved[:, :, used] += viewed.transpose(0, 2, 1) @ found
+        moved[:, :, used] += times(viewed.transpose(0, 2, 1), found)
         between = several[used]
         if between.any():
             squares = _squares(viewed, found[:, :, between], multiplicity)
@@ -235,14 +237,14 @@ def _expected(
     return moved, np.maximum(variance, 0) / SIDE**2
 
 
-def _squares(viewed: Complexes, found: Complexes, multiplicity: Singles) -> Singles:
+def _squares(viewed: Terms, found: Complexes, multiplicity: Singles) -> Singles:
     """(V·U, n) sums over all frequencies of |views|², `viewed` (F, q, V·U) times what is `found` (F, q, n)."""
     count = viewed.shape[1]
     if count**2 > _FEW_PAIRS:
-        views = viewed.transpose(0, 2, 1) @ found
+        views = times(viewed.transpose(0, 2, 1), found)
         return np.asarray(np.einsum("fvn,f->vn", views.real**2 + views.imag**2, multiplicity))
-    pairs = (viewed[:, :, None] * viewed[:, None].conj() * multiplicity[:, None, None, None]).reshape(
+    both = (viewed[:, :, None] * viewed[:, None].conj() * multiplicity[:, None, None, None]).reshape(
         -1, viewed.shape[2]
     )
     together = (found[:, :, None] * found[:, None].conj()).reshape(-1, found.shape[2])
-    return np.asarray((pairs.T @ together).real)
+    return np.asarray((both.T @ together.real) if np.isrealobj(both) else (both.T @ together).real)

@@ -49,6 +49,7 @@ from dappled.decode.joint.patches import Patches
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.joint.told_disparity import MOST_STILL, at_rest, shares_of, views_told
 from dappled.decode.joint.told_patches import ToldPatches, likely_told, write_variance
+from dappled.decode.joint.view_pairs import variance_of_views, views_of
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.workers import each, spans
@@ -123,8 +124,10 @@ def joint_views(
     """
     patches = Patches((slices.shape[1], slices.shape[2]), SIDE)
     off, unlike = model.unlike(slices)
-    common = model.common()[: len(slices)] + off
-    first, means = patches.less_means(patches.cut(slices[:1]), common[:1])
+    model = model.upright()
+    back = model.turns[: len(slices)].conj()
+    common = model.common()[: len(slices)] + (off * back).real
+    first, means = patches.less_means(patches.cut(slices[:1]), common[:1])  # which is real as it is
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach, workers=workers)
     frame = replace(frame, unlike=math.hypot(unlike, _UNLIKE), error=_ERRORS[0])
     group = _groups(first[0].real, patches)
@@ -147,7 +150,8 @@ def joint_views(
         power = (np.abs(patches.spectra(first[:, alike])[:, 0]) ** 2).mean(axis=1)
         spectra = np.empty((len(frame.frequencies), len(frame.noise), len(members)), dtype=np.complex64)
         for some in spans(len(members), AT_A_TIME):
-            spectra[:, :, some] = patches.spectra(patches.less_means(patches.cut(slices, members[some]), common)[0])
+            cut = patches.cut(slices, members[some]) * back[:, None, None, None].astype(np.complex64)
+            spectra[:, :, some] = patches.spectra(patches.less_means(cut, common)[0])
         found[part] = _Looked.of(here, power, mean, members, spectra)
 
     each(look, range(len(parts)), workers)
@@ -236,7 +240,7 @@ class _PatchViews:
         for number in np.unique(kinds):
             kind = KINDS[number]
             background = PatchBackground.of(one.rests.of(number), frame.alone, kind.alone * own)
-            left = (frame.multiplicity @ background.left)[:, None] / SIDE**2
+            left = variance_of_views(frame.multiplicity @ background.left)[:, None] / SIDE**2
             for still in (False, True):
                 chosen = which[(kinds == number) & (moved != still)]
                 if not len(chosen):
@@ -246,8 +250,8 @@ class _PatchViews:
                 self.of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
                 self.beyond[members] = kind.range == BEYOND
                 for few, made, found in views_at_any(frame, some, own, background, one.spectra[:, :, chosen]):
-                    self.windowed[members[few]] = self.patches.images(made) + self.lit[members[few]]
-                    self.variance[:, members[few]] = of_alone * left + of_rest * found
+                    self.windowed[members[few]] = self.patches.images(views_of(made)) + self.lit[members[few]]
+                    self.variance[:, members[few]] = of_alone * left + of_rest * variance_of_views(found)
 
     def told(self, one: _Looked, shares: Floats) -> list[ToldPatches]:
         """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
@@ -258,9 +262,9 @@ class _PatchViews:
         spectra, kinds = one.spectra[:, :, here], one.kinds[here]
         found = views_told(one.frame, one.rests, spectra, shares[members])
         gained = found.nats - usual_nats(one.frame, one.rests, kinds, spectra)
-        change = self.patches.images(found.spectra) - (self.windowed[members] - self.lit[members])
+        change = self.patches.images(views_of(found.spectra)) - (self.windowed[members] - self.lit[members])
         windowed = np.asarray(self.windowed[members] + _TRUST * change, dtype=np.float32)
-        return [ToldPatches(members, windowed, found.kinds, found.rest, gained)]
+        return [ToldPatches(members, windowed, found.kinds, variance_of_views(found.rest), gained)]
 
     def take(self, told: list[ToldPatches], likely: NDArray[np.bool_]) -> None:
         """Take the views of patches as told, where those are `likely` (N,)."""

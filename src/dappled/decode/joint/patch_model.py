@@ -8,15 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patches import Patches
-from dappled.decode.joint.slice_model import Fold, SliceModel, folded
+from dappled.decode.joint.slice_model import Fold, SliceModel, Terms, folded
+from dappled.decode.joint.view_pairs import paired
 from dappled.workers import each, spans
 
+Doubles = NDArray[Any]
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
 SIDE = 24  # samples: a patch is wide against parallax, and small against things at one disparity
@@ -87,14 +90,14 @@ _UNLIKE = 1e-3  # of the light, times a transfer: what a wrong aperture leaves i
 @dataclass(frozen=True, slots=True, eq=False)
 class DisparityRange:
     """Disparities that a patch may have, `disparities` (D·R,) in sensor columns over the aperture, ascending: `seen`
-    (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, R of them within each of D steps. What is seen lies in
-    few directions: it is `within` (F, D, R, r) times a `basis` (F, r, A)."""
+    (F, D, R, A) and `viewed` (F, D, R, V·U) of unit spectrum, views in pairs, R of them within each of D steps. What is
+    seen lies in few directions: it is `within` (F, D, R, r) times a `basis` (F, r, A)."""
 
     disparities: Floats
-    seen: Complexes
-    viewed: Complexes
-    within: NDArray[np.complex128]
-    basis: NDArray[np.complex128]
+    seen: Terms
+    viewed: Singles
+    within: Doubles
+    basis: Doubles
 
     @classmethod
     def of(
@@ -110,9 +113,9 @@ class DisparityRange:
         shape = (len(disparities), len(WITHIN), len(frequencies), -1)
         seen, viewed = (
             np.ascontiguousarray(part(frequencies, within).reshape(shape).transpose(2, 0, 1, 3))
-            for part in (model.seen, model.viewed)
+            for part in (model.seen, lambda *at: paired(model.viewed(*at)))
         )
-        rows = seen.reshape(len(frequencies), -1, seen.shape[3]).astype(np.complex128)
+        rows = _double(seen.reshape(len(frequencies), -1, seen.shape[3]))
         strength, vectors = np.linalg.eigh(rows.swapaxes(1, 2) @ rows.conj())
         count = int((strength > _ROUNDING * strength[:, -1:]).sum(axis=1).max())
         vectors = vectors[:, :, -count:]
@@ -124,7 +127,8 @@ class DisparityRange:
 class FrameModel:
     """What all groups of patches share. `frequencies` (F, 2) in cycles per sensor column; `per_bin` of a patch;
     `weights` (F,) of a frequency in likelihoods; `ranges` of disparities, by their place in `RANGES`; `folds` from
-    beyond the band, at rest and in the usual range; `alone` (A, V·U), how the slices hold what each view has alone;
+    beyond the band, at rest and in the usual range; `alone` (A, V·U), how the slices hold what each view has alone,
+    the views in pairs;
     `noise` (A,); `astray`, the share of the scene's light that gets into each slice but the first, whatever its
     transfer, `unlike` the same, times its transfer, by a wrong aperture; `error`, the share of a slice's power that no
     light field explains."""
@@ -137,7 +141,7 @@ class FrameModel:
     lowest: NDArray[np.bool_]
     ranges: Mapping[int, DisparityRange]
     folds: Mapping[int, list[Fold]]
-    alone: Complexes
+    alone: Terms
     noise: Floats
     astray: float = 0.0
     unlike: float = _UNLIKE
@@ -223,11 +227,11 @@ class Rests:
 
     kinds: Sequence[PatchKind]
     plain: Floats
-    from_beyond: Mapping[int, Complexes]
-    lonely: Complexes
+    from_beyond: Mapping[int, Terms]
+    lonely: Terms
     own: Floats
 
-    def of(self, number: int, some: slice = slice(None)) -> Complexes:
+    def of(self, number: int, some: slice = slice(None)) -> Terms:
         """The covariances (F, A, A) of a kind, at some frequencies."""
         kind = self.kinds[number]
         made = np.float32(kind.beyond) * self.from_beyond[min(kind.range, USUAL)][some]
@@ -236,7 +240,7 @@ class Rests:
         made[:, diagonal, diagonal] += self.plain[some]
         return made
 
-    def whole(self, number: int, detail: Complexes, some: slice = slice(None)) -> Complexes:
+    def whole(self, number: int, detail: Terms, some: slice = slice(None)) -> Terms:
         """The same with the `detail` (F, A, A) of the band itself."""
         # More detail beyond the band than usual: there is as much more in it.
         return self.of(number, some) + np.float32(max(1.0, self.kinds[number].beyond)) * detail
@@ -260,22 +264,19 @@ def rests_of(
         number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size)
         for number, some in frame.folds.items()
     }
-    lonely = (frame.alone @ frame.alone.conj().T).astype(np.complex64)
-    return Rests(kinds, own_noise, from_beyond, lonely, own)
+    return Rests(kinds, own_noise, from_beyond, frame.alone @ frame.alone.conj().T, own)
 
 
-def detail_of(seen: Complexes, own: Floats) -> Complexes:
+def detail_of(seen: Terms, own: Floats) -> Terms:
     """(F, A, A) covariance of the band's own detail, of all disparities of a range at once, `seen` (F, D, R, A)."""
     flat = seen.reshape(len(own), -1, seen.shape[3]).transpose(0, 2, 1)
     waves = flat * np.sqrt(own / flat.shape[2]).astype(np.float32)[:, None, None]
     return np.asarray(waves @ waves.conj().transpose(0, 2, 1))
 
 
-def wholes_of(
-    frame: FrameModel, rests: Rests, numbers: Iterable[int], some: slice = slice(None)
-) -> Iterator[Complexes]:
+def wholes_of(frame: FrameModel, rests: Rests, numbers: Iterable[int], some: slice = slice(None)) -> Iterator[Terms]:
     """Covariances (F, A, A) of slices at some frequencies, one of each of these kinds of patch."""
-    details: dict[int, Complexes] = {}
+    details: dict[int, Terms] = {}
     for number in numbers:
         place = rests.kinds[number].range
         if place not in details:
@@ -310,14 +311,32 @@ def likely_errors(
     return found
 
 
-def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
+def _double(values: NDArray[Any]) -> Doubles:
+    return values.astype(np.result_type(values, np.float64))
+
+
+def single(values: Doubles) -> Terms:
+    """The values in single precision."""
+    return values.astype(np.complex64 if np.iscomplexobj(values) else np.float32)
+
+
+def times(matrix: NDArray[Any], spectra: NDArray[Any]) -> NDArray[Any]:
+    """`matrix` (F, a, b) times complex `spectra` (F, b, N): of a real one a half of the products, as their real and
+    imaginary parts are 2 N columns of numbers."""
+    if np.iscomplexobj(matrix):
+        return np.asarray(matrix @ spectra)
+    made = matrix @ np.ascontiguousarray(spectra).view(spectra.real.dtype)
+    return np.asarray(made.view(np.result_type(made, np.complex64)))
+
+
+def whitener_of(covariance: Terms) -> Doubles:
     """L⁻¹ (F, A, A) of covariances LLᴴ (F, A, A): what has a covariance is white behind it."""
     # In double precision: odds of hypotheses are exponentials of numbers in the thousands.
-    exact, diagonal = covariance.astype(np.complex128), range(covariance.shape[1])
+    exact, diagonal = _double(covariance), range(covariance.shape[1])
     exact[:, diagonal, diagonal] *= 1 + _SINGLE
     lower = np.linalg.cholesky(exact)
     # Row by row for all F at once: faster than LU of each.
-    found = np.zeros(lower.shape, dtype=np.complex128)
+    found = np.zeros_like(lower)
     for row in range(lower.shape[1]):
         own = 1 / lower[:, row, row, None]
         found[:, row, row] = own[:, 0]
@@ -325,7 +344,7 @@ def whitener_of(covariance: Complexes) -> NDArray[np.complex128]:
     return found
 
 
-def nats_of(whitener: NDArray[np.complex128], white: Complexes | NDArray[np.complex128]) -> Floats:
+def nats_of(whitener: Doubles, white: NDArray[Any]) -> Floats:
     """(F, N) log likelihoods, but for a constant, of patches that the `whitener` (F, A, A) made `white` (F, A, N)."""
     volume = 2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1)
     parts = white.view(white.real.dtype)
@@ -333,7 +352,7 @@ def nats_of(whitener: NDArray[np.complex128], white: Complexes | NDArray[np.comp
     return np.asarray(volume[:, None] - power)
 
 
-def likelihoods(wholes: Iterable[Complexes], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
+def likelihoods(wholes: Iterable[Terms], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
     """(B, …, N) log likelihoods of patches (F, A, N) whose slices have these covariances (F, A, A), by frequencies'
     `weights` (…, F)."""
     listed = list(wholes)
@@ -341,9 +360,9 @@ def likelihoods(wholes: Iterable[Complexes], spectra: Complexes, weights: Single
 
     def one(number: int) -> None:
         exact = whitener_of(listed[number])
-        whitener = exact.astype(np.complex64)
+        whitener = single(exact)
         for some in spans(spectra.shape[2], AT_A_TIME):
-            found[number, ..., some] = weights @ nats_of(exact, whitener @ spectra[:, :, some])
+            found[number, ..., some] = weights @ nats_of(exact, times(whitener, spectra[:, :, some]))
 
     each(one, range(len(listed)), workers)
     return found
@@ -369,7 +388,7 @@ def _most_likely(
     likely = tried >= tried.max(axis=0) - _UNSURE_NATS
     likely &= np.count_nonzero(likely, axis=0) > 1
     nats = tried.copy()
-    details: dict[int, Complexes] = {}
+    details: dict[int, Terms] = {}
     for place in map(int, np.flatnonzero(likely.any(axis=1))):
         number, here = numbers[place], likely[place]
         kind = rests.kinds[number]
@@ -403,7 +422,7 @@ def _at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra
     """
     common, own = frame.model.common(), rests.own
     seen = some.seen
-    moved = (np.abs(seen - common.astype(np.complex64) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
+    moved = (np.abs(seen - single(common) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
     moved[:, 0] = own
     base, once = (rests.variances(number) for number in (0, 1))  # without detail beyond the band, and with it
     varied = once - base + moved

@@ -68,12 +68,13 @@ class Patches:
     def cut(self, images: NDArray[Any], which: NDArray[np.intp] | None = None) -> NDArray[Any]:
         """(K, N, side, side) the patches of images (K, h, w), continued at their edges by reflection; or `which` (N,)
         of them."""
-        n, corners = self.side, self.corners
-        wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), mode="symmetric")
-        chosen = corners if which is None else [corners[one] for one in which]
-        return np.stack([wide[:, top : top + n, left : left + n] for top, left in chosen], axis=1)
+        n, corners = self.side, np.array(self.corners)
+        rows, columns = (np.pad(np.arange(size), (n, 2 * n), mode="symmetric") for size in self.shape)
+        top, left = (corners if which is None else corners[which]).T[:, :, None] + np.arange(n)
+        places = rows[top][:, :, None] * self.shape[1] + columns[left][:, None, :]
+        return np.asarray(images.reshape(len(images), -1).take(places, axis=1))
 
-    def less_means(self, patches: Complexes, common: NDArray[np.complex128]) -> tuple[Complexes, Floats]:
+    def less_means(self, patches: Complexes, common: NDArray[Any]) -> tuple[Complexes, Floats]:
         """The patches (K, N, side, side), in their place, without their means (N,) by the window: those of the first
         image, times what each image holds of what is `common` (K,)."""
         weights = self.window**2
@@ -121,10 +122,12 @@ class Patches:
         """(V, N) the mean squares by which windowed patches (N, V, side, side) are apart from the images (V, h, w) that
         they and the patches beside them were joined to."""
         n, window = self.side, self.window.astype(np.float32)
-        wide = np.pad(images, ((0, 0), (n, 2 * n), (n, 2 * n)), constant_values=np.nan)
         found = np.empty((patches.shape[1], len(patches)))
-        for number, (top, left) in enumerate(self.corners):
-            image = wide[:, top : top + n, left : left + n]
-            weight = (window**2)[np.isfinite(image[0])].sum()
-            found[:, number] = np.nansum((patches[number] - image * window) ** 2, axis=(1, 2)) / weight
+        for number, corner in enumerate(self.corners):
+            begins = [max(0, n - at) for at in corner]  # what of the patch lies within the images
+            ends = [min(n, n + size - at) for at, size in zip(corner, self.shape, strict=True)]
+            inside = tuple(slice(*bounds) for bounds in zip(begins, ends, strict=True))
+            there = tuple(slice(at - n + one.start, at - n + one.stop) for at, one in zip(corner, inside, strict=True))
+            off = patches[number][:, *inside] - images[:, *there] * window[inside]
+            found[:, number] = np.einsum("vyx,vyx->v", off, off) / (window[inside] ** 2).sum()
         return found

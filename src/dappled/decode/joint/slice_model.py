@@ -9,21 +9,29 @@ F_m being the carrier's frequency of order m. The term m = 0 is the band's own d
 band, which the mask multiplies before the sensor samples, so that it folds into other bands. W is that of the whole
 stop: a continuous one has angular orders that no carrier measures, and they are contained in it. View v, the mean over
 its cell of the stop, holds W_v(−D·f) ŝ(f).
+
+T_k is real but for the phase that the mask's place gives it, which slices can be turned back by (`upright`); the stop
+has a centre of symmetry, so that W is real, and what opposite views hold is conjugate: of sums and differences of two
+it is real, too (`view_pairs`). Everything that is computed of the model then has a fourth of the products.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats
+from dappled.decode.joint.view_pairs import paired
 from dappled.decode.lightfield.aperture import Aperture
 from dappled.decode.optics import Order
 
+Terms = NDArray[Any]
+"""Of what slices hold, in single precision: real where they are turned back."""
 # Squared deviations, as in `aperture`: boards 100 px apart before each other leave up to 8, and have 34.4 dB where that
 # is taken off, 38.6 else.
 _EVIDENCE = 9.0
@@ -34,13 +42,15 @@ _WAVES = 2  # of the longest waves over a frame, those that a Hann window parts 
 class SliceModel:
     """The carriers of the whole plane: `orders` (A, 2), `transfers` (A,), `angular` ω (A, 2) in cycles over the
     aperture, `carriers` F (A, 2) in cycles per sensor column, both axes; and the `aperture`. Disparities are in sensor
-    columns over the whole aperture."""
+    columns over the whole aperture. Slices are turned back by `turns` (A,) of unit size: by none, and transfers are
+    complex, or by all (`upright`), and they are real, as all that is computed with them."""
 
     orders: NDArray[np.int64]
-    transfers: NDArray[np.complex128]
+    transfers: NDArray[Any]
     angular: Floats
     carriers: Floats
     aperture: Aperture
+    turns: NDArray[np.complex128]
 
     @classmethod
     def of_half(
@@ -59,11 +69,18 @@ class SliceModel:
             np.concatenate([angular, -angular[1:]]),
             np.concatenate([carriers, -carriers[1:]]),
             aperture,
+            np.ones(2 * len(half) - 1, dtype=np.complex128),
         )
 
-    def common(self) -> NDArray[np.complex128]:
+    def upright(self) -> SliceModel:
+        """The same for slices that are turned back by the phases of the transfers."""
+        size = np.abs(self.transfers)
+        turns = np.where(size > 0, self.transfers / np.where(size > 0, size, 1), 1)
+        return replace(self, transfers=size, turns=self.turns * turns)
+
+    def common(self) -> NDArray[Any]:
         """(A,) what each slice holds of a scene without texture, over what slice (0, 0) holds."""
-        return np.asarray(self.transfers * self.aperture.transform(self.angular))
+        return np.asarray(self.transfers * self.aperture.transform(self.angular).real)
 
     def unlike(self, slices: Complexes) -> tuple[NDArray[np.complex128], float]:
         """By what share of the scene's light slices (K, h, w), the half plane's, are brighter than `common` says, (K,),
@@ -93,13 +110,13 @@ class SliceModel:
         share = max(0.0, 1 - _EVIDENCE * around / power) if power else 0.0
         return share * means * transfers, float(np.sqrt(share * around / weights.sum()))
 
-    def alone(self) -> Complexes:
-        """(A, V·U) what the slices hold of a view that has detail which no other view has, of unit spectrum."""
-        return (self.transfers[:, None] * self.aperture.cells(self.angular)).astype(np.complex64)
+    def alone(self) -> Terms:
+        """(A, V·U) what the slices hold of detail that a view has alone, of unit spectrum, the views in pairs."""
+        return _single(self.transfers[:, None] * paired(self.aperture.cells(-self.angular)))
 
-    def seen(self, frequencies: Floats, disparities: Floats) -> Complexes:
+    def seen(self, frequencies: Floats, disparities: Floats) -> Terms:
         """(D, F, A) each band's own detail in the slices, of a scene of unit spectrum at each disparity."""
-        return np.asarray(self.transfers * self._through(self.angular, frequencies, disparities), dtype=np.complex64)
+        return _single(self.transfers * self._through(self.angular, frequencies, disparities))
 
     def _through(self, angular: Floats, frequencies: Floats, disparities: Floats) -> Floats:
         """(D, F, n) W(ω − D·g) of the stop, for ω (n, 2) and g (F, 2)."""
@@ -122,10 +139,16 @@ class SliceModel:
             to, source = np.array([(n, other) for n, other in pairs if other is not None]).T
             out = frequencies + np.array(step) @ lattice
             through = self._through(self.angular[source], out, disparities)
-            waves = self.transfers[source] * through / np.sqrt(len(disparities))
-            each = waves.astype(np.complex64).transpose(1, 2, 0)
+            turned = self.turns[source] * self.turns[to].conj()  # but for a sign, the same for all of them
+            signs = np.where((turned * turned[0].conj()).real < 0, -1, 1)
+            waves = self.transfers[source] * signs * through / np.sqrt(len(disparities))
+            each = _single(waves).transpose(1, 2, 0)
             found.append(Fold(to, out, each @ each.conj().transpose(0, 2, 1)))
         return found
+
+
+def _single(values: NDArray[Any]) -> Terms:
+    return values.astype(np.complex64 if np.iscomplexobj(values) else np.float32)
 
 
 @lru_cache(maxsize=8)  # the frames of a flight have these in common, whatever aperture each was fitted
@@ -149,12 +172,12 @@ class Fold:
 
     into: NDArray[np.int64]
     beyond: Floats
-    covariance: Complexes
+    covariance: Terms
 
 
-def folded(folds: Sequence[Fold], powers: Sequence[Floats], slices: int) -> Complexes:
+def folded(folds: Sequence[Fold], powers: Sequence[Floats], slices: int) -> Terms:
     """(F, A, A) covariance of folded detail of these powers (F,) in A slices."""
-    total = np.zeros((len(powers[0]), slices, slices), dtype=np.complex64)
+    total = np.zeros((len(powers[0]), slices, slices), dtype=folds[0].covariance.dtype)
     for fold, power in zip(folds, powers, strict=True):
         total[:, fold.into[:, None], fold.into[None, :]] += fold.covariance * power.astype(np.float32)[:, None, None]
     return total

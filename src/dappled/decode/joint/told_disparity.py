@@ -18,9 +18,22 @@ from scipy import ndimage
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.depth_map import nearest_known
-from dappled.decode.joint.any_disparity import STRENGTHS, Doubles, PatchBackground
-from dappled.decode.joint.patch_model import KINDS, SIDE, USUAL, USUAL_KINDS, FrameModel, Rests, nats_of
+from dappled.decode.joint.any_disparity import STRENGTHS, PatchBackground
+from dappled.decode.joint.patch_model import (
+    KINDS,
+    SIDE,
+    USUAL,
+    USUAL_KINDS,
+    Doubles,
+    FrameModel,
+    Rests,
+    nats_of,
+    single,
+    times,
+)
 from dappled.decode.joint.patches import Patches
+from dappled.decode.joint.slice_model import Terms
+from dappled.decode.joint.small_eigh import eigh
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
@@ -81,7 +94,7 @@ def _smoothed(values: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[Any]:
 @dataclass(frozen=True, slots=True, eq=False)
 class ToldViews:
     """`spectra` (F, V·U, N) of the views of N patches, their variance (V·U, N) a pixel but for what each has alone,
-    `rest`, the `kinds` (N,) of the patches, and their log likelihoods `nats` (N,)."""
+    `rest`, both of views in pairs, the `kinds` (N,) of the patches, and their log likelihoods `nats` (N,)."""
 
     spectra: Complexes
     rest: Floats
@@ -110,7 +123,7 @@ def views_told(frame: FrameModel, rests: Rests, spectra: Complexes, shares: Floa
         chosen = np.flatnonzero(kinds == number)
         background = PatchBackground.of(rests.of(number), frame.alone, KINDS[number].alone * own)
         there = _Whitened.of(seen, background, spectra[:, :, chosen])
-        beside = (viewed - seen @ background.unmixed.transpose(0, 2, 1)).astype(np.complex64)
+        beside = viewed - seen @ background.unmixed.transpose(0, 2, 1)
         coefficients = np.zeros((len(own), seen.shape[1], len(chosen)), dtype=np.complex64)
         for members, mix in _mixes(there, shares[chosen]):
             gains = mix.gains(frame.weights)
@@ -119,8 +132,8 @@ def views_told(frame: FrameModel, rests: Rests, spectra: Complexes, shares: Floa
             odds /= odds.sum(axis=0)
             coefficients[:, mix.at, members[:, None]] = mix.coefficients(odds)
             rest[:, chosen[members]] = mix.variance(odds, beside, frame.multiplicity) / SIDE**2
-        moved = beside.transpose(0, 2, 1) @ coefficients
-        made[:, :, chosen] = background.unmixed @ spectra[:, :, chosen] + moved
+        moved = times(beside.transpose(0, 2, 1), coefficients)
+        made[:, :, chosen] = times(background.unmixed, spectra[:, :, chosen]) + moved
     return ToldViews(made, rest, kinds, likely)
 
 
@@ -130,15 +143,15 @@ class _Whitened:
     Hᴴy of patches, and their log likelihoods `without` (F, N) detail."""
 
     gram: Doubles
-    projected: Doubles
+    projected: NDArray[np.complex128]
     without: Floats
 
     @classmethod
-    def of(cls, seen: Complexes, background: PatchBackground, spectra: Complexes) -> _Whitened:
-        rows = seen.astype(np.complex128) @ background.whitener.transpose(0, 2, 1)
-        white = background.whitener @ spectra
+    def of(cls, seen: Terms, background: PatchBackground, spectra: Complexes) -> _Whitened:
+        rows = seen @ background.whitener.transpose(0, 2, 1)
+        white = times(background.whitener, spectra)
         without = nats_of(background.whitener, white)
-        return cls(rows.conj() @ rows.transpose(0, 2, 1), rows.conj() @ white, without)
+        return cls(rows.conj() @ rows.transpose(0, 2, 1), times(rows.conj(), white), without)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +164,7 @@ class _Mix:
     sizes: Floats
     strength: Floats
     turn: Doubles
-    projected: Doubles
+    projected: NDArray[np.complex128]
 
     def gains(self, weights: Singles) -> Floats:
         """(strengths, n) log likelihoods over that of no detail."""
@@ -162,16 +175,16 @@ class _Mix:
             one[:] = np.einsum("f,fnr->n", weights, scale * power / scaled - np.log(scaled))
         return found
 
-    def coefficients(self, odds: Floats) -> Doubles:
+    def coefficients(self, odds: Floats) -> NDArray[np.complex128]:
         """(F, n, R) of each disparity, by the odds (strengths, n)."""
         found = self.turn @ (self._shares(odds) * self.projected)[..., None]
         return np.asarray(found[..., 0] * self.sizes)
 
-    def variance(self, odds: Floats, beside: Complexes, multiplicity: Floats) -> Floats:
+    def variance(self, odds: Floats, beside: Terms, multiplicity: Floats) -> Floats:
         """(V·U, n) sums over all frequencies of the views `beside` (F, D, V·U) what is known of the detail."""
         shares = self._shares(odds) * multiplicity[:, None, None]
         total = np.zeros((beside.shape[2], len(self.at)))
-        turned = (self.turn * self.sizes[:, :, None]).astype(np.complex64).transpose(0, 1, 3, 2)
+        turned = single(self.turn * self.sizes[:, :, None]).transpose(0, 1, 3, 2)
         for number, at in enumerate(self.at):
             viewed = turned[:, number] @ beside[:, at]
             total[:, number] = np.einsum("frv,fr->v", viewed.real**2 + viewed.imag**2, shares[:, number])
@@ -193,7 +206,7 @@ def _mixes(there: _Whitened, shares: Floats) -> Iterator[tuple[NDArray[np.intp],
             at = np.nonzero(shares[members])[1].reshape(-1, count)
             sizes = np.sqrt(np.take_along_axis(shares[members], at, axis=1))
             few = there.gram[:, at[:, :, None], at[:, None, :]] * (sizes[:, :, None] * sizes[:, None, :])
-            strength, turn = np.linalg.eigh(few)
+            strength, turn = eigh(few)
             projected = there.projected[:, at, members[:, None]] * sizes
             projected = (turn.conj().swapaxes(2, 3) @ projected[..., None])[..., 0]
             yield members, _Mix(at, sizes, np.maximum(strength, 0), turn, projected)
