@@ -30,6 +30,7 @@ from dappled.decode.joint.patch_model import (
     Doubles,
     FrameModel,
     single,
+    some_of,
     times,
     whitener_of,
 )
@@ -181,7 +182,7 @@ def _gains(hypotheses: list[_Hypothesis], likely: NDArray[np.bool_], low: Comple
     """(C, N) `gains` of projected patches (F, r, N), −inf where a hypothesis is not `likely` (D, N)."""
     gains = np.full((len(hypotheses), len(STRENGTHS), low.shape[2]), -np.inf)
     for one, members, found in zip(hypotheses, likely, gains, strict=True):
-        found[:, members] = one.gains(low[:, :, members], weights)
+        found[:, members] = one.gains(some_of(low, members), weights)
     return gains.reshape(-1, low.shape[2])
 
 
@@ -222,12 +223,12 @@ def _expected(
         shares = scaled / (1 + scaled * one.strength)  # (strengths, F, R)
         shown = one.rows.shape[1]
         shrunk = np.tensordot(shares[:, :, -shown:], odd[:, used], axes=(0, 0)).astype(np.float32)
-        found = shrunk * times(one.rows, low[:, :, used])
+        found = shrunk * times(one.rows, some_of(low, used))
         viewed = one.viewed[:, -shown:]
         moved[:, :, used] += times(viewed.transpose(0, 2, 1), found)
         between = several[used]
         if between.any():
-            squares = _squares(viewed, found[:, :, between], multiplicity)
+            squares = _squares(viewed, some_of(found, between), multiplicity)
             variance[:, used[between]] += squares / odd[:, used[between]].sum(axis=0)
         weighted = (np.abs(one.viewed) ** 2 * multiplicity[:, None, None]).reshape(-1, moved.shape[1])
         variance += (shares.reshape(count, -1) @ weighted).T @ odd

@@ -42,7 +42,9 @@ from dappled.decode.joint.patch_model import (
     likely_errors,
     likely_kinds,
     moved_nats,
+    rests_in,
     rests_of,
+    some_of,
     usual_nats,
 )
 from dappled.decode.joint.patches import Patches
@@ -220,7 +222,7 @@ class _PatchViews:
 
             def ask(one: _Looked) -> None:
                 here = still[one.members]
-                moved[one.members[here]] = moved_nats(one.frame, one.rests, one.spectra[:, :, here])
+                moved[one.members[here]] = moved_nats(one.frame, one.rests, some_of(one.spectra, here))
 
             each(ask, resting, workers)
         if not (still.any() and is_motionless(moved[still])):
@@ -228,7 +230,7 @@ class _PatchViews:
 
         def rest(one: _Looked) -> None:
             here = np.flatnonzero(still[one.members])
-            kinds = likely_kinds(one.frame, one.rests, one.spectra[:, :, here], with_parallax=False)
+            kinds = likely_kinds(one.frame, one.rests, some_of(one.spectra, here), with_parallax=False)
             self._solve(one, here, kinds, moved[one.members[here]] >= MOVES_NATS)
 
         each(rest, resting, workers)
@@ -249,8 +251,8 @@ class _PatchViews:
                 members = one.members[chosen]
                 self.of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
                 self.beyond[members] = kind.range == BEYOND
-                for few, made, found in views_at_any(frame, some, own, background, one.spectra[:, :, chosen]):
-                    self.windowed[members[few]] = self.patches.images(views_of(made)) + self.lit[members[few]]
+                for few, made, found in views_at_any(frame, some, own, background, some_of(one.spectra, chosen)):
+                    self.windowed[members[few]] = self.patches.images(views_of(made), self.lit[members[few]])
                     self.variance[:, members[few]] = of_alone * left + of_rest * variance_of_views(found)
 
     def told(self, one: _Looked, shares: Floats) -> list[ToldPatches]:
@@ -259,11 +261,12 @@ class _PatchViews:
         if not here.any():
             return []
         members = one.members[here]
-        spectra, kinds = one.spectra[:, :, here], one.kinds[here]
+        spectra, kinds = some_of(one.spectra, here), one.kinds[here]
         found = views_told(one.frame, one.rests, spectra, shares[members])
         gained = found.nats - usual_nats(one.frame, one.rests, kinds, spectra)
-        change = self.patches.images(views_of(found.spectra)) - (self.windowed[members] - self.lit[members])
-        windowed = np.asarray(self.windowed[members] + _TRUST * change, dtype=np.float32)
+        windowed = self.patches.images(views_of(found.spectra), self.lit[members])
+        windowed *= _TRUST
+        windowed += (1 - _TRUST) * self.windowed[members]
         return [ToldPatches(members, windowed, found.kinds, variance_of_views(found.rest), gained)]
 
     def take(self, told: list[ToldPatches], likely: NDArray[np.bool_]) -> None:
@@ -320,11 +323,12 @@ class _Looked:
         spectrum = TexturePower.of(np.maximum(power - frame.noise[0], 0), radius)
         strength = spectrum.at(radius)
         frames = [replace(frame, error=error) for error in _ERRORS]
-        tried = [rests_of(one, spectrum, strength, mean) for one in frames]
+        first = rests_of(frames[0], spectrum, strength, mean)
+        tried = [first, *(rests_in(one, first, mean) for one in frames[1:])]
         kinds = likely_kinds(frame, tried[0], spectra, with_parallax=True)
         likely = likely_errors(frames, tried, kinds, spectra)
         return [
-            cls(members[some], one, rests, kinds[some], spectra[:, :, some])
+            cls(members[some], one, rests, kinds[some], some_of(spectra, some))
             for one, rests, some in zip(frames, tried, (likely == n for n in range(len(frames))), strict=True)
             if some.any()
         ]

@@ -71,6 +71,7 @@ USUAL_KINDS = [number for number, kind in enumerate(KINDS) if (kind.range, kind.
 LEAST_NOISE = 1e-12  # variance: what a slice without noise counts as, so that its inverse is finite in double precision
 WITHIN = (-0.4, 0.0, 0.4)  # of the step from one disparity to the next: a patch is not flat
 AT_A_TIME = 256  # patches: what is worked on stays small
+_FEW_AT_A_TIME = 64  # where little is done to each number, so that what is worked on stays near the processor
 _TRIED = 3  # of so many frequencies one is looked at to choose the kind
 _UNSURE_NATS = 300.0  # by those: less is no choice
 _HYPOTHESES = 17  # disparities over a range, an eighth of the reach apart
@@ -254,17 +255,27 @@ def rests_of(
     frame: FrameModel, spectrum: TexturePower, own: Floats, mean: float, kinds: Sequence[PatchKind] = KINDS
 ) -> Rests:
     """What is not the band's own detail, of each kind of patch."""
-    size = len(frame.noise)
+    from_beyond = {
+        number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], len(frame.noise))
+        for number, some in frame.folds.items()
+    }
+    plain = _plain(frame, own, mean)
+    return Rests(kinds, plain, from_beyond, frame.alone @ frame.alone.conj().T, own)
+
+
+def _plain(frame: FrameModel, own: Floats, mean: float) -> Floats:
+    """(F, A) variances of noise, of what no light field explains, and of light that is where it should not be."""
     through = (np.abs(frame.ranges[USUAL].seen) ** 2).mean(axis=(1, 2, 3)) * own
     own_noise = frame.noise + LEAST_NOISE + frame.error * through[:, None]
     light = own + frame.lowest * (mean * SIDE) ** 2
     lost = frame.astray**2 + (frame.unlike * np.abs(frame.model.transfers[1:])) ** 2
     own_noise[:, 1:] += light[:, None] * lost
-    from_beyond = {
-        number: folded(some, [spectrum.at(frame.radius(one.beyond)) for one in some], size)
-        for number, some in frame.folds.items()
-    }
-    return Rests(kinds, own_noise, from_beyond, frame.alone @ frame.alone.conj().T, own)
+    return np.asarray(own_noise)
+
+
+def rests_in(frame: FrameModel, rests: Rests, mean: float) -> Rests:
+    """The same of a frame that differs by its `error` alone."""
+    return replace(rests, plain=_plain(frame, rests.own, mean))
 
 
 def detail_of(seen: Terms, own: Floats) -> Terms:
@@ -290,7 +301,7 @@ def usual_nats(frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra
     detail, found = detail_of(frame.ranges[USUAL].seen, rests.own), np.empty((*frame.weights.shape[:-1], len(kinds)))
     for number in map(int, np.unique(kinds)):
         here = kinds == number
-        found[..., here] = likelihoods([rests.whole(number, detail)], spectra[:, :, here], frame.weights)[0]
+        found[..., here] = likelihoods([rests.whole(number, detail)], some_of(spectra, here), frame.weights)[0]
     return found
 
 
@@ -303,7 +314,7 @@ def likely_errors(
     usual, radius = np.isin(kinds, USUAL_KINDS), frames[0].radius(frames[0].frequencies)
     apart = frames[0].weights * np.stack([radius < _SHORT, radius >= _SHORT])
     large, small = (
-        usual_nats(replace(one, weights=apart), rest, kinds[usual], spectra[:, :, usual])
+        usual_nats(replace(one, weights=apart), rest, kinds[usual], some_of(spectra, usual))
         for one, rest in zip(frames, rests, strict=True)
     )
     found = np.zeros(len(kinds), dtype=np.intp)
@@ -318,6 +329,11 @@ def _double(values: NDArray[Any]) -> Doubles:
 def single(values: Doubles) -> Terms:
     """The values in single precision."""
     return values.astype(np.complex64 if np.iscomplexobj(values) else np.float32)
+
+
+def some_of(spectra: Complexes, which: NDArray[np.bool_] | NDArray[np.intp]) -> Complexes:
+    """Those of `which` patches, of (F, A, N); by an index NumPy would leave them with the patches apart in memory."""
+    return np.asarray(spectra.take(np.flatnonzero(which) if which.dtype == np.bool_ else which, axis=2))
 
 
 def times(matrix: NDArray[Any], spectra: NDArray[Any]) -> NDArray[Any]:
@@ -395,7 +411,7 @@ def _most_likely(
         if kind.range not in details:
             details[kind.range] = detail_of(frame.ranges[kind.range].seen, rests.own)
         whole = rests.whole(number, details[kind.range])
-        nats[place, here] = likelihoods([whole], spectra[:, :, here], frame.weights)[0] - kind.nats
+        nats[place, here] = likelihoods([whole], some_of(spectra, here), frame.weights)[0] - kind.nats
     unsure = likely.any(axis=0)
     return np.asarray(np.where(unsure, np.where(likely, nats, -np.inf).argmax(axis=0), tried.argmax(axis=0)))
 
@@ -427,24 +443,29 @@ def _at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra
     base, once = (rests.variances(number) for number in (0, 1))  # without detail beyond the band, and with it
     varied = once - base + moved
     found = np.zeros((len(_USUAL_AMOUNTS), spectra.shape[2]))
+    amounts = np.array((*_USUAL_AMOUNTS, *_MORE))[:, None, None]
     for number, turn in enumerate(common):
-        sizes = [(base + amount * varied)[:, number, None].astype(np.float32) for amount in (*_USUAL_AMOUNTS, *_MORE)]
-        volumes = [-np.log(size) for size in sizes]
-        for some_patches in spans(spectra.shape[2], AT_A_TIME):
+        size = base[:, number, None] + amounts * varied[:, number, None]
+        volume, shrunk = np.log(size).astype(np.float32), (1 / size).astype(np.float32)
+        for some_patches in spans(spectra.shape[2], _FEW_AT_A_TIME):
             left = spectra[:, number, some_patches]
             if number:
                 left = left - np.complex64(turn) * spectra[:, 0, some_patches]
-            power = left.real**2 + left.imag**2
-            nats = np.stack([volume - power / size for volume, size in zip(volumes, sizes, strict=True)])
+            nats = shrunk * -(left.real**2 + left.imag**2)
+            nats -= volume
             found[:, some_patches] += np.tensordot(_means_of_odds(nats), frame.weights, axes=(1, 0))
     return np.asarray(found.max(axis=0))
 
 
 def _means_of_odds(nats: Singles) -> Singles:
-    """(usual, F, N) log likelihoods where each frequency has any of these amounts (B, F, N): mostly one of the usual
-    ones, which come first."""
+    """(usual, F, N) log likelihoods where each frequency has any of these amounts (B, F, N), which are overwritten:
+    mostly one of the usual ones, which come first."""
     usual = len(_USUAL_AMOUNTS)
     top = nats.max(axis=0)
-    odds = np.exp(nats - top)
+    nats -= top
+    odds = np.exp(nats, out=nats)
     seldom = np.float32(_SELDOM / len(_MORE)) * odds[usual:].sum(axis=0)
-    return np.asarray(top + np.log(np.float32(1 - _SELDOM) * odds[:usual] + seldom))
+    made = odds[:usual]
+    made *= np.float32(1 - _SELDOM)
+    made += seldom
+    return np.asarray(top + np.log(made, out=made))

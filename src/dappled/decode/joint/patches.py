@@ -103,11 +103,18 @@ class Patches:
                 found[:, at, some] = part.reshape(*part.shape[:2], len(found)).transpose(2, 0, 1)
         return found
 
-    def images(self, spectra: Complexes) -> Singles:
-        """(N, V, side, side) the windowed patches of real images from their half spectra (F, V, N)."""
-        columns = self.side // 2 + 1
-        whole = spectra.transpose(2, 1, 0).reshape(spectra.shape[2], spectra.shape[1], self.side, columns)
-        return np.asarray(fft.irfft2(whole, s=(self.side, self.side)) * (self.side / 2), dtype=np.float32)
+    def images(self, spectra: Complexes, lit: Singles | None = None) -> Singles:
+        """(N, V, side, side) the windowed patches of real images from their half spectra (F, V, N), and what is `lit`
+        (N, 1, side, side) in all images."""
+        columns, count = self.side // 2 + 1, spectra.shape[1]
+        made = np.empty((spectra.shape[2], count, self.side, self.side), dtype=np.float32)
+        for some in spans(len(made), _AT_A_TIME):
+            whole = np.ascontiguousarray(spectra[:, :, some].transpose(2, 1, 0)).reshape(-1, self.side, columns)
+            image = fft.irfft2(whole, s=(self.side, self.side), overwrite_x=True, norm="forward")
+            np.multiply(image.reshape(-1, count, self.side, self.side), 0.5 / self.side, out=made[some])
+            if lit is not None:
+                made[some] += lit[some]
+        return made
 
     def joined(self, patches: Singles) -> Singles:
         """(V, h, w) of windowed patches (N, V, side, side)."""

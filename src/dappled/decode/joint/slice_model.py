@@ -96,7 +96,8 @@ class SliceModel:
             np.exp(-2j * np.pi * np.outer(along, np.arange(side) / side)) * np.hanning(side + 2)[1:-1]
             for side in slices.shape[1:]
         )
-        waves = down @ (slices / transfers[:, None, None]).real @ across.T
+        over = (slices * (1 / transfers).astype(np.complex64)[:, None, None]).real
+        waves = (down.real @ over + 1j * (down.imag @ over)) @ across.T
         mean = float(waves[0, _WAVES, _WAVES].real)
         if not mean > 0:
             return np.zeros(len(slices), dtype=np.complex128), 0.0

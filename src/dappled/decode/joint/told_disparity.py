@@ -29,6 +29,7 @@ from dappled.decode.joint.patch_model import (
     Rests,
     nats_of,
     single,
+    some_of,
     times,
 )
 from dappled.decode.joint.patches import Patches
@@ -122,7 +123,8 @@ def views_told(frame: FrameModel, rests: Rests, spectra: Complexes, shares: Floa
     for number in np.unique(kinds):
         chosen = np.flatnonzero(kinds == number)
         background = PatchBackground.of(rests.of(number), frame.alone, KINDS[number].alone * own)
-        there = _Whitened.of(seen, background, spectra[:, :, chosen])
+        few_spectra = some_of(spectra, chosen)
+        there = _Whitened.of(seen, background, few_spectra)
         beside = viewed - seen @ background.unmixed.transpose(0, 2, 1)
         coefficients = np.zeros((len(own), seen.shape[1], len(chosen)), dtype=np.complex64)
         for members, mix in _mixes(there, shares[chosen]):
@@ -133,7 +135,7 @@ def views_told(frame: FrameModel, rests: Rests, spectra: Complexes, shares: Floa
             coefficients[:, mix.at, members[:, None]] = mix.coefficients(odds)
             rest[:, chosen[members]] = mix.variance(odds, beside, frame.multiplicity) / SIDE**2
         moved = times(beside.transpose(0, 2, 1), coefficients)
-        made[:, :, chosen] = times(background.unmixed, spectra[:, :, chosen]) + moved
+        made[:, :, chosen] = times(background.unmixed, few_spectra) + moved
     return ToldViews(made, rest, kinds, likely)
 
 
