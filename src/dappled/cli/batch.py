@@ -54,7 +54,6 @@ class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
     json: bool = flag("--json", "print one JSON object per frame")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.check_profiles()
         wrong = [layout.not_a_flight(one) for one in self._folders()]
         if all(wrong):
@@ -66,7 +65,6 @@ class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
         return _different(_flights(self.flights))
 
     def run(self, output: Output) -> Report:
-        """Process whole flights."""
         jobs: list[Job] = []
         doubts: list[Finding] = []
         refused = 0

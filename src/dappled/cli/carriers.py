@@ -100,7 +100,6 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.picture)
         if self.frame is None:
             if not self.shape or self.camera == "auto" or self.mask == profiles.LENSLET:
@@ -112,7 +111,6 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
         Darkroom(self.recipe()).check()
 
     def run(self, output: Output) -> Report:
-        """Show the predicted and the measured carriers."""
         if self.frame is None:
             table = self._predicted()
         else:

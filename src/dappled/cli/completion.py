@@ -47,7 +47,6 @@ class PrintCompletion(Verb):
     shell: str = argument("SHELL", f"the shell: {', '.join(_WHERE)}", choices=tuple(_WHERE))
 
     def run(self, output: Output) -> Report:
-        """Print a completion script."""
         script = _fish(words()) if self.shell == "fish" else (_ZSH if self.shell == "zsh" else "") + _bash(words())
         return Report({"shell": self.shell, "script": script}, script.splitlines())
 

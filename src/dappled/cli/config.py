@@ -26,7 +26,6 @@ class CheckSettings(Verb):
     file: Path = argument("FILE", "settings file")
 
     def run(self, output: Output) -> Report:
-        """Check a settings file."""
         settings_check.checked(settings.examine_file(self.file), by_this_user=False)
         return Report({"file": str(self.file), "good": True}, [f"{self.file}: good"])
 
@@ -40,7 +39,6 @@ class ShowSettings(Verb):
     file: Path | None = argument("FILE", "settings file (default: the built-in settings)", default=None)
 
     def run(self, output: Output) -> Report:
-        """Show every setting with its value, unit and meaning."""
         tables = settings.to_tables(settings.load(self.file))
         return Report(tables, list(_lines(tables)))
 
@@ -68,7 +66,6 @@ class ListProfiles(Verb):
     examples = ("dappled profiles",)
 
     def run(self, output: Output) -> Report:
-        """List the shipped profiles."""
         cameras = [profiles.camera(name) for name in profiles.shipped("cameras")]
         masks = [profiles.mask(name) for name in profiles.shipped("masks")]
         values = {

@@ -56,11 +56,9 @@ class DecodeFrames(Overwriting, Doubtable, Several, FramesArguments, Verb):
         return Darkroom(recorded(self.frames, self.recipe(colour=self.colour, taper=self.taper)))
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self._darkroom().check()
 
     def run(self, output: Output) -> Report:
-        """Decode frames to light fields."""
         recipe, found = self._darkroom().recipe, frames(self.frames)
         single = len(found) == 1 and bool(self.output.suffix)
         if not single:

@@ -80,7 +80,6 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
     output: tuple[Path, ...] = option("-o --output", "files to write", (), metavar="OUT")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.check_source("together")
         if self.window is not None and self.window % 2 == 0:
             raise CallError(f"a window of {self.window} px has no middle: give an odd --window")
@@ -95,7 +94,6 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
         self.refuse_existing(*self.output)
 
     def run(self, output: Output) -> Report:
-        """Measure disparities and distances."""
         if self.field is None:
             return self._heights(output)
         found = opened_field(self.field, self)

@@ -59,7 +59,6 @@ class ExamineMachine(SettingsArgument, Verb):
     watch: bool = flag("--watch", "print which cameras appear and disappear on USB, until Ctrl-C")
 
     def run(self, output: Output) -> Report:
-        """Say what is missing on this machine."""
         return _watch(output) if self.watch else _examined(self, output)
 
 

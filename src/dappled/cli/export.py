@@ -56,7 +56,6 @@ class ExportLightField(Overwriting, RangingArguments, FieldArguments, Verb):
             raise DappledError(f"{self.output} exists already: move it away, or choose another name")
 
     def run(self, output: Output) -> Report:
-        """Write light fields for other tools."""
         found = opened_field(self.field, self)
         written = self._write(found)
         words = views_words(found.field)

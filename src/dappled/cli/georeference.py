@@ -77,7 +77,6 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         return len(self.against) > 1
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.check_refinement()
         if ("difference" in self.kinds) != bool(self.against):
             raise CallError("--as difference and --against FLIGHT go together")
@@ -107,7 +106,6 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                 yield from (output / "frames").glob(f"*{_EACH[kind]}")
 
     def run(self, output: Output) -> Report:
-        """Make maps of a flight."""
         flight = layout.open_folder(self.flight).path
         folder = self.output or flight / "maps"
         with ExitStack() as stack:

@@ -90,14 +90,12 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.check_mounted()
         check_geoid(self.geoid)
         if self.mark_lever_arm is not None and self.pos is None:
             raise CallError("--mark-lever-arm goes with --pos: leave it out, or give the positions of the marks")
 
     def run(self, output: Output) -> Report:
-        """Write positions and attitudes."""
         facts = layout.read_facts(layout.open_folder(self.flight))
         key = sealing.key_of(self.config)
         into_flight = self.output is None

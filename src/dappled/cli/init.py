@@ -65,12 +65,10 @@ class InitSettings(Overwriting, Verb):
     folder: str | None = option("--folder", of_setting(RecordSettings, "directory"), None, metavar="DIR")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.file)
         refuse_no_folder(self.file)
 
     def run(self, output: Output) -> Report:
-        """Write a settings file."""
         asks = sys.stdin.isatty() and sys.stderr.isatty() and not self.json
         given = {"--camera": self.camera, "--shutter": self.shutter, "--mask": self.mask}
         given |= {"--link": self.link, "--folder": self.folder}

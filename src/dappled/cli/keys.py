@@ -38,12 +38,10 @@ class MakeKeys(Verb):
     folder: Path = option("-o --folder", "folder to write to", _HOME, metavar="DIR")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if wrong := curve.not_a_name(self.name):
             raise CallError(wrong)
 
     def run(self, output: Output) -> Report:
-        """Make a pair of keys."""
         public, secret = curve.make(self.folder.expanduser(), self.name)
         lines = [f"{public}  to give away", f"{secret}  to keep: name it in publish.keys, or after --keys"]
         return Report({"public": str(public), "secret": str(secret)}, lines)
@@ -58,7 +56,6 @@ class ShowKey(Verb):
     file: Path = argument("FILE", "NAME.key or NAME.key_secret", there=paths.file)
 
     def run(self, output: Output) -> Report:
-        """Show a public key."""
         key = curve.load_public(self.file).decode()
         return Report({"public_key": key}, [key])
 
@@ -68,7 +65,6 @@ class _NewFile(Verb):
     file: Path = argument("FILE", "file to write; must not exist yet")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         refuse_no_folder(self.file.expanduser())
 
 
@@ -78,7 +74,6 @@ class MakeToken(_NewFile):
     examples = ("dappled keys token /etc/dappled/console.token",)
 
     def run(self, output: Output) -> Report:
-        """Make a token for the console."""
         key_files.make(self.file.expanduser(), secrets.token_urlsafe(24) + "\n")
         said = f"{self.file}  name it in console.token; anyone who knows its content may use the console"
         return Report({"token_file": str(self.file)}, [said])
@@ -90,7 +85,6 @@ class MakeSealKey(_NewFile):
     examples = ("dappled keys seal /etc/dappled/seal.key",)
 
     def run(self, output: Output) -> Report:
-        """Make a key that signs the seals of flights."""
         seal_key.make(self.file.expanduser())
         said = f"{self.file}  name it in record.seal_key, and keep a copy where flights are checked"
         return Report({"seal_key_file": str(self.file)}, [said])
@@ -107,7 +101,6 @@ class MakeLinkKey(_NewFile):
     )
 
     def run(self, output: Output) -> Report:
-        """Make a key for a signed link."""
         make_key(self.file, _passphrase() if self.passphrase else None)
         said = f'{self.file}: a key for this user alone; set keys = ["{self.file.absolute()}"] in [mavlink]'
         return Report({"key_file": str(self.file)}, [said])

@@ -117,7 +117,6 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         return self.all_in_focus or self.index is not None
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self._check_mix()
         self.check_source("flight", "height", "combine")
         if self.field is None:
@@ -166,7 +165,6 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
             )
 
     def run(self, output: Output) -> Report:
-        """Refocus a light field, or a flight."""
         if self.field is None:
             return self._flight(output)
         found = opened_field(self.field, self)

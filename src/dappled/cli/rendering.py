@@ -36,19 +36,15 @@ class TerminalOutput:
         self._what = ""
 
     def row(self, values: Mapping[str, Any], *lines: str) -> None:
-        """Print one result at once: its values as a line of JSON with --json, else its lines."""
         self._print([json.dumps(values)] if self._as_json else lines)
 
     def remark(self, text: str) -> None:
-        """Say something beside the results, on standard error."""
         self._print([text], error=True)
 
     def warn(self, text: str) -> None:
-        """Say what went wrong or is in doubt, on standard error, with the verb's name."""
         self.remark(f"dappled {self._path}: {text}")
 
     def each(self, items: Sequence[Item], unit: str = "frame") -> Iterator[Item]:
-        """The items, with a bar."""
         with self.bar(len(items), unit) as add:
             for item in items:
                 yield item
@@ -56,7 +52,6 @@ class TerminalOutput:
 
     @contextmanager
     def bar(self, total: int | None, unit: str, what: str = "") -> Iterator[Callable[[int], object]]:
-        """A bar of so many units; the function adds to it."""
         if not sys.stderr.isatty():
             yield lambda _: None
             return
@@ -68,7 +63,6 @@ class TerminalOutput:
             self.close()
 
     def show(self, what: str, done: int, total: int) -> None:
-        """So many steps of a stretch of work are done."""
         if not sys.stderr.isatty():
             return
         if self._bar is None or what != self._what:

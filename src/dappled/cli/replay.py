@@ -120,7 +120,6 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
         return {name: getattr(self, name) for name in _GIVEN}
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if not self._is_flight:
             if not self.flight.is_dir():
                 raise CallError(f"{self.flight} is neither a flight nor a folder of frames")
@@ -138,7 +137,6 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
             profiles.mask(self.mask)
 
     def run(self, output: Output) -> Report:
-        """Run a recorded flight."""
         settings = configuration.load(self.config)
         problems = [*flight_check.check(self.flight).problems] if self.verify else []
         facts = layout.read_facts(layout.open_folder(self.flight)) if self._is_flight else {}

@@ -72,7 +72,6 @@ class RunDaemon(SettingsArgument, Verb):
     json: bool = flag("--json", "print one JSON object per frame")
 
     def run(self, output: Output) -> Report:
-        """Run the daemon."""
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)  # until a daemon can end in order
         hung_up = signal.signal(signal.SIGHUP, signal.SIG_IGN)
         try:
@@ -129,11 +128,9 @@ class RunSurroundings:
     frames: int | None
 
     def ready(self) -> bool:
-        """Whether the camera is ready."""
         return self.camera.state == "ready"
 
     def ground_station(self) -> Asker | None:
-        """Start the ground station that asks for the frames; None where there is none to start."""
         return self.simulation.ground_station(self.frames) if self.simulation and self.frames else None
 
 

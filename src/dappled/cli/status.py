@@ -50,7 +50,6 @@ class ShowStatus(Verb):
     json: bool = flag("--json", "print the health record as it is published")
 
     def run(self, output: Output) -> Report:
-        """Show the state of the daemon."""
         record = health(self.endpoint or stream_endpoint(self.config), self.timeout, unit(self.config))
         return Report(record, screen(record))
 

@@ -163,7 +163,6 @@ class RunObserver(Observer):
         self._frames.finished(pending)
 
     def camera_changed(self, change: StateChanged) -> None:
-        """The camera's state changed."""
         self._camera.changed(change)
 
 

@@ -73,14 +73,12 @@ class AskForPhotographs(Verb):
     json: bool = flag("--json", "print one JSON object per photograph")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         try:
             parse(self.url or DEFAULT_URL)
         except LinkError as error:
             raise CallError(str(error)) from None
 
     def run(self, output: Output) -> Report:
-        """Ask for photographs."""
         url, key = self._link()
         with GroundClient(url, key_file=key) as client:
             with waiting_for(f"a camera on {url}"):

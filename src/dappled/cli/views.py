@@ -53,7 +53,6 @@ class DrawViews(Overwriting, FieldArguments, Verb):
     output: Path = option("-o --output", "picture or animation to write")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if self.of != "epi" and (self.row, self.column) != (None, None):
             raise CallError(f"--row and --column are of --of epi: leave them out of {self.of}")
         if self.animate and self.of != "views":
@@ -63,7 +62,6 @@ class DrawViews(Overwriting, FieldArguments, Verb):
         self.refuse_existing(self.output)
 
     def run(self, output: Output) -> Report:
-        """Draw views, slices or shifts as one picture."""
         found = opened_field(self.field)
         if self.animate:
             pictures = _parallax(found) if self.animate == "parallax" else _focus(found)

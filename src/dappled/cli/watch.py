@@ -51,12 +51,10 @@ class WatchStream(Verb):
     json: bool = flag("--json", "print one JSON object per line")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if bool(self.keys) != bool(self.server_key):
             raise CallError("--keys and --server-key go together: your own secret key, and the vehicle's public one")
 
     def run(self, output: Output) -> Report:
-        """Subscribe to the stream."""
         endpoint = self.endpoint or stream_endpoint(self.config)
         ask = self.ask or (f"{endpoint}.ask" if endpoint.startswith("ipc://") else "")
         keys = ClientKeys(load_own(self.keys), load_public(self.server_key)) if self.keys and self.server_key else None

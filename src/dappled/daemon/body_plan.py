@@ -144,7 +144,6 @@ class BodyPlan:
     # what a ground station uses
 
     def settings(self) -> tuple[Setting, ...]:
-        """The settings as last read, from memory; empty while none were read, and for a camera that has none."""
         return self._body.settings()
 
     def change(self, name: SettingName, value: str) -> None:

@@ -50,7 +50,6 @@ class FlightControl:
     # ShotSink
 
     def obstacle(self) -> Finding | None:
-        """Why no shot can be taken now (no camera, disk full); None where one can."""
         if self._handover is not None and self._handover.next is not None:
             return finding(Code.FLIGHT_NEXT_BEGINS, Subject("flight"))
         if (missing := self._shots.without_camera()) is not None:
@@ -76,7 +75,6 @@ class FlightControl:
         self._recording.journal.note(shot)
 
     def fire(self, shot: Shot) -> None:
-        """Hand a noted shot to the camera."""
         self._shots.fire(shot)
 
     def refused(self, why: Finding) -> None:
@@ -96,11 +94,9 @@ class FlightControl:
         return self._settings.now.pose.on_gimbal
 
     def facts(self) -> CameraFacts:
-        """Make, model, lens and sensor, as far as they are known."""
         return self._camera.facts()
 
     def storage(self) -> DiskSpace | None:
-        """The disk that frames go to; None while it can't be read."""
         try:
             return layout.disk_space(self._recording.folder.path)
         except FlightError:
@@ -113,15 +109,12 @@ class FlightControl:
         return camera_status.captured_image(index, self._recording.index)
 
     def pose(self) -> Pose | None:
-        """The vehicle's pose now; None while it is unknown."""
         return self._navigation.pose_now()
 
     def troubled(self) -> bool:
-        """Whether the heartbeat says MAV_STATE_CRITICAL."""
         return self._alarms.troubled
 
     def lost(self, triggers: Finding) -> None:
-        """Write down triggers of the autopilot that became no shot."""
         self.lost_triggers += triggers.number("triggers")
         self._writer.later(LOST, triggers)
 
@@ -140,7 +133,6 @@ class DecodingParameter:
         self._shots, self._writer, self._decodes = shots, writer, decodes
 
     def parameters(self) -> tuple[Parameter]:
-        """Each as it is now."""
         choices = ("on", "off") if self._decodes else ()
         return (Parameter("LF_DECODE", "Decode in flight", "on" if self._shots.decoding else "off", choices),)
 

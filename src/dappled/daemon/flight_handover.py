@@ -102,7 +102,6 @@ class RecipeParameters:
         self._after, self._settings, self._shutter, self._events = after, settings, shutter, events
 
     def parameters(self) -> tuple[Parameter, Parameter]:
-        """Each as it is now."""
         masks, laws = ((), ()) if self._after is None else (self._after.masks(), self._after.laws())
         return Parameter("LF_MASK", "Mask", self._mask, masks), Parameter("LF_LAW", "Carrier law", self._law, laws)
 

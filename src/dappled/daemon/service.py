@@ -533,7 +533,6 @@ class Service:
 
     @property
     def requested(self) -> int:
-        """Shots so far."""
         return self.parts.shutter.statistics().shots
 
     def request(self, request: CaptureRequest) -> ShotDecision:

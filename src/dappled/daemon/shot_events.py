@@ -50,12 +50,10 @@ class ShotEvents(Observer):
         self.of_body: deque[BodyNews] = deque(maxlen=_OF_BODY)
 
     def settled(self, index: int, ok: bool) -> None:
-        """A shot is safe (`ok`) or failed."""
         self._shutter.settled(index, ok)
         self._outside.settled(index, ok)
 
     def tagged(self, pending: PendingShot) -> None:
-        """A shot's tag is known, or there will be none."""
         captured = captured_shot(pending, self._utc.utc_ns)
         if self._component.announce(captured):
             self._note_reported(captured.index)
@@ -81,7 +79,6 @@ class ShotEvents(Observer):
         self._outside.finished(pending)
 
     def camera_changed(self, change: StateChanged) -> None:
-        """The camera's state changed."""
         log.debug("camera %s %s", change.state, change.reason)
         if change.state != "busy" and not (change.state == "ready" and self._camera.known):
             reason = f": {change.reason}" if change.reason else ""
@@ -95,7 +92,6 @@ class ShotEvents(Observer):
         self._outside.camera_changed(change)
 
     def settings_changed(self, change: SettingsChanged) -> None:
-        """The camera's settings changed."""
         self.of_body.append(change)
         if change.refused:
             self._logbook.add(f"the camera refused a setting: {change.refused}", "warning")

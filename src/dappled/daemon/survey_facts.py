@@ -20,22 +20,18 @@ class LiveSurvey:
         self._navigation, self._camera, self._shots = navigation, camera, shots
 
     def pose(self) -> Pose | None:
-        """Now."""
         return self._navigation.pose_now()
 
     def height(self) -> Height | None:
-        """Now; None where it is unknown."""
         return Height.of(self._navigation.pose_now())
 
     def field(self) -> tuple[float, float] | None:
-        """The sensor's (height, width) over the focal length; None where one is unknown."""
         facts = self._camera.facts()
         if not (facts.focal_length_mm and facts.sensor_height_mm and facts.sensor_width_mm):
             return None
         return facts.sensor_height_mm / facts.focal_length_mm, facts.sensor_width_mm / facts.focal_length_mm
 
     def busy(self) -> bool:
-        """Whether the body is at work on a shot, so that another would be taken later, and elsewhere."""
         return self._shots.state == "busy" or self._shots.waits
 
 

@@ -39,7 +39,6 @@ class ReplayCamera(PlainCamera):
         self._playing = False
 
     def start(self) -> None:
-        """Begin to look for the camera and to report events."""
         self._playing = True
         self.report(StateChanged("ready", "", self._clock.monotonic_ns(), self._identity))
 
@@ -73,5 +72,4 @@ class ReplayCamera(PlainCamera):
         return self._identity
 
     def stop(self) -> None:
-        """Close the camera within two seconds."""
         self._playing = False

@@ -50,7 +50,6 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
     )
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if self.kit is not None:
             if self.frames or self.mask:
                 raise CallError("--kit reads the frames and masks of its folder: leave out FRAME and --mask")
@@ -66,7 +65,6 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
             Darkroom(self.recipe()).check()
 
     def run(self, output: Output) -> Report:
-        """Fit lattice, law and phases."""
         if self.kit is not None:
             return kit.calibrated(kit.KitCall(self.kit, self.recipe(), self._given), self.output, output)
         assert self.output is not None

@@ -31,7 +31,6 @@ class ListFlights(SettingsArgument, Verb):
     )
 
     def run(self, output: Output) -> Report:
-        """List all flights in a folder."""
         folder = self.folder or folder_of_flights(self.config)
         found = flight_report.list_flights(folder)
         if not found and not self.json:
@@ -46,7 +45,6 @@ class ShowFlight(FlightArgument, Verb):
     examples = (f"dappled flight show {EXAMPLE}",)
 
     def run(self, output: Output) -> Report:
-        """Show every shot of a flight."""
         found = flight_report.show(self.chosen(output))
         events = [{**codec.plain(one), "text": one.words, "finding": codec.plain(one.finding)} for one in found.events]
         return Report({**codec.plain(found), "events": events}, list(flight_lines.of_flight(found)))
@@ -63,7 +61,6 @@ class CheckFlight(FlightArgument, Verb):
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
-        """Check that every byte is intact."""
         key = sealing.key_of(self.config, self.key)
         return _of_check(flight_check.check(self.chosen(output), key), signed=self.key is not None)
 
@@ -79,7 +76,6 @@ class SealFlight(FlightArgument, Verb):
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
-        """Check a flight and sign it as it stands."""
         flight = self.chosen(output)
         key = sealing.key_of(self.config, self.key)
         if key is None:
@@ -115,14 +111,12 @@ class ReportFlight(Overwriting, FlightArgument, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         for path in self.page:
             if path.suffix not in (".html", ".pdf"):
                 raise CallError(f"--page {path}: a page is .html or .pdf")
         self.refuse_existing(*self.page)
 
     def run(self, output: Output) -> Report:
-        """Count which requests became frames."""
         flight = self.chosen(output)
         found, by_source = flight_report.balance(flight), flight_report.by_source(flight)
         sources = codec.plain(by_source)
@@ -161,7 +155,6 @@ class OffloadFlight(Doubtable, FlightArgument, Verb):
     same_device: bool = flag("--same-device", "insist on a DEST that is on the same disk")
 
     def run(self, output: Output) -> Report:
-        """Copy a flight to another disk."""
         flight = self.chosen(output)
         total = sum(path.stat().st_size for path in flight.rglob("*") if path.is_file())
         with output.bar(total, "B") as add:

@@ -54,7 +54,6 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         return [] if self.output is None else [self.output / f"coverage.{kind}" for kind in ("tif", "geojson", "png")]
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if self.refly is not None and self.refly.suffix != ".plan":
             raise CallError(f"--refly {self.refly}: QGroundControl opens .plan files only")
         if self.refly is not None and self.area is None:
@@ -62,7 +61,6 @@ class CoverageOfFlight(Overwriting, FlightArgument, Verb):
         self.refuse_existing(*self._files(), self.refly)
 
     def run(self, output: Output) -> Report:
-        """Which ground the frames have seen."""
         files = self._files()
         area = None if self.area is None else areas.read(self.area)
         seen = coverage.of_flight(

@@ -28,7 +28,6 @@ class WriteReceiverStream(Overwriting, Doubtable, FlightArgument, Verb):
     output: Path | None = option("-o --output", "the file", None, otherwise="the flight's name.ubx")
 
     def run(self, output: Output) -> Report:
-        """Write the GNSS receiver's stream."""
         flight = self.chosen(output)
         folder = layout.open_folder(flight)
         to = self.output or Path(f"{folder.name}.ubx")

@@ -47,7 +47,6 @@ class PickUpFiles(Doubtable, FlightArgument, Verb):
     dry_run: bool = flag("--dry-run", "only say what would be done")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         source = parse_source(self.source, PtpSource)
         if isinstance(source, FolderSource) and not source.removable and not source.folder.is_dir():
             raise CallError(f"--from {self.source}: there is no such folder; check the path, or mount the card")
@@ -56,7 +55,6 @@ class PickUpFiles(Doubtable, FlightArgument, Verb):
                 raise CallError(f"--pair {index}=…: {count} files are named for shot {index}; name one")
 
     def run(self, output: Output) -> Report:
-        """Fetch the files that stayed in the camera."""
         flight = self.chosen(output)
         source = parse_source(self.source, PtpSource)
         choice = Choice(dict(self.pair), self.offset, self.any_clock, self.by_order)

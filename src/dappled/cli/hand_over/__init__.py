@@ -62,7 +62,6 @@ class HandOver(Overwriting, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if (self.pictures is None) == (self.task is None):
             raise CallError("name the folder of the pictures, or with --task one that was sent earlier, not both")
         if self.task is not None and (self.options or self.name):
@@ -72,7 +71,6 @@ class HandOver(Overwriting, Verb):
             _check_writable(self.output)
 
     def run(self, output: Output) -> Report:
-        """Give pictures to another program."""
         return self.hand_over(output, time.sleep, time.monotonic)
 
     def hand_over(self, output: Output, wait: Callable[[float], None], now_s: Callable[[], float]) -> Report:

@@ -49,7 +49,6 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
     picture: Path | None = option("--picture", "draw the carriers on the spectrum", None, metavar="FILE.png")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.picture)
         profiles.camera(self.camera)
         if self.mask is None:
@@ -76,7 +75,6 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         )
 
     def run(self, output: Output) -> Report:
-        """Design mask, distance and film."""
         if self.mask:
             return self._best(self.mask)
         law, wanted = self.law or profiles.camera(self.camera).law, self._wanted()

@@ -39,12 +39,10 @@ class PredictDiffraction(Overwriting, Verb):
     beam: float = option("--beam", "diameter of the laser's beam", 2.0, unit="mm", low=0.01, high=20)
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.picture)
         profiles.mask(self.mask)
 
     def run(self, output: Output) -> Report:
-        """Predict a laser's spots."""
         known = profiles.mask(self.mask)
         found = [(i, i.landing_mm(self.wavelength, self.distance)) for i in laser_bench.impulses(known.mask)]
         verdict, others = None, list[str]()

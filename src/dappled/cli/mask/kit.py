@@ -52,12 +52,10 @@ class WriteTestKit(Overwriting, Verb):
         return masks + [self.folder / name for name in ("wedge.png", "target.png", "shots.txt", KIT)]
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         profiles.camera(self.camera)
         self.refuse_existing(*self._files())
 
     def run(self, output: Output) -> Report:
-        """Write what to print and shoot."""
         camera, chosen, folder = profiles.camera(self.camera), FILMS[self.film], self.folder
         masks = {name: Mask(self.frequency, 2, name, "linear") for name in _MASKS}
         folder.mkdir(parents=True, exist_ok=True)

@@ -64,14 +64,12 @@ class MakeMask(Overwriting, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.refuse_existing(self.output)
         self._film()
         if self.wedge is None:
             self._mask_given()
 
     def run(self, output: Output) -> Report:
-        """Write the image that goes on film."""
         chosen = self._film()
         if self.size_mm:
             chosen = chosen.cut_to(*self.size_mm)

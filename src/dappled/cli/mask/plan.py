@@ -46,13 +46,11 @@ class PlanFlight(AltitudeArguments, Verb):
     sideways: bool = flag("--sideways", "the width of the frame, not its height, lies along the flight line")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.camera_set()
         if self.mask:
             profiles.mask(self.mask)
 
     def run(self, output: Output) -> Report:
-        """Plan a flight."""
         camera, sensor, length = self.camera_set()
         columns, warnings, depth = None, list[str](), None
         if self.mask:

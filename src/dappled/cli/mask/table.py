@@ -37,11 +37,9 @@ class TabulateCarriers(InstallationArguments, Verb):
     )  # fmt: skip
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         self.installed(self.mask)
 
     def run(self, output: Output) -> Report:
-        """Print where the carriers are."""
         camera, one = self.installed(self.mask)
         only = only_length(camera)
         lengths = self.focal_length or (THESIS_FOCAL_LENGTHS_MM if only is None else (only,))

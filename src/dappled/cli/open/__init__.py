@@ -62,7 +62,6 @@ class OpenInBrowser(Verb):
     dark: str | None = option("--dark", "dark frame of raw frames", None, metavar="FILE", there=True, otherwise=_OWN)
 
     def run(self, output: Output) -> Report:
-        """Look at a flight or a light field."""
         path = example.flight() if self.path is None else self.path
         given = {name: value for name in _GIVEN if (value := getattr(self, name)) is not None}
         with ExitStack() as stack:

@@ -72,7 +72,6 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
     json: bool = flag("--json", "print one JSON object per frame")
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if (self.panel is None) != (self.reflectance is None):
             raise CallError("--panel and --reflectance belong together")
         if self.panel_file is not None and self._suffix() not in (".tif", ".tiff"):
@@ -85,7 +84,6 @@ class MakePictures(Overwriting, Doubtable, Several, FramesArguments, Verb):
         return own if own in picture_files.SUFFIXES else f".{self.kind}"
 
     def run(self, output: Output) -> Report:
-        """Make photographs without the mask's shadow."""
         recipe, found = recorded(self.frames, self.recipe()), frames(self.frames)
         panel = None if self.panel_file is None else reflectance.read(self.panel_file)
         if self.panel is not None and len(found) > 1:

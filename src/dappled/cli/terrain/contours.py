@@ -32,13 +32,11 @@ class DrawContours(Overwriting, Verb):
     smooth: float = option("--smooth", "smooth the heights by a Gaussian of this σ first", 0.0, unit="m", low=0.0)
 
     def check(self) -> None:
-        """Refuse a call that is wrong by itself."""
         if self.output.suffix.lower() not in (".geojson", ".json"):
             raise CallError(f"{self.output}: contours are written as .geojson")
         self.refuse_existing(self.output)
 
     def run(self, output: Output) -> Report:
-        """Draw lines of equal height."""
         raster = heights.read(self.raster)
         interval = self.interval or contours.interval_of(raster)
         made = contours.of(raster, interval, smooth_m=self.smooth)

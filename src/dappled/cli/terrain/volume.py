@@ -43,7 +43,6 @@ class MeasureVolume(Verb):
     )  # fmt: skip
 
     def run(self, output: Output) -> Report:
-        """How much was filled and cut."""
         before, after = heights.read(self.before), heights.read(self.after)
         area, stable = (None if one is None else areas.read(one) for one in (self.area, self.stable))
         made = volumes.between(

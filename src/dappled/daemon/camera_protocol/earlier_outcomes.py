@@ -61,7 +61,6 @@ class IndexedOutcomes:
         return (_outcome(self._left[0], self._images),)
 
     def sent(self, index: int) -> None:
-        """The outcome of this shot was sent, and is not due again."""
         self._images.note_late_report(index)
         self._left.remove(index)
 

@@ -199,7 +199,6 @@ class GroundClient:
         """Write a packet to the telemetry log. A ground client keeps no log."""
 
     def on_packet(self, packet: Packet) -> None:
-        """Take a packet that was logged, received or sent."""
         message = packet.message
         if packet.sent:
             return

@@ -38,7 +38,6 @@ class RecordedHub(Hub):
         self._end: Event = {"is": "end", "shots": dict(shots)}
 
     def listen(self, first: list[Event]) -> AsyncIterator[str]:
-        """Server-sent events for a new page: the first ones at once, a comment when there are none for a while."""
         return super().listen([*first, self._end])
 
 

@@ -124,11 +124,9 @@ class _PageRequests:
     handler: ConsoleRequests
 
     def begun(self, channel: ProcessChannel) -> None:
-        """The process was started, the first time or again."""
         channel.send(self.setup, timeout_s=5.0)
 
     def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
-        """Its next message; None where none came for 0.2 s."""
         if message is None:
             return
         answer = {**self.handler.answer(message.body), "number": message.body.get("number")}

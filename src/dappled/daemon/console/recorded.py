@@ -78,18 +78,15 @@ class FlightFrames:
 
     @property
     def start(self) -> Mapping[str, Any]:
-        """The header of the `start` message: flight, camera, mask."""
         tags = [line.tag for line in self._lines.values() if line.tag is not None]
         camera, mask = (tags[0].camera, tags[0].mask) if tags else ("", "")
         return {"flight": self._contents.name, "camera": camera, "mask": mask}
 
     @property
     def shots(self) -> Mapping[str, int]:
-        """How many shots were wished for, and how many became safe frames."""
         return {"wished": len(self._contents.lines), "safe": len(self._lines)}
 
     def frames(self) -> Sequence[ShownFrame]:
-        """All frames that have a tag, in order."""
         shown = []
         for line in self._lines.values():
             if line.tag is not None and line.frame is not None:
@@ -126,7 +123,6 @@ class FlightFrames:
         return str(self._folder.file(line.frame.name)), line.tag
 
     def light_field(self, _index: int) -> LightField | None:
-        """The frame's light field where it was decoded before; None where views are made of its slices."""
         return None
 
     def _named(self, header: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,16 +138,13 @@ class LightFieldFrames:
 
     @property
     def start(self) -> Mapping[str, Any]:
-        """The header of the `start` message: flight, camera, mask."""
         return {"flight": self._name, "camera": self._said("camera") or "", "mask": self._said("mask") or ""}
 
     @property
     def shots(self) -> Mapping[str, int]:
-        """How many shots were wished for, and how many became safe frames."""
         return {"wished": 1, "safe": 1}
 
     def frames(self) -> Sequence[ShownFrame]:
-        """All frames that have a tag, in order."""
         facts = {"utc_sigma_ns": None, "time_source": "", "exposure_s": None, "iso": None}
         return [ShownFrame({**self._facts(), **facts, "name": self._name, "size": self._size})]
 
@@ -179,7 +172,6 @@ class LightFieldFrames:
         return Message("slices", header, slices.data.cast("B"))
 
     def light_field(self, _index: int) -> LightField | None:
-        """The frame's light field where it was decoded before; None where views are made of its slices."""
         return self._field
 
     def full_size(self, _index: int) -> FullSizePicture:

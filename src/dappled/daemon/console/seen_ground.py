@@ -28,7 +28,6 @@ class _Metres:
         self._east_m = _METRES_PER_DEGREE * math.cos(math.radians(latitude_deg))
 
     def to_map(self, latitude_deg: Floats, longitude_deg: Floats) -> tuple[Floats, Floats]:
-        """East and north."""
         east = (longitude_deg - self._origin[1] + 540) % 360 - 180
         return east * self._east_m, (latitude_deg - self._origin[0]) * _METRES_PER_DEGREE
 

@@ -382,7 +382,6 @@ class Navigation:
         return self.telemetry.locate(exposure)
 
     def rates(self, pose: Pose) -> Vector3 | None:
-        """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
         return self.telemetry.rates(pose)
 
     def pose_now(self) -> Pose:

@@ -75,19 +75,15 @@ class LedgerWriter:
         self.recording.ledger.add_shot(shot)
 
     def frame(self, index: int) -> Frame | None:
-        """A frame that is safe."""
         return self.recording.ledger.frame(index)
 
     def tag(self, index: int) -> Tag | None:
-        """The tag of a frame, once known."""
         return self.recording.ledger.tag(index)
 
     def fired(self, event: Fired) -> None:
-        """The trigger call was made."""
         self.recording.ledger.fired(event.shot, event.called_monotonic_ns, event.returned_monotonic_ns)
 
     def failed(self, index: int, why: Finding) -> None:
-        """A shot will bring no frame."""
         self.recording.ledger.failed(index, why)
         self._index(index)
 
@@ -105,12 +101,10 @@ class LedgerWriter:
         return frame
 
     def follows(self, index: int, why: Finding) -> None:
-        """A shot was fired, and its file stays at the camera for now."""
         self.recording.ledger.follows(index, why)
         self._index(index)
 
     def companion(self, index: int, name: str, blob: Blob) -> None:
-        """Make a file safe that stands beside a frame."""
         recorder = self.recording.recorder
         recorder.record_companion(index, name, blob, arrived_utc_ns=self._clock.utc_ns())
         if self._sizes:
@@ -123,11 +117,9 @@ class LedgerWriter:
         return sum(sizes) / len(sizes) if sizes else None
 
     def path(self, frame: Frame) -> str:
-        """Where the frame's file stands."""
         return str(self.recording.folder.path / frame.name)
 
     def tagged(self, tag: Tag) -> None:
-        """A frame's tag is known."""
         self.recording.ledger.add_tag(tag)
 
     def law_decided(self, decision: LawDecision) -> None:
@@ -136,11 +128,9 @@ class LedgerWriter:
         self.event("law", finding(Code.DECODE_LAW_DECIDED, FRAME, why=decision.sentence), decision.first)
 
     def decoded(self, result: Result) -> None:
-        """A frame's slices are known."""
         self.recording.ledger.add_result(result)
 
     def event(self, kind: str, found: Finding, index: int | None = None) -> None:
-        """Something happened."""
         self.recording.ledger.add_event(kind, found, index)
 
     def later(self, kind: str, found: Finding) -> None:

@@ -41,14 +41,12 @@ class MissingTagWriter(ReplayVerifier):
         return frame
 
     def tagged(self, tag: Tag) -> None:
-        """A frame's tag is known."""
         super().tagged(tag)
         if self._lacks(tag.index):
             self._ledger.add_tag(tag)
             self.added.append(tag.index)
 
     def event(self, kind: str, found: Finding, index: int | None = None) -> None:
-        """Something happened."""
         if index is not None and self._lacks(index) and kind not in self._expected[index].events:
             self._ledger.add_event(kind, found, index)
 

@@ -315,7 +315,6 @@ class RecordedTelemetry:
         return time, pose
 
     def rates(self, pose: Pose) -> Vector3 | None:
-        """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
         return self._telemetry.rates(pose)
 
     def findings(self) -> list[Finding]:

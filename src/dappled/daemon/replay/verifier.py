@@ -75,12 +75,10 @@ class ReplayVerifier:
         self._differences: list[Finding] = []
 
     def frame(self, index: int) -> Frame | None:
-        """A frame that is safe."""
         one = self._expected.get(index)
         return None if one is None else one.frame
 
     def tag(self, index: int) -> Tag | None:
-        """The tag of a frame, once known."""
         return self._tags.get(index)
 
     def requested(self, shot: Shot) -> None:
@@ -90,7 +88,6 @@ class ReplayVerifier:
         """The trigger call was made."""
 
     def failed(self, index: int, why: Finding) -> None:
-        """A shot will bring no frame."""
         if self._expected[index].frame is not None:
             self._differences.append(replace(why, subject=Subject("frame", index)))
 
@@ -111,11 +108,9 @@ class ReplayVerifier:
         """Make a file safe that stands beside a frame. A replay brings frames only."""
 
     def path(self, frame: Frame) -> str:
-        """Where the frame's file stands."""
         return str(self.root / frame.name)
 
     def tagged(self, tag: Tag) -> None:
-        """A frame's tag is known."""
         one = self._expected[tag.index]
         self._tags[tag.index] = tag
         recorded = codec.plain(one.tag)
@@ -129,7 +124,6 @@ class ReplayVerifier:
         """A frame showed by which law this flight is decoded. A replay goes by what the flight decided."""
 
     def decoded(self, result: Result) -> None:
-        """A frame's slices are known."""
         if self._keep is not None:
             self._keep.decoded(result)
             self._seen[result.index].add("slices")

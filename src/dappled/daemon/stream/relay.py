@@ -79,7 +79,6 @@ class _RefusalReports:
         """The process was started, the first time or again. The process has all that it needs."""
 
     def turn(self, channel: ProcessChannel, message: ChannelMessage | None) -> None:
-        """Its next message; None where none came for 0.2 s."""
         self.refusals.settle()
         for address, reason, count in message.body.get("refused", ()) if message is not None else ():
             self.refusals.refused(finding(Code(reason), Subject("peer", str(address))), int(count))

@@ -108,18 +108,15 @@ class SigningTime:
         self._correction = correction_ns // NS_A_UNIT
 
     def monotonic_ns(self) -> int:
-        """The time of arrivals."""
         return self._clock.monotonic_ns()
 
     def oldest(self) -> int:
-        """Return the time that a stream heard for the first time must be later than."""
         with self._lock:
             if self._correction is not None:
                 return max(min(self._floor, self._started + self._correction), self._now() - NEW_STREAM_UNITS)
             return max(self._floor, max(self._used, self._accepted, self._now()) - NEW_STREAM_UNITS)
 
     def ahead(self, timestamp: int) -> int:
-        """Return by how much a time is ahead of this machine's; 0 while that is not known, or by less than a minute."""
         ahead = timestamp - self._now()
         return ahead if self._correction is not None and ahead > NEW_STREAM_UNITS else 0
 
@@ -133,7 +130,6 @@ class SigningTime:
             return self._used
 
     def accepted(self, timestamp: int) -> None:
-        """Take note of an accepted packet's timestamp."""
         with self._lock:
             self._accepted = max(self._accepted, timestamp)
 

@@ -95,7 +95,6 @@ class ComposedCamera(PlainCamera):
             self._line.use_autopilot(send)
 
     def start(self) -> None:
-        """Begin to look for the camera and to report events."""
         self.report(StateChanged("starting", "", self._clock.monotonic_ns()))
         if self._watch is None:
             self._looked.set()
@@ -124,7 +123,6 @@ class ComposedCamera(PlainCamera):
         return self._identity if self._opened else None
 
     def stop(self) -> None:
-        """Close the camera within two seconds."""
         with self._lock:
             self._stopping.set()
         self._asked.set()

@@ -131,7 +131,6 @@ class FileWatch:
             yield Noticed(finding(Code.CARD_PICTURES_LEFT, subject, pictures=len(others), first=first), now_ns)
 
     def close(self) -> None:
-        """Close the source."""
         self._source.close()
 
     # cards

@@ -65,7 +65,6 @@ class PtpSource:
         return Blob(answer.fds[0], answer.body["size"], answer.body["sha256"])
 
     def close(self) -> None:
-        """Close the source."""
         child, self._child = self._child, None
         if child is None:
             return

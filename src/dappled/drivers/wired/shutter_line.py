@@ -101,7 +101,6 @@ class GpioLine:
             raise CameraError(f"the shutter line {self._line} of {self._chip} can't be set: {error.strerror}") from None
 
     def close(self) -> None:
-        """Give the line back, released."""
         output, self._output = self._output, None
         if output is not None:
             try:
@@ -128,7 +127,6 @@ class AutopilotLine:
         self._sender: CommandSender | None = None
 
     def use_autopilot(self, send: CommandSender) -> None:
-        """Send commands by this from now on."""
         self._sender = send
 
     def open(self) -> None:
@@ -179,7 +177,6 @@ class HalfPressedLine:
         self._full, self._half, self.lead_s = full, half, lead_s
 
     def use_autopilot(self, send: CommandSender) -> None:
-        """Send commands by this from now on."""
         for line in (self._full, self._half):
             if isinstance(line, UsesAutopilot):
                 line.use_autopilot(send)
@@ -207,7 +204,6 @@ class HalfPressedLine:
         self._half.let_go()
 
     def close(self) -> None:
-        """Give the line back, released."""
         try:
             self._full.close()
         finally:
