@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from dappled.cli.stop_condition import StopCondition
-from dappled.cli.terminal import Tally
+from dappled.cli.terminal import CameraRemarks, Tally
 from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.flight import Frame
@@ -41,18 +41,16 @@ class World:
     asker: Asker = field(default_factory=Asker)
     asked: int = 0
     asks: bool = False
-    is_ready: bool = False
+    camera: CameraRemarks = field(default_factory=CameraRemarks)
     clock: RecordedClock = field(default_factory=lambda: RecordedClock(10**11))
 
-    def ready(self) -> bool:
-        return self.is_ready
-
-    def ground_station(self) -> Asker | None:
-        self.asked += self.asks
-        return self.asker if self.asks else None
+    def ground_station(self, frames: int) -> Asker:
+        self.asked += frames
+        return self.asker
 
     def condition(self, frames: int | None = None, seconds: float | None = None) -> StopCondition:
-        return StopCondition(self.tally, frames, seconds, around=self, clock=self.clock)
+        ask = self.ground_station if self.asks else None
+        return StopCondition(self.tally, frames, seconds, camera=self.camera, ask=ask, clock=self.clock)
 
 
 def test_without_a_goal_it_never_ends() -> None:
@@ -98,17 +96,20 @@ def test_the_ground_station_asks_once_and_only_a_ready_camera() -> None:
     condition.begin(Flight(0))
     assert not condition.reached()
     assert world.asked == 0
-    world.is_ready = True
+    world.camera.state = "ready"
     assert not condition.reached()
-    world.is_ready = False
+    world.camera.state = "busy"
     assert not condition.reached()
-    assert world.asked == 1
+    world.camera.state = "ready"
+    assert not condition.reached()
+    assert world.asked == 2, "once, for both frames"
 
 
 @pytest.mark.parametrize("earlier", [0, 2])
 def test_a_ground_station_that_gave_up_ends_it_when_all_it_wished_has_ended(earlier: int) -> None:
     """Requests that failed were refused, say; those of flights before have ended and count no more."""
-    world = World(asks=True, is_ready=True)
+    world = World(asks=True)
+    world.camera.state = "ready"
     condition = world.condition(frames=8)
     for index in range(earlier):
         world.tally.add(ended(index))

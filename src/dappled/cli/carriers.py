@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from dappled import codec, durable
+from dappled import codec
 from dappled.cli import paths
 from dappled.cli.frame_arguments import FRAME_HELP, RecipeArguments
 from dappled.cli.table import words_only
@@ -18,8 +17,6 @@ from dappled.errors import CallError, DappledError, counted
 from dappled.findings import FRAME, Finding, told
 
 if not words_only:
-    from PIL import Image
-
     from dappled.config import profiles
     from dappled.decode.calibration.law_search import LawSearch
     from dappled.decode.decoder import CarriersFrom
@@ -32,6 +29,7 @@ if not words_only:
     from dappled.decode.spectrum.transform import padded_shape, transform
     from dappled.drivers.raw.darkroom import Darkroom, known_to
     from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
+    from dappled.products.exports import prints
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +114,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
         else:
             plane, table = self._measured(self.frame)
             if self.picture:
-                _save(self._picture(plane, table), self.picture)
+                prints.save(self.picture, self._picture(plane, table))
         return Report(_as_json(table), _lines(table), findings=[table.doubt] if table.doubt else ())
 
     def _picture(self, plane: Plane, table: Table) -> Any:
@@ -150,7 +148,8 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
             if self.mask == profiles.LENSLET:
                 found = find_lattice(transform(plane, workers=2))
                 pairs = list(zip(found.carriers, found.measured, strict=True))
-                rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), measure_mean()), *pairs])
+                mean = Measured(0.0, 0.0, 1.0, 0.0, 1.0, False)  # which every frame has
+                rows = _both_halves([(Carrier(0, 0, 0.0, 0.0), mean), *pairs])
                 main = frozenset(found.orders) | {(0, 0)}
                 return plane, Table(
                     shape, "found", None, found.lattice, rows, main, found, "found", None, found.rotation_rad
@@ -207,16 +206,6 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
             )
 
 
-def _save(shown: Any, path: Path) -> None:
-    """Write a picture, whole or not at all, in the form that its name says. Raises DappledError and OSError."""
-    coded = io.BytesIO()
-    try:
-        Image.fromarray(shown).save(coded, Image.registered_extensions()[path.suffix.lower()])
-    except KeyError:
-        raise DappledError(f"{path}: no picture is written under such a name; end it in .png") from None
-    durable.write_file(path, coded.getvalue())
-
-
 def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
     """The spectrum with a box around each slice, uint8 RGB (Figs 36, 41, 42)."""
     half = [(c, m) for c, m in table.rows if (c.ky, c.kx) >= (0, 0) and c.on_sensor]
@@ -230,11 +219,6 @@ def picture(plane: Plane, table: Table, look: Look = "magnitude") -> Any:
         measured=[m for _, m in half],
         look=look,
     )
-
-
-def measure_mean() -> Measured:
-    """The mean of a frame, which every frame has."""
-    return Measured(0.0, 0.0, 1.0, 0.0, 1.0, False)
 
 
 def _both_halves(half: Sequence[tuple[Carrier, Measured | None]]) -> list[tuple[Carrier, Measured | None]]:
@@ -253,10 +237,7 @@ def _as_json(table: Table) -> dict[str, Any]:
     for carrier, seen in table.rows:
         row, column = carrier.index(table.shape)
         entry: dict[str, Any] = {
-            "ky": carrier.ky,
-            "kx": carrier.kx,
-            "fy": carrier.fy,
-            "fx": carrier.fx,
+            **codec.plain(carrier),
             "row": row,
             "col": column,
             "main": (carrier.ky, carrier.kx) in table.main or (-carrier.ky, -carrier.kx) in table.main,
@@ -265,16 +246,7 @@ def _as_json(table: Table) -> dict[str, Any]:
         }
         if seen is not None:
             at = Carrier(carrier.ky, carrier.kx, seen.fy, seen.fx).index(table.shape)
-            entry["measured"] = {
-                "fy": seen.fy,
-                "fx": seen.fx,
-                "row": at[0],
-                "col": at[1],
-                "strength": seen.strength,
-                "phase_rad": seen.phase_rad,
-                "phase_pattern": seen.phase_pattern,
-                "suspect": seen.suspect,
-            }
+            entry["measured"] = {**codec.plain(seen), "row": at[0], "col": at[1]}
         carriers.append(entry)
     whole: dict[str, Any] = {
         "shape": list(table.shape),

@@ -27,7 +27,7 @@ from dappled.errors import DappledError, sentence
 from dappled.key_files import KeyFileError
 
 if not words_only:
-    from dappled.cli.stop_condition import Asker, StopCondition
+    from dappled.cli.stop_condition import StopCondition
     from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
     from dappled.daemon import settings_check
     from dappled.daemon.flight_handover import FlightHandover, flights
@@ -119,28 +119,13 @@ class RunPlan:
     as_json: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class RunSurroundings:
-    """The camera, as it was reported last, and what is simulated around it; `frames` are asked for."""
-
-    camera: CameraRemarks
-    simulation: Simulation | None
-    frames: int | None
-
-    def ready(self) -> bool:
-        return self.camera.state == "ready"
-
-    def ground_station(self) -> Asker | None:
-        return self.simulation.ground_station(self.frames) if self.simulation and self.frames else None
-
-
 def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> int:
     """Run the daemon, flight after flight, until a signal, --frames or --for ends it."""
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
     frames = FrameLines(as_json=plan.as_json)
     asked, hung_up = threading.Event(), threading.Event()
-    around = RunSurroundings(camera, simulation, plan.frames)
-    goal = StopCondition(tally, plan.frames, plan.seconds, around=around, clock=SystemClock())
+    ask = None if simulation is None else simulation.ground_station
+    goal = StopCondition(tally, plan.frames, plan.seconds, camera=camera, ask=ask, clock=SystemClock())
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
         """Run one flight. Returns whether another may follow."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
-from dappled.cli.terminal import Tally
+from dappled.cli.terminal import CameraRemarks, Tally
 from dappled.clock import Clock
 
 
@@ -13,16 +14,6 @@ class Asker(Protocol):
 
     def running(self) -> bool:
         """Whether it still asks, or waits for an answer."""
-
-
-class Surroundings(Protocol):
-    """What a run has around it: a camera, and perhaps a simulated ground station."""
-
-    def ready(self) -> bool:
-        """Whether the camera is ready."""
-
-    def ground_station(self) -> Asker | None:
-        """Start the ground station that asks for the frames; None where there is none to start."""
 
 
 class BegunFlight(Protocol):
@@ -36,8 +27,8 @@ class BegunFlight(Protocol):
 class StopCondition:
     """The end of a run: `frames` shots have ended, or `seconds` have passed since the first flight began.
 
-    None means no such end. Where frames are wanted, a ground station that asks for them is started once the camera is
-    ready. The run ends when it has no more requests to send and all of its shots have ended.
+    None means no such end. Where frames are wanted, a ground station that asks for them (`ask`) is started once the
+    `camera` is ready. The run ends when it has no more requests to send and all of its shots have ended.
     """
 
     def __init__(
@@ -46,11 +37,12 @@ class StopCondition:
         frames: int | None,
         seconds: float | None,
         *,
-        around: Surroundings,
+        camera: CameraRemarks,
+        ask: Callable[[int], Asker] | None,
         clock: Clock,
     ) -> None:
         self._tally, self._frames, self._seconds = tally, frames, seconds
-        self._around, self._clock = around, clock
+        self._camera, self._ask, self._clock = camera, ask, clock
         self._until_ns: int | None = None
         self._asker: Asker | None = None
         self._flight: BegunFlight | None = None
@@ -73,8 +65,8 @@ class StopCondition:
             return True
         if self._frames is None:
             return False
-        if self._asker is None and self._around.ready():
-            self._asker = self._around.ground_station()
+        if self._ask is not None and self._asker is None and self._camera.state == "ready":
+            self._asker = self._ask(self._frames)
         if self._tally.count >= self._frames:
             return True
         requested = self._earlier + (0 if self._flight is None else self._flight.requested)

@@ -15,7 +15,6 @@ from dappled.findings import told
 
 if not words_only:
     import numpy as np
-    from PIL import Image
 
     from dappled.config import profiles
     from dappled.decode import DecodeError
@@ -23,6 +22,7 @@ if not words_only:
     from dappled.decode.optics.film import FILMS
     from dappled.decode.optics.mask_design import DESIGNS, Design, DesignRequirements, buildable
     from dappled.decode.spectrum import pictures
+    from dappled.products.exports import prints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +81,7 @@ class DesignMask(Overwriting, AltitudeArguments, InstallationArguments, Verb):
         made = DESIGNS[law](wanted)
         instead = None if made.works else buildable(wanted, law)
         if self.picture:
-            Image.fromarray(_picture(made)).save(self.picture)
+            prints.save(self.picture, _picture(made))
         values = {**_as_json(made), "buildable": None if instead is None else _as_json(instead)}
         return Report(values, _lines(made, instead), failed=not made.works)
 

@@ -12,13 +12,12 @@ from dappled.cli.verb import Output, Overwriting, Report, Verb, option
 
 if not words_only:
     import numpy as np
-    from PIL import Image
 
     from dappled.config import profiles
     from dappled.config.profiles import MaskProfile
     from dappled.decode.optics import laser_bench
     from dappled.decode.optics.film import FILMS, MaskImage
-    from dappled.products.exports import mask_files
+    from dappled.products.exports import mask_files, prints
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +54,7 @@ class PredictDiffraction(Overwriting, Verb):
         if self.picture:
             screen = self._screen(known)
             bright = np.sqrt(screen.intensity / screen.intensity.max())
-            Image.fromarray(np.rint(255 * np.clip(4 * bright, 0, 1)).astype(np.uint8)).save(self.picture)
+            prints.save(self.picture, np.rint(255 * np.clip(4 * bright, 0, 1)).astype(np.uint8))
             half = screen.intensity.shape[1] / 2 * screen.pitch_mm[1]
             output.remark(f"{self.picture}: the wall from {-half:.1f} to {half:.1f} mm")
         values = {
