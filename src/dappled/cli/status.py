@@ -5,8 +5,6 @@ from __future__ import annotations
 import os
 import pwd
 import re
-import socket
-import struct
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -23,6 +21,7 @@ from dappled.findings import above_note, told
 if not words_only:
     from dappled.daemon.health.record import four_numbers
     from dappled.daemon.health.standing import ALL_IS_WELL, in_record
+    from dappled.daemon.stream import sockets
     from dappled.daemon.stream.subscriber import Subscriber
     from dappled.daemon.stream.wire import WireError
 
@@ -94,17 +93,7 @@ def is_listening(endpoint: str) -> bool:
 
 def _listener(endpoint: str) -> int | None:
     """The user id of who listens on an ipc endpoint; None where nobody does, and for any other endpoint."""
-    if not endpoint.startswith("ipc://"):
-        return None
-    with socket.socket(socket.AF_UNIX) as probe:
-        probe.settimeout(1.0)
-        try:
-            probe.connect(endpoint.removeprefix("ipc://"))
-            facts = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
-        except OSError:
-            return None
-    _, user, _ = struct.unpack("3i", facts)
-    return int(user)
+    return sockets.listener(endpoint.removeprefix("ipc://")) if endpoint.startswith("ipc://") else None
 
 
 def stranger(endpoint: str) -> str | None:

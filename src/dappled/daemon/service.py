@@ -24,7 +24,7 @@ from dappled.config.settings import Settings
 from dappled.daemon.body_plan import BodyPlan
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera
 from dappled.daemon.camera_protocol.component import Component
-from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes
+from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.configured_links import configured_links
@@ -271,7 +271,7 @@ class Service:
             shutter,
             parameters,
             model=control,
-            earlier=IndexedOutcomes(recording.index),
+            earlier=EarlierOutcomes(recording.index),
             series=distance,
         )
         decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)

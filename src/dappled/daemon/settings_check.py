@@ -26,11 +26,7 @@ from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.errors import DappledError
 from dappled.findings import told
-from dappled.flight import seal_key
-
-
-def _none(_: Settings) -> tuple[str, ...]:
-    return ()
+from dappled.flight import layout, seal_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +43,7 @@ class SettingsRule:
     check: Callable[[Settings], object]
     reads: tuple[str, ...] = ()
     may_come: bool = False
-    secrets: Callable[[Settings], tuple[str, ...]] = _none
+    secrets: Callable[[Settings], tuple[str, ...]] = lambda _: ()
 
     def depends_on_user(self, settings: Settings) -> bool:
         """Whether this user can't tell."""
@@ -150,13 +146,8 @@ def _link_keys(settings: Settings) -> None:
         read_key(key)
 
 
-def _nearest(folder: Path) -> Path:
-    """The folder, or the one above it that exists already."""
-    return next(one for one in (folder, *folder.parents) if os.path.exists(one))
-
-
 def _directory(settings: Settings) -> None:
-    place = _nearest(Path(settings.record.directory))
+    place = layout.existing(Path(settings.record.directory))
     if not place.is_dir():
         raise ConfigError(f"{place} is not a folder: move it away, or set record.directory")
 
@@ -194,14 +185,9 @@ def _calibration(settings: Settings) -> None:
         raise ConfigError(str(told(wrong)))
 
 
-def _white(settings: Settings) -> None:
-    if settings.decode.white and settings.mask.profile:
-        reading.read_metadata(Path(settings.decode.white))
-
-
-def _dark(settings: Settings) -> None:
-    if settings.decode.dark and settings.mask.profile:
-        reading.read_metadata(Path(settings.decode.dark))
+def _frame(settings: Settings, name: str) -> None:
+    if name and settings.mask.profile:
+        reading.read_metadata(Path(name))
 
 
 def _stream(settings: Settings) -> None:
@@ -244,8 +230,8 @@ RULES: tuple[SettingsRule, ...] = (
     SettingsRule("record.directory", _directory),
     SettingsRule("record.seal_key", _seal, secrets=lambda settings: (settings.record.seal_key,)),
     SettingsRule("decode.calibration", _calibration, ("camera.profile", "mask.profile", "decode.law")),
-    SettingsRule("decode.white", _white, ("mask.profile",)),
-    SettingsRule("decode.dark", _dark, ("mask.profile",)),
+    SettingsRule("decode.white", lambda settings: _frame(settings, settings.decode.white), ("mask.profile",)),
+    SettingsRule("decode.dark", lambda settings: _frame(settings, settings.decode.dark), ("mask.profile",)),
     SettingsRule("publish.slices", _stream, ("publish.keys",)),
     SettingsRule("publish.ask", _ask, ("publish.keys",)),
     SettingsRule(

@@ -235,6 +235,11 @@ def disk_space(path: Path) -> DiskSpace:
     return DiskSpace(total, total - free, available, disk.f_favail if disk.f_files else None)
 
 
+def existing(folder: Path) -> Path:
+    """The folder, or the one above it that is there already, as far as this user may look."""
+    return next(one for one in (folder, *folder.parents) if os.path.exists(one))
+
+
 def write_facts(folder: FlightFolder, facts: Mapping[str, Any]) -> None:
     """Replace flight.toml, whole or not at all. TOML has no null: None values are left out.
 

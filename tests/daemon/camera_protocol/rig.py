@@ -13,6 +13,7 @@ from dappled.clock import Clock, RecordedClock, SystemClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import Telemetry
@@ -27,8 +28,11 @@ from tests.daemon.fakes import Nowhere
 from tests.waiting import eventually
 
 
-class NothingEarlier:
+class NothingEarlier(EarlierOutcomes):
     """No outcome of an earlier flight is left to report."""
+
+    def __init__(self) -> None:
+        pass
 
     def summary(self) -> None:
         """Nothing was lost."""

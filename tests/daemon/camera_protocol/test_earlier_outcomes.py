@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dappled.clock import RecordedClock
-from dappled.daemon.camera_protocol.earlier_outcomes import IndexedOutcomes, numbers
+from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes, numbers
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 from dappled.flight import Recording, recording
 from tests.daemon.camera_protocol.test_component import Rig
@@ -35,7 +35,7 @@ def flown(flights: Path) -> Recording:
 
 def restarted(flights: Path, at_s: int) -> tuple[Recording, Rig]:
     after = recording.begin(flights, RecordedClock(START_UTC_NS + at_s * 10**9))
-    return after, Rig(earlier=IndexedOutcomes(after.index))
+    return after, Rig(earlier=EarlierOutcomes(after.index))
 
 
 def reported(messages: list[MavlinkMessage]) -> list[tuple[int, int, str]]:

@@ -119,7 +119,7 @@ def test_a_lost_message_is_asked_for_and_had(endpoint: str) -> None:
         connected(one, subscriber)
         one.publish("slices", {"frame": 40, "arrays": []}, b"")
         assert receive(subscriber, "slices").header["frame"] == 40
-        subscriber._gaps._next["f"] = 0  # as if the first had been number 0 and lost on the way
+        subscriber._next["f"] = 0  # as if the first had been number 0 and lost on the way
         one.publish("slices", {"frame": 41, "arrays": []}, b"")
         assert receive(subscriber, "slices").header["frame"] == 41
         answer_ = receive(subscriber, "slices")

@@ -7,7 +7,6 @@ import threading
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 from dappled import findings
 from dappled.clock import Clock
@@ -15,7 +14,7 @@ from dappled.daemon.camera_protocol.camera_status import STORAGE_ID, ZOOM, Camer
 from dappled.daemon.camera_protocol.parameters import Parameters, unsigned_refusal
 from dappled.daemon.pipeline.repeats import CaptureRequest, RecentRequests
 from dappled.daemon.pipeline.shutter import CANNOT_FIRE, ShotDecision, Shutter
-from dappled.daemon.pipeline.spacing import Spacing
+from dappled.daemon.pipeline.spacing import DistanceTrigger, Spacing
 from dappled.drivers.camera import CameraError
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -141,19 +140,6 @@ class CommandAnswer:
 _NOT_OURS = CommandAnswer(DENIED)  # a broadcast to a camera that something else fires: it is left alone, unanswered
 
 
-class DistanceSeries(Protocol):
-    """Photographs by distance (see `DistanceTrigger`)."""
-
-    def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None:
-        """Take photographs by distance, in place of a running series; the first one spacing away, or `at_once`."""
-
-    def begin_configured(self, source: str) -> bool:
-        """Begin the series of the settings; False where they have none."""
-
-    def end(self) -> object:
-        """End a running series, from any source; one that began after `asked_ns` (monotonic) goes on."""
-
-
 class MessageIntervals:
     """The messages that were asked for at an interval (MAV_CMD_SET_MESSAGE_INTERVAL).
 
@@ -207,7 +193,7 @@ class CameraCommands:
         parameters: Parameters,
         *,
         intervals: MessageIntervals,
-        series: DistanceSeries,
+        series: DistanceTrigger,
         component_id: int,
     ) -> None:
         self._series, self._component_id = series, component_id

@@ -21,7 +21,6 @@ from dappled.daemon.camera_protocol.commands import (
     CameraCommands,
     Command,
     CommandAnswer,
-    DistanceSeries,
     MessageIntervals,
 )
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
@@ -33,6 +32,7 @@ from dappled.daemon.health.status_text import GroundStations, PilotMessages
 from dappled.daemon.navigation.samples import CAPTURED, image_number, sent_us
 from dappled.daemon.pipeline.repeats import CaptureRequest, PacketDedup
 from dappled.daemon.pipeline.shutter import Shutter
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.drivers.mavlink import MavlinkMessage, Packet, is_for, mavlink
 from dappled.drivers.mavlink.log_budget import Rate
 from dappled.findings import Code, Finding, Subject, Value, finding, told
@@ -151,7 +151,7 @@ class Component:
         *,
         model: CameraModel,
         earlier: EarlierOutcomes,
-        series: DistanceSeries,
+        series: DistanceTrigger,
     ) -> None:
         links, clock = autopilot.links, shutter.clock
         self._links, self._autopilot, self._identity = links, autopilot, autopilot.identity

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Protocol
 
 from dappled.daemon.camera_protocol.camera_status import Captured, captured_image
 from dappled.errors import counted
@@ -14,21 +13,8 @@ PACE_NS = 100_000_000
 _NAMED = 8
 
 
-class EarlierOutcomes(Protocol):
-    """The outcomes that are still to be reported, as `Component` sends them. Each call may read a disk."""
-
-    def summary(self) -> str | None:
-        """A sentence that counts the lost photographs among them; None where no new one was lost. Once for each."""
-
-    def due(self, now_ns: int) -> Sequence[Captured]:
-        """The outcomes to send now. Time is monotonic."""
-
-    def sent(self, index: int) -> None:
-        """The outcome of this shot was sent, and is not due again."""
-
-
-class IndexedOutcomes:
-    """The unreported outcomes in the index over all flights, the oldest first, ten a second.
+class EarlierOutcomes:
+    """The unreported outcomes in the index over all flights, the oldest first, ten a second. Each call may read a disk.
 
     The shots stand in the index until each is sent, so a second crash neither loses nor repeats a report. (If the
     process is killed in the 0.1 ms between sending and noting that, one is sent twice.)
@@ -61,6 +47,7 @@ class IndexedOutcomes:
         return (_outcome(self._left[0], self._images),)
 
     def sent(self, index: int) -> None:
+        """The outcome of this shot was sent, and is not due again."""
         self._images.note_late_report(index)
         self._left.remove(index)
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from html import escape  # that of xml.sax loads urllib, SSL and e-mail
 from typing import Protocol
 
-from dappled.drivers.camera import CameraError, Setting, SettingName
+from dappled.drivers.camera import BodySettings, CameraError, SettingName
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
 TYPE = mavlink.MAV_PARAM_EXT_TYPE_UINT32
@@ -57,18 +57,10 @@ class OwnParameters(Protocol):
         """Take one of the choices of one of them; it has it at once. Raises CameraError."""
 
 
-class BodyParameters(Protocol):
-    """The part of a camera driver that is needed here; see `drivers.camera.BodySettings`."""
-
-    def settings(self) -> tuple[Setting, ...]: ...
-
-    def change(self, name: SettingName, value: str) -> None: ...
-
-
 class Parameters:
     """All settings of a camera, as known in memory: the body's and those of dappled itself."""
 
-    def __init__(self, body: BodyParameters, own: Sequence[OwnParameters] = (), *, unsigned: bool = False) -> None:
+    def __init__(self, body: BodySettings, own: Sequence[OwnParameters] = (), *, unsigned: bool = False) -> None:
         """`unsigned`: strangers may set everything (`mavlink.unsigned_parameters`)."""
         self._body, self._own, self._unsigned = body, own, unsigned
 

@@ -137,7 +137,7 @@ def _opened(settings: Settings, last: StateChanged | None) -> Finding:
 def disk(settings: Settings, machine: Machine) -> list[Finding]:
     """The folder where flights are recorded."""
     folder = Path(settings.record.directory)
-    place = next(one for one in (folder, *folder.parents) if os.path.exists(one))  # False without permission to look
+    place = layout.existing(folder)
     if not os.access(place, os.W_OK):
         return [finding(Code.DISK_CLOSED, DISK, place=str(place), folder=str(folder))]
     space = layout.disk_space(place)

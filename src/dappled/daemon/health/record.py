@@ -283,14 +283,8 @@ def _counters(link: LinkStatistics, now_ns: int) -> dict[str, Any]:
 
 
 def _publish(publisher: PublisherStatistics) -> dict[str, Any]:
-    return {
-        "name": "publish",
-        "sent": dict(publisher.sent),
-        "dropped": dict(publisher.dropped),
-        "questions": publisher.questions,
-        "refused": publisher.refused,
-        "wrong_keys": publisher.wrong_keys,
-    }
+    """Its counters; what waits is told by the other stages alone, whose work it is."""
+    return {"name": "publish"} | {name: value for name, value in codec.plain(publisher).items() if name != "waiting"}
 
 
 def _place(pose: Pose) -> dict[str, float | None]:

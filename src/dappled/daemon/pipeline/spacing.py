@@ -161,6 +161,7 @@ class DistanceTrigger(OneThread):
         self._wake.set()
 
     def begin_configured(self, source: str) -> bool:
+        """Begin the series of the settings; False where they have none."""
         if self._configured is None:
             return False
         self.begin(self._configured, source)

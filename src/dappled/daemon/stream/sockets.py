@@ -34,6 +34,7 @@ _HEARTBEAT_MS, _DEAF_MS = 5_000, 30_000  # a peer that reads nothing for so long
 _PATH_BYTES = 107  # of sockaddr_un
 _BEGIN_S = 10.0
 _OWN_MODE = 0o600
+_PEER = struct.Struct("3i")  # of unix(7): process, user, group
 _EVENT = struct.Struct("=HI")  # of a monitor: its kind and value; zmq.utils.monitor, which reads it too, loads asyncio
 
 
@@ -179,7 +180,7 @@ def bind(one: zmq.Socket[Any], endpoint: str, *, keys: ServerKeys | None = None,
     Raises WireError where it is in use or can't be bound.
     """
     path = endpoint.removeprefix("ipc://")
-    if _answers(path):
+    if listener(path) is not None:  # ZeroMQ would replace it silently
         raise WireError(f"{endpoint} is in use by another program; stop it, or choose another endpoint")
     one.curve_server = keys is not None
     if keys is not None:
@@ -225,15 +226,16 @@ def _prepare_folder(folder: Path, endpoint: str) -> None:
         raise WireError(f"{endpoint}: {folder} belongs to another user; choose another endpoint")
 
 
-def _answers(path: str) -> bool:
-    """Whether a program listens on this UNIX socket: ZeroMQ would replace it silently."""
+def listener(path: str) -> int | None:
+    """The user id of the program that listens on this UNIX socket; None where none does."""
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1)
         try:
             probe.connect(path)
+            facts = probe.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
         except OSError:
-            return False
-        return True
+            return None
+    return int(_PEER.unpack(facts)[1])
 
 
 def _give_room(descriptor: int) -> None:

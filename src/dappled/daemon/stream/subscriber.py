@@ -103,7 +103,7 @@ class Gaps:
         return found
 
 
-class _SubscriberCore:
+class _SubscriberCore(Gaps):
     """What `Subscriber` and `AsyncSubscriber` share: a SUB for the stream, a DEALER for questions, and the counters.
 
     A call of a socket returns a value with one and an awaitable with the other. `_receive` yields what the call
@@ -130,8 +130,8 @@ class _SubscriberCore:
         With `from_start` the slices that a flight sent before count as a gap too. `keys` are for a tcp endpoint with
         CURVE. Raises WireError for an invalid endpoint.
         """
+        super().__init__(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
         self.ended = False
-        self._gaps = Gaps(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
         self._zmq = self._context()
         self._poller = self._poller_of()
         self._sub = self._zmq.socket(zmq.SUB)
@@ -147,31 +147,6 @@ class _SubscriberCore:
         except WireError:
             self.close()
             raise
-
-    @property
-    def gaps(self) -> int:
-        """Slices that were missed."""
-        return self._gaps.gaps
-
-    @property
-    def recovered(self) -> int:
-        """Missed slices that came when they were asked for."""
-        return self._gaps.recovered
-
-    @property
-    def lost(self) -> int:
-        """Missed slices that were given up."""
-        return self._gaps.lost
-
-    @property
-    def unsent(self) -> int:
-        """Slices that the sender dropped: no message holds them, the flight does."""
-        return self._gaps.unsent
-
-    @property
-    def waiting_for(self) -> int:
-        """How many answers are outstanding."""
-        return self._gaps.waiting_for
 
     @property
     def finished(self) -> bool:
@@ -194,7 +169,7 @@ class _SubscriberCore:
     def _receive(self, timeout_s: float) -> _Steps:
         deadline = time.monotonic() + timeout_s
         while True:
-            for question in self._gaps.questions(time.monotonic()):
+            for question in self.questions(time.monotonic()):
                 yield self._send(question)
             left = max(0.0, deadline - time.monotonic())
             ready = dict((yield self._poller.poll(round(min(left, _LOOK_S) * 1000))))
@@ -202,7 +177,7 @@ class _SubscriberCore:
                 if one is not None and one in ready:
                     message = wire.decode([part.buffer for part in (yield one.recv_multipart(copy=False))])
                     self._take(message, answered=one is self._dealer)
-                    for question in self._gaps.questions(time.monotonic()):
+                    for question in self.questions(time.monotonic()):
                         yield self._send(question)
                     return message
             if time.monotonic() >= deadline:
@@ -210,9 +185,9 @@ class _SubscriberCore:
 
     def _take(self, message: Message, *, answered: bool) -> None:
         if answered:
-            self._gaps.answered(message)
+            self.answered(message)
         else:
-            self._gaps.received(message)
+            self.received(message)
             self.ended = self.ended or message.topic == "end"
 
 
