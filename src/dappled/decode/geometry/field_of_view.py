@@ -33,7 +33,7 @@ def look(
     if pose is None or head is None:
         return None, None
     right, down, forward = (turned(head, (mount[at], mount[3 + at], mount[6 + at])) for at in range(3))
-    attitude = _quaternion((forward, right, down))
+    attitude = quaternion((forward, right, down))
     known = (pose.latitude_rad, pose.longitude_rad, pose.altitude_msl_m, pose.height_above_home_m)
     latitude, longitude, altitude, height = known
     if latitude is None or longitude is None or altitude is None or height is None:
@@ -50,7 +50,7 @@ def look(
     )
 
 
-def _quaternion(axes: tuple[Vector3, Vector3, Vector3]) -> Quaternion:
+def quaternion(axes: Sequence[Vector3]) -> Quaternion:
     """The rotation whose matrix has these columns (Shepperd: the largest of four decides, so nothing cancels)."""
     (m00, m10, m20), (m01, m11, m21), (m02, m12, m22) = axes
     fours = (1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22)

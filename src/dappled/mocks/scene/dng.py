@@ -10,10 +10,11 @@ import struct
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from fractions import Fraction
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dappled.products.geotags.exif_gps import Entry, directory, text_entry
 
 BYTE, ASCII, SHORT, LONG, RATIONAL, UNDEFINED, SRATIONAL = 1, 2, 3, 4, 5, 7, 10
 COLOUR_FILTERS, LINEAR_RAW = 32803, 34892
@@ -37,13 +38,6 @@ class Exif:
     taken_utc_ns: int
 
 
-class _Entry(NamedTuple):
-    tag: int
-    kind: int
-    values: int
-    data: bytes
-
-
 def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif, mono: bool = False) -> bytes:
     """A DNG file of an RGGB plane (H, W), or of one without colours. Raises ValueError for a plane of another shape."""
     if raw.ndim != 2 or raw.shape[0] % 2 or raw.shape[1] % 2:
@@ -51,7 +45,7 @@ def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif, mono:
     height, width = raw.shape
     taken = datetime.fromtimestamp(exif.taken_utc_ns // 1_000_000_000, UTC).strftime("%Y:%m:%d %H:%M:%S")
 
-    def folder(strip: int, exif_at: int) -> list[_Entry]:
+    def folder(strip: int, exif_at: int) -> list[Entry]:
         entries = [
             _numbers(254, LONG, 0),  # NewSubfileType: the main image
             _numbers(256, LONG, width),
@@ -59,23 +53,23 @@ def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif, mono:
             _numbers(258, SHORT, 16),  # BitsPerSample
             _numbers(259, SHORT, 1),  # Compression: none
             _numbers(262, SHORT, LINEAR_RAW if mono else COLOUR_FILTERS),  # Photometric
-            _text(271, exif.make),
-            _text(272, exif.model),
+            text_entry(271, exif.make),
+            text_entry(272, exif.model),
             _numbers(273, LONG, strip),
             _numbers(274, SHORT, 1),  # Orientation
             _numbers(277, SHORT, 1),  # SamplesPerPixel
             _numbers(278, LONG, height),  # RowsPerStrip
             _numbers(279, LONG, raw.size * 2),  # StripByteCounts
             _numbers(284, SHORT, 1),  # PlanarConfiguration
-            _text(305, "dappled simulator"),
-            _text(306, taken),
+            text_entry(305, "dappled simulator"),
+            text_entry(306, taken),
             _numbers(33421, SHORT, 2, 2),  # CFARepeatPatternDim
-            _Entry(33422, BYTE, 4, RGGB),  # CFAPattern
+            (33422, BYTE, 4, RGGB),  # CFAPattern
             _numbers(34665, LONG, exif_at),  # the EXIF folder
-            _Entry(50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
-            _Entry(50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
-            _text(50708, f"{exif.make} {exif.model}"),  # UniqueCameraModel
-            _Entry(50710, BYTE, 3, bytes((0, 1, 2))),  # CFAPlaneColor
+            (50706, BYTE, 4, bytes((1, 4, 0, 0))),  # DNGVersion
+            (50707, BYTE, 4, bytes((1, 1, 0, 0))),  # DNGBackwardVersion
+            text_entry(50708, f"{exif.make} {exif.model}"),  # UniqueCameraModel
+            (50710, BYTE, 3, bytes((0, 1, 2))),  # CFAPlaneColor
             _numbers(50711, SHORT, 1),  # CFALayout: rectangular
             _numbers(50714, SHORT, black),
             _numbers(50717, SHORT, white),
@@ -83,50 +77,31 @@ def encode(raw: NDArray[np.uint16], *, black: int, white: int, exif: Exif, mono:
             _fractions(50728, RATIONAL, *(Fraction(1),) * 3),  # AsShotNeutral
             _numbers(50778, SHORT, 21),  # CalibrationIlluminant1: D65
         ]
-        return [entry for entry in entries if not (mono and entry.tag in _OF_COLOUR)]
+        return [entry for entry in entries if not (mono and entry[0] in _OF_COLOUR)]
 
     shot = [
         _fractions(33434, RATIONAL, Fraction(exif.exposure_s).limit_denominator(100_000)),
         _fractions(33437, RATIONAL, Fraction(round(exif.f_number * 100), 100)),
         _numbers(34855, SHORT, exif.iso),
-        _Entry(36864, UNDEFINED, 4, b"0230"),  # ExifVersion
-        _text(36867, taken),  # DateTimeOriginal
-        _text(36868, taken),  # DateTimeDigitized
+        (36864, UNDEFINED, 4, b"0230"),  # ExifVersion
+        text_entry(36867, taken),  # DateTimeOriginal
+        text_entry(36868, taken),  # DateTimeDigitized
         _fractions(37386, RATIONAL, Fraction(round(exif.focal_length_mm * 10), 10)),
-        _text(42033, exif.serial),  # BodySerialNumber
+        text_entry(42033, exif.serial),  # BodySerialNumber
     ]
     first = 8
-    exif_at = first + len(_folder(folder(0, 0), first))
-    strip = exif_at + len(_folder(shot, exif_at))
+    exif_at = first + len(directory("<", first, folder(0, 0)))
+    exif_folder = directory("<", exif_at, shot)
+    strip = exif_at + len(exif_folder)
     strip += -strip % 16
-    head = struct.pack("<2sHI", b"II", 42, first) + _folder(folder(strip, exif_at), first) + _folder(shot, exif_at)
+    head = struct.pack("<2sHI", b"II", 42, first) + directory("<", first, folder(strip, exif_at)) + exif_folder
     return b"".join((head.ljust(strip, b"\0"), raw.astype("<u2", copy=False).tobytes()))
 
 
-def _numbers(tag: int, kind: int, *values: int) -> _Entry:
-    return _Entry(tag, kind, len(values), struct.pack(f"<{len(values)}{'H' if kind == SHORT else 'I'}", *values))
+def _numbers(tag: int, kind: int, *values: int) -> Entry:
+    return (tag, kind, len(values), struct.pack(f"<{len(values)}{'H' if kind == SHORT else 'I'}", *values))
 
 
-def _fractions(tag: int, kind: int, *values: Fraction) -> _Entry:
+def _fractions(tag: int, kind: int, *values: Fraction) -> Entry:
     sign = "i" if kind == SRATIONAL else "I"
-    return _Entry(
-        tag, kind, len(values), b"".join(struct.pack(f"<2{sign}", v.numerator, v.denominator) for v in values)
-    )
-
-
-def _text(tag: int, value: str) -> _Entry:
-    data = value.encode("ascii") + b"\0"
-    return _Entry(tag, ASCII, len(data), data)
-
-
-def _folder(entries: list[_Entry], at: int) -> bytes:
-    """A TIFF directory for offset `at`, followed by its longer values."""
-    head, tail = struct.pack("<H", len(entries)), b""
-    behind = at + 2 + 12 * len(entries) + 4
-    for entry in entries:
-        value = entry.data
-        if len(value) > 4:
-            value = struct.pack("<I", behind + len(tail))
-            tail += entry.data + b"\0" * (len(entry.data) % 2)
-        head += struct.pack("<HHI", entry.tag, entry.kind, entry.values) + value.ljust(4, b"\0")
-    return head + b"\0\0\0\0" + tail
+    return (tag, kind, len(values), b"".join(struct.pack(f"<2{sign}", v.numerator, v.denominator) for v in values))

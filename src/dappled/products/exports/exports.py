@@ -10,8 +10,6 @@ from __future__ import annotations
 import configparser
 import math
 import os
-import struct
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +21,7 @@ from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
 from dappled.errors import DappledError
+from dappled.products import png_files
 from dappled.products.exports import point_cloud, prints
 from dappled.products.extras import need
 from dappled.products.whole_files import whole
@@ -83,7 +82,7 @@ def eslf(path: Path, field: LightField, lenslet_px: int = 0) -> None:
     if beside.exists():
         raise DappledError(f"{beside} exists already; choose another name")
     with whole(path, fresh=True) as part:
-        _png16(part, flat)
+        png_files.write(part, (flat.shape[0], flat.shape[1]), 16, [flat], rgb=bool(colours), effort=4)
     note = f"lenslet_px = {side}\nviews = {count_v} x {count_u}\nwhite = {white:.6g}\n"
     with whole(beside, fresh=True) as part:
         part.write_text(note, encoding="utf-8")
@@ -181,22 +180,6 @@ def _sixteen_bits(views: NDArray[np.float32]) -> tuple[NDArray[np.uint16], float
     white = prints.white_of([views])
     made = np.rint(65535 * np.clip(np.nan_to_num(views) / white, 0, 1)).astype(np.uint16)
     return made, white
-
-
-def _png16(path: Path, values: NDArray[np.uint16]) -> None:
-    """A 16-bit PNG, grey or RGB."""
-    height, width = values.shape[:2]
-    kind = 2 if values.ndim == 3 else 0
-    lines = values.astype(">u2").reshape(height, -1).view(np.uint8)
-    raw = np.concatenate([np.zeros((height, 1), np.uint8), lines], axis=1).tobytes()
-    with path.open("wb") as file:
-        file.write(b"\x89PNG\r\n\x1a\n")
-        for name, data in (
-            (b"IHDR", struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)),
-            (b"IDAT", zlib.compress(raw, 4)),
-            (b"IEND", b""),
-        ):
-            file.write(struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)))
 
 
 def rerun(

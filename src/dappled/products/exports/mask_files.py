@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,7 @@ from dappled import durable
 from dappled.bounds.pictures import check_tiff_page, open_picture
 from dappled.decode.optics.film import DensityCurve, density_curve
 from dappled.errors import DappledError, first_line
-from dappled.products import csv_tables
+from dappled.products import csv_tables, png_files
 from dappled.products.whole_files import whole
 from dappled.workers import spans
 
@@ -63,26 +62,15 @@ def write(
 
 def _write_png(path: Path, picture: _Picture) -> None:
     rows, columns = picture.shape
-    packer = zlib.compressobj(1)
-    with path.open("wb") as file:
 
-        def chunk(kind: bytes, data: bytes) -> None:
-            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
-
-        file.write(b"\x89PNG\r\n\x1a\n")
-        chunk(b"IHDR", struct.pack(">IIBBBBB", columns, rows, picture.bits, 0, 0, 0, 0))
-        per_m = (round(density * 1000) for density in reversed(picture.px_per_mm))
-        chunk(b"pHYs", struct.pack(">IIB", *per_m, 1))
+    def strips() -> Iterator[Levels]:
         for these in spans(rows, _STRIP):
-            strip = picture.tile(these, slice(0, columns))
-            raw = strip.astype(">u2").view(np.uint8) if picture.bits == 16 else strip
-            lines = np.zeros((len(strip), 1 + columns * picture.bits // 8), dtype=np.uint8)  # filter 0 before each line
-            lines[:, 1:] = raw.reshape(len(strip), -1)
-            if packed := packer.compress(lines.tobytes()):
-                chunk(b"IDAT", packed)
-            picture.progress(len(strip))
-        chunk(b"IDAT", packer.flush())
-        chunk(b"IEND", b"")
+            yield picture.tile(these, slice(0, columns))
+            picture.progress(these.stop - these.start)
+
+    per_m = (round(density * 1000) for density in reversed(picture.px_per_mm))
+    resolution = png_files.chunk(b"pHYs", struct.pack(">IIB", *per_m, 1))
+    png_files.write(path, picture.shape, picture.bits, strips(), more=resolution)
 
 
 def _write_tiff(path: Path, picture: _Picture) -> None:

@@ -18,7 +18,7 @@ from dappled.decode.array_types import Floats
 from dappled.decode.depth import DistanceMap
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
-from dappled.products.extras import need
+from dappled.products.maps import las_files
 from dappled.products.maps.earth import Projection, utm
 from dappled.products.maps.eye import intrinsics
 from dappled.products.maps.photographs import Station, eye_of, lens_of
@@ -116,15 +116,5 @@ def _ply(path: Path, cloud: PointCloud) -> None:
 
 
 def _las(path: Path, cloud: PointCloud) -> None:
-    laspy = need("laspy")
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.offsets = np.floor(cloud.points.min(axis=0))
-    header.scales = np.full(3, 0.001)
-    header.add_extra_dim(laspy.ExtraBytesParams(name="sigma_m", type=np.float32, description="1 sigma, m"))
-    if cloud.crs:
-        header.add_crs(pyproj.CRS(cloud.crs))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = cloud.points.T
-    las.red, las.green, las.blue = cloud.colours.T
-    las["sigma_m"] = cloud.sigma_m
-    las.write(str(path))
+    crs = pyproj.CRS(cloud.crs) if cloud.crs else None
+    las_files.write(path, cloud.points, {"sigma_m": (cloud.sigma_m, "1 sigma, m")}, crs=crs, colours=cloud.colours)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -17,6 +16,7 @@ from datetime import UTC, datetime
 from dappled.decode.geometry import Pose
 from dappled.decode.geometry.camera_pose import CameraPose
 from dappled.errors import DappledError
+from dappled.products import png_files
 
 _GPS_IFD = 0x8825
 _BYTE, _ASCII, _LONG, _RATIONAL = 1, 2, 4, 5
@@ -26,7 +26,6 @@ _RAF = b"FUJIFILMCCD-RAW"
 _RAF_JPEG = 84
 _RAF_ALIGNED, _RAF_NOT_SET = 4, 0x8000
 _EXIF = b"Exif\0\0"
-_PNG = b"\x89PNG\r\n\x1a\n"
 _SOI, _APP0, _APP1, _SOS = 0xD8, 0xE0, 0xE1, 0xDA
 _SEGMENT = 0xFFFF
 _FILL = re.compile(rb"\xff+")
@@ -74,7 +73,7 @@ def tagged(data: bytes, where: Place) -> bytes:
             return _tiff(data, where)
         if data[:2] == bytes((0xFF, _SOI)):
             return _jpeg(data, where)
-        if data.startswith(_PNG):
+        if data.startswith(png_files.SIGNATURE):
             return _png(data, where)
         if data.startswith(_RAF):
             offset, length = struct.unpack_from(">II", data, _RAF_JPEG)
@@ -114,12 +113,12 @@ def with_directory(data: bytes, tag: int, inner: Sequence[Entry], first_too: Seq
     kept = [entry for entry in entries if struct.unpack_from(order + "H", entry)[0] not in new]
     data += b"\0" * (len(data) % 2)
     pointer = struct.pack(order + "HHII", tag, _LONG, 1, len(data))
-    data += _directory(order, len(data), sorted(inner))
+    data += directory(order, len(data), sorted(inner))
     rows, values = _rows(order, len(data), first_too)
     data += values
     kept = sorted([*kept, *rows, pointer], key=lambda entry: int(struct.unpack_from(order + "H", entry)[0]))
-    directory = struct.pack(order + "H", len(kept)) + b"".join(kept) + body[-4:]
-    return data[:4] + struct.pack(order + "I", len(data)) + data[8:] + directory
+    made = struct.pack(order + "H", len(kept)) + b"".join(kept) + body[-4:]
+    return data[:4] + struct.pack(order + "I", len(data)) + data[8:] + made
 
 
 def _jpeg(data: bytes, where: Place) -> bytes:
@@ -142,7 +141,7 @@ def _jpeg(data: bytes, where: Place) -> bytes:
 
 def _png(data: bytes, where: Place) -> bytes:
     """The eXIf chunk (PNG 1.5 extensions) stays in its place; a new one precedes the pixels. No other byte changes."""
-    at, first = len(_PNG), dict[bytes, tuple[int, int]]()
+    at, first = len(png_files.SIGNATURE), dict[bytes, tuple[int, int]]()
     while b"IEND" not in first and at + 12 <= len(data):
         end = at + 12 + int(struct.unpack_from(">I", data, at)[0])
         first.setdefault(data[at + 4 : at + 8], (at, end))
@@ -152,11 +151,7 @@ def _png(data: bytes, where: Place) -> bytes:
     pixels, _ = first[b"IDAT"]
     start, end = first.get(b"eXIf", (pixels, pixels))
     present = data[start + 8 : end - 4] if start < end else EMPTY
-    return data[:start] + _chunk(_tiff(present, where)) + data[end:]
-
-
-def _chunk(tiff: bytes) -> bytes:
-    return struct.pack(">I", len(tiff)) + b"eXIf" + tiff + struct.pack(">I", zlib.crc32(b"eXIf" + tiff))
+    return data[:start] + png_files.chunk(b"eXIf", _tiff(present, where)) + data[end:]
 
 
 def _segment(tiff: bytes) -> bytes:
@@ -165,7 +160,7 @@ def _segment(tiff: bytes) -> bytes:
     return struct.pack(">BBH", 0xFF, _APP1, len(tiff) + 8) + _EXIF + tiff
 
 
-def _directory(order: str, start: int, entries: Sequence[Entry]) -> bytes:
+def directory(order: str, start: int, entries: Sequence[Entry]) -> bytes:
     """An image file directory for the offset `start`, followed by its longer values."""
     rows, values = _rows(order, start + 2 + 12 * len(entries) + 4, entries)
     return struct.pack(order + "H", len(entries)) + b"".join(rows) + bytes(4) + values

@@ -15,6 +15,7 @@ import numpy as np
 
 from dappled import durable
 from dappled.decode.array_types import Floats
+from dappled.decode.geometry import field_of_view
 from dappled.errors import DappledError
 from dappled.products.handover import view_cameras, view_files
 from dappled.products.handover.view_cameras import FrameCameras, LocalAxes, ViewCamera
@@ -162,10 +163,7 @@ def _from_world(one: FrameCameras, view: ViewCamera, world: LocalAxes) -> tuple[
     """Quaternion (w, x, y, z) and translation from world to a view's camera axes."""
     to_world, centre = world.place(one)
     place: Floats = centre + to_world @ np.array(view.centre_m)
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # an eighth of the start of `batch`
-
-    x, y, z, w = Rotation.from_matrix(to_world.T).as_quat().tolist()
-    return (w, x, y, z, *(-to_world.T @ place).tolist())
+    return (*field_of_view.quaternion(to_world.tolist()), *(-to_world.T @ place).tolist())
 
 
 def _words(numbers: Sequence[float]) -> str:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dappled import durable
+from dappled.decode.geometry import field_of_view
 from dappled.decode.lightfield import LightField
 from dappled.products.exports import light_files
 from dappled.products.extras import need
@@ -119,9 +120,7 @@ def _messages(
     yield "/camera/camera_info", "sensor_msgs/msg/CameraInfo", _info(one, camera)
     yield "/fix", "sensor_msgs/msg/NavSatFix", _fix(one, camera)
     turn, centre = world.place(one)
-    from scipy.spatial.transform import Rotation  # noqa: PLC0415  # an eighth of the start of `batch`
-
-    x, y, z, w = Rotation.from_matrix(turn).as_quat().tolist()
+    w, x, y, z = field_of_view.quaternion(turn.T.tolist())
     east, north, up = centre.tolist()
     pose = {"position": {"x": east, "y": north, "z": up}, "orientation": {"x": x, "y": y, "z": z, "w": w}}
     yield "/camera/pose", "geometry_msgs/msg/PoseStamped", {"header": ground, "pose": pose}

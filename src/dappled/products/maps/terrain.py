@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyproj
@@ -19,8 +17,7 @@ from scipy import ndimage
 
 from dappled import durable
 from dappled.decode.array_types import Floats
-from dappled.products.extras import need
-from dappled.products.maps import cog, hyperstereo, map_grid
+from dappled.products.maps import cog, hyperstereo, las_files, map_grid
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground
@@ -111,27 +108,15 @@ def write_ground(made: Survey, terrain: TerrainModel, path: Path) -> Path:
 def write_points(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     """Write LAS 1.4 points, on the map's projection with EGM96 heights; `sigma` and, where terrain was given,
     `difference` are extra dimensions in metres."""
-    laspy = need("laspy")
-    surface = terrain.surface
-    known = surface.known
+    surface, known = terrain.surface, terrain.surface.known
     east, north = surface.grid.places(made.projection)
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.offsets = [np.floor(east.min()), np.floor(north.min()), 0.0]
-    header.scales = [0.001, 0.001, 0.001]
-    header.generating_software = "dappled"
-    header.creation_date = datetime.fromtimestamp(made.photographs[0].utc_ns // 1_000_000_000, UTC).date()
-    header.add_crs(compound(made.projection))
-    header.add_extra_dim(laspy.ExtraBytesParams("sigma", np.float32, "m, one standard deviation"))
+    points = np.stack([east[known], north[known], surface.height_m[known].astype(np.float64)], axis=1)
+    extra = {"sigma": (surface.sigma_m[known], "m, one standard deviation")}
     if terrain.difference_m is not None:
-        header.add_extra_dim(laspy.ExtraBytesParams("difference", np.float32, "m above the given terrain"))
-    points: Any = laspy.LasData(header)
-    points.x, points.y, points.z = east[known], north[known], surface.height_m[known].astype(np.float64)
-    points.sigma = surface.sigma_m[known]
-    if terrain.difference_m is not None:
-        points.difference = terrain.difference_m[known]
+        extra["difference"] = terrain.difference_m[known], "m above the given terrain"
     durable.make_folder(path.parent)
     with replacing(path) as part:
-        points.write(part)
+        las_files.write(part, points, extra, crs=compound(made.projection), utc_ns=made.photographs[0].utc_ns)
     return path
 
 

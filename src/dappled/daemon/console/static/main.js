@@ -444,7 +444,7 @@ async function stop(pressed) {
   tick();
 }
 
-$("follow").addEventListener("change", () => { if ($("follow").checked && frames.size) choose([...frames.keys()].at(-1)); });
+$("follow").addEventListener("change", lookAtNewest);
 $("map-in").addEventListener("click", () => map.zoom(1.5));
 $("map-out").addEventListener("click", () => map.zoom(1 / 1.5));
 $("map-fit").addEventListener("click", () => { map.following = true; map.redraw(); });
