@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import ClassVar
 
 from dappled.clock import Clock, SystemClock, TimeOfDayClock
+from dappled.drivers.child_process import end_child
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.drivers.python_command import python_module
 from dappled.mocks.autopilot.path import SPEED_M_S, FlightPath, TruePose
@@ -226,11 +227,7 @@ class Autopilot:
         """End it."""
         assert self._process.stdin is not None
         self._process.stdin.close()
-        try:
-            self._process.wait(3)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait(3)
+        end_child(self._process, 3.0)
 
 
 def _euler(pose: TruePose) -> tuple[float, float, float]:

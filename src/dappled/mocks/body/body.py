@@ -24,6 +24,7 @@ from typing import ClassVar, Protocol
 
 from dappled import codec
 from dappled.clock import SystemClock
+from dappled.drivers.child_process import end_child
 from dappled.drivers.python_command import python_module
 from dappled.errors import DappledError
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
@@ -179,11 +180,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     for pipe in (process.stdin, process.stdout):
         if pipe is not None:
             pipe.close()
-    try:
-        process.wait(2)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait(5)
+    end_child(process, 2.0)
 
 
 def pattern(shot_number: int, size: int) -> bytes:
