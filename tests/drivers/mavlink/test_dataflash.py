@@ -14,7 +14,7 @@ from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.decode.geometry import metres_per_radian, turn_rad
 from dappled.drivers.mavlink import dataflash, log_packets
-from dappled.drivers.mavlink.dataflash import DataFlashError
+from dappled.drivers.mavlink.log_packets import AutopilotLogError
 from dappled.drivers.reader_process import Budget
 from dappled.findings import Code, Finding, Level, text
 from dappled.flight import TimeSource
@@ -90,13 +90,13 @@ def test_a_log_that_was_cut_short_is_told_of(form: str, cut: int, tmp_path: Path
 def test_a_log_without_a_flight_is_one_sentence(data: bytes, says: str, tmp_path: Path) -> None:
     path = tmp_path / "1.bin"
     path.write_bytes(data)
-    with pytest.raises(DataFlashError, match=says):
+    with pytest.raises(AutopilotLogError, match=says):
         list(dataflash.packets(path))
 
 
 def test_a_log_without_a_fix_has_no_time(tmp_path: Path) -> None:
     own, _ = written(tmp_path, fix=1)
-    with pytest.raises(DataFlashError, match="no fix"):
+    with pytest.raises(AutopilotLogError, match="no fix"):
         list(dataflash.packets(own))
 
 
@@ -134,7 +134,7 @@ def test_a_receiver_whose_time_is_put_right_counts_as_it_says_from_then_on(
 def test_a_receiver_whose_time_goes_on_changing_is_refused(tmp_path: Path, wrong_ms: tuple[int, ...]) -> None:
     own, _ = written(tmp_path, wrong_ms=wrong_ms)
     with pytest.raises(
-        DataFlashError, match=r"00000012\.bin: the receiver's time in UTC changes by [0-9.]+ s .*\.tlog"
+        AutopilotLogError, match=r"00000012\.bin: the receiver's time in UTC changes by [0-9.]+ s .*\.tlog"
     ):
         list(dataflash.packets(own))
 
@@ -156,7 +156,7 @@ def test_a_log_of_holes_is_judged_before_it_is_read(tmp_path: Path) -> None:
     path.write_bytes(b"\xa3\x95\x80\x80")
     with path.open("ab") as file:
         file.truncate(1 << 40)
-    with pytest.raises(DataFlashError, match=r"1\.bin.*its content would take"):
+    with pytest.raises(AutopilotLogError, match=r"1\.bin.*its content would take"):
         list(dataflash.packets(path))
 
 
@@ -181,5 +181,5 @@ def test_a_log_that_is_made_to_exhaust_the_machine_is_one_sentence(
     monkeypatch.setattr(dataflash, "_BUDGET", budget)
     path = tmp_path / "1.bin"
     path.write_bytes(of_nothing(300_000))
-    with pytest.raises(DataFlashError, match=rf"1\.bin is damaged .*({says})"):
+    with pytest.raises(AutopilotLogError, match=rf"1\.bin is damaged .*({says})"):
         list(dataflash.packets(path))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 import math
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
+from dappled.daemon.console import pictures
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry.area import PlannedArea, within
 
@@ -90,7 +89,4 @@ class SeenGround:
         """What no frame has seen of the area, hatched; the rest is transparent."""
         rows, columns = np.indices(self._planned.shape)
         hatched = self._planned & (self._frames == 0) & ((rows + columns) % _STRIPE < _STRIPE // 2)
-        picture = np.where(hatched[..., None], np.array(_HOLE, dtype=np.uint8), np.uint8(0))
-        file = io.BytesIO()
-        Image.fromarray(picture.astype(np.uint8), "RGBA").save(file, "PNG")
-        return file.getvalue()
+        return pictures.png(np.where(hatched[..., None], np.array(_HOLE, dtype=np.uint8), np.uint8(0)))

@@ -34,6 +34,7 @@ from dappled.daemon.navigation.samples import (
     prune,
 )
 from dappled.decode.geometry import norm
+from dappled.decode.geometry.camera_pose import matrix_of
 from dappled.drivers.mavlink import MavlinkMessage
 from dappled.drivers.mavlink.sample_judge import (
     OF_ATTITUDES,
@@ -43,7 +44,6 @@ from dappled.drivers.mavlink.sample_judge import (
     Track,
     Tracks,
     point_m,
-    turned,
 )
 
 POSITION_GAP_NS, ATTITUDE_GAP_NS, GIMBAL_GAP_NS = 2_500_000_000, 1_500_000_000, 1_500_000_000
@@ -309,7 +309,7 @@ class VehicleHistory:
         if sample is None or not self._believed(sample, message, self._attitudes):
             return
         self.counts.attitudes += 1
-        first, matrix = self.time.first(number + 1), turned(*sample.attitude)
+        first, matrix = self.time.first(number + 1), matrix_of(sample.attitude).ravel().tolist()
         for one in self._steady_attitudes.take(sample, (matrix,), first):
             if _rises(self._attitudes, one, first):
                 keep(self._attitudes, one)

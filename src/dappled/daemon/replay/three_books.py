@@ -27,12 +27,12 @@ from dappled.daemon.navigation import recorded_vehicles
 from dappled.daemon.replay.in_order import paired_in_order
 from dappled.daemon.replay.replay import own_log
 from dappled.drivers.mavlink import PacketParser, mavlink
+from dappled.drivers.mavlink.framing import message_of
 from dappled.drivers.mavlink.log_packets import BootMap, LoggedTrigger, TriggerLog
 from dappled.drivers.utc_choice import LOGS_FROM_NS, UtcBounds
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Subject, finding, text
 from dappled.flight import LedgerReader, ShotRow, Stray, Tag, layout, log_reading
-from dappled.flight.logs import MAVLINK_2
 
 _NUMBERED_US = 6_000_000  # a trigger that is reported later than 5 s is no shot
 _LATE_US = 2_600_000  # over a second link
@@ -269,8 +269,7 @@ def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside
     for _, stamp_us, raw in log_reading.read_telemetry(telemetry) if telemetry.is_file() else ():
         found.first_us = stamp_us if found.first_us is None else found.first_us
         found.last_us = max(found.last_us, stamp_us)
-        number = int.from_bytes(raw[7:10], "little") if raw[0] == MAVLINK_2 else raw[5]
-        message = parse(raw) if number in _READ else None
+        message = parse(raw) if message_of(raw) in _READ else None
         if message is None or message.get_srcSystem() not in systems or message.get_srcComponent() != 1:
             continue
         name = message.get_type()

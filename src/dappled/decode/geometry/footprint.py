@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-_A_M, _E2 = 6378137.0, 0.00669437999014  # WGS 84
+from dappled.decode.geometry.pose import metres_per_radian
+
+_AT_POLES_M = 6.4  # for a radian of longitude: what is on a pole has one too
 _STEEPEST = 0.2  # the least share of a ray's length that points down: 78° from straight down
 
 
@@ -90,8 +92,7 @@ def _corners_m(frame: OrientedFrame) -> NDArray[np.float64] | None:
 
 def _degrees(frame: OrientedFrame, north_m: float, east_m: float) -> tuple[float, float]:
     """Metres from the antenna as degrees, by the ellipsoid's radii at that place; longitude from −180 to 180."""
-    latitude = math.radians(frame.latitude_deg)
-    w = math.sqrt(1 - _E2 * math.sin(latitude) ** 2)
-    lat = frame.latitude_deg + math.degrees(north_m / (_A_M * (1 - _E2) / w**3))
-    lon = frame.longitude_deg + math.degrees(east_m / (_A_M / w * max(math.cos(latitude), 1e-6)))
+    along_m, across_m = metres_per_radian(math.radians(frame.latitude_deg), 0.0)
+    lat = frame.latitude_deg + math.degrees(north_m / along_m)
+    lon = frame.longitude_deg + math.degrees(east_m / max(across_m, _AT_POLES_M))
     return lat, (lon + 180) % 360 - 180

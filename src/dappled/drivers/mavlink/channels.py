@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 
 from dappled.clock import Clock
 from dappled.drivers.mavlink.peers import Peers, Shown, Source
-from dappled.drivers.mavlink.streams import ByteStream, TcpServer, over_tcp
+from dappled.drivers.mavlink.streams import ByteStream, OnePeer, TcpServer, over_tcp
 from dappled.errors import DappledError
 
 __all__ = [
@@ -257,7 +257,7 @@ def _bound(address: Address, kind: socket.SocketKind) -> socket.socket:
 # --- UDP
 
 
-class _Udp:
+class _Udp(OnePeer):
     """A UDP socket: each datagram holds whole packets, and writing never has to wait."""
 
     datagrams = True
@@ -266,13 +266,6 @@ class _Udp:
         sock.setblocking(False)
         self._sock = sock
         self._last: tuple[bytes, Source] | None = None
-
-    @property
-    def origin(self) -> int:
-        return 0
-
-    def ask_proof(self) -> None:
-        return
 
     def descriptors(self) -> Sequence[int]:
         return (self._sock.fileno(),)
@@ -283,15 +276,6 @@ class _Udp:
 
     def source(self) -> str:
         return "" if self._last is None else "{}:{}".format(*self._last[1])
-
-    def shown(self, evidence: Shown) -> None:
-        return
-
-    def wants_write(self) -> bool:
-        return False
-
-    def flush(self) -> None:
-        return
 
     def port(self) -> int:
         return int(self._sock.getsockname()[1])

@@ -7,7 +7,6 @@ without a pin, CAM.
 
 from __future__ import annotations
 
-import contextlib
 import math
 from collections.abc import Callable, Iterator
 from datetime import timedelta
@@ -28,7 +27,6 @@ from dappled.drivers.mavlink.log_evidence import Chosen, LoggedPlaces, Missing, 
 from dappled.drivers.mavlink.log_packets import AutopilotLogError, BootMap, LoggedTrigger, Timed, TriggerLog
 from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import UtcBounds, rollovers
-from dappled.errors import first_line
 from dappled.findings import Code, Finding, Subject, finding
 
 _USED = ["POS", "ATT", "GPS", "GPA", "XKF1", "NKF1", "XKF4", "NKF4"]
@@ -42,17 +40,13 @@ _METRES_PER_DEG = 111_195.0
 _BUDGET = Budget(bytes_a_second=2e5, ratio=32)  # pymavlink reads some megabytes a second
 
 
-class DataFlashError(AutopilotLogError):
-    """A log of ArduPilot can't be used; one sentence."""
-
-
 def packets(
     path: Path, report: Callable[[Finding], object] = lambda _: None, bounds: UtcBounds | None = None
 ) -> Iterator[tuple[int, int, bytes]]:
     """(running number, stamp in µs UTC, packet), in the order of time. `report` gets what is to be said of the log;
-    `bounds` say which dates can be true (None: up to now). Raises DataFlashError."""
+    `bounds` say which dates can be true (None: up to now). Raises AutopilotLogError."""
     missing = Missing()
-    with _sound(path):
+    with log_packets.sound(path, "ArduPilot"):
         rows, cut = _rows(path, _USED)
         clock, counting, told = _clock(path, rows, bounds)
         messages = [*_positions(path, rows, missing, told), *_attitudes(rows, missing)]
@@ -64,15 +58,15 @@ def packets(
 
 
 def triggers(path: Path, cam_idx: int, bounds: UtcBounds | None = None) -> TriggerLog:
-    """The triggers of one camera (0 is CAM1). Raises DataFlashError."""
-    with _sound(path):
+    """The triggers of one camera (0 is CAM1). Raises AutopilotLogError."""
+    with log_packets.sound(path, "ArduPilot"):
         rows, _ = _rows(path, ["GPS", *_OF_CAMERAS])
         clock, _, _ = _clock(path, rows, bounds)
         # before ArduPilot 4.3 the messages don't say which camera: there is one
         mine = {name: [row for row in rows[name] if getattr(row, "I", 0) == cam_idx] for name in _OF_CAMERAS}
         given = mine["TRIG"] or mine["CAM"]
         if any(not hasattr(row, name) for row in given for name in ("Img", "TimeUS", "Lat", "Lng")):
-            raise DataFlashError(f"{path} holds messages CAM or TRIG in a form that is not ArduPilot's since 4.0")
+            raise AutopilotLogError(f"{path} holds messages CAM or TRIG in a form that is not ArduPilot's since 4.0")
         found = sorted(
             (
                 LoggedTrigger(
@@ -86,21 +80,6 @@ def triggers(path: Path, cam_idx: int, bounds: UtcBounds | None = None) -> Trigg
         contacts = len(mine["CAM"]) if mine["TRIG"] else None
         records = f"CAM or TRIG of CAM{cam_idx + 1}"
         return TriggerLog("ArduPilot", tuple(found), contacts, min(times_us), max(times_us), clock, records)
-
-
-@contextlib.contextmanager
-def _sound(path: Path) -> Iterator[None]:
-    """What damage does to the reader, or to a field of a message, is one sentence."""
-    try:
-        yield
-    except OSError as error:
-        raise DataFlashError(f"{path} can't be read: {error.strerror}") from None
-    except DataFlashError:
-        raise
-    except MemoryError as error:
-        raise DataFlashError(f"{path} is damaged as a log of ArduPilot, or made to exhaust memory: {error}") from None
-    except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
-        raise DataFlashError(f"{path} is damaged as a log of ArduPilot ({first_line(error)}): copy it again") from None
 
 
 def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
@@ -127,14 +106,11 @@ def _rows(path: Path, used: list[str]) -> tuple[dict[str, list[Any]], bool]:
 def _clock(
     path: Path, rows: dict[str, list[Any]], bounds: UtcBounds | None
 ) -> tuple[BootMap, list[tuple[Receiver, Chosen]], list[Finding]]:
-    """The autopilot's clock, the receiver's messages that count, and what is to be said of both. Raises DataFlashError
-    without a fix."""
+    """The autopilot's clock, the receiver's messages that count, and what is to be said of both. Raises
+    AutopilotLogError without a fix."""
     receivers = list(_receivers(rows))
     counting, told = log_evidence.chosen(path, receivers)
-    try:
-        clock, doubts = log_evidence.utc_clock(path, counting, receivers, bounds)
-    except AutopilotLogError as error:
-        raise DataFlashError(str(error)) from None
+    clock, doubts = log_evidence.utc_clock(path, counting, receivers, bounds)
     return clock, log_evidence.in_turn(counting, receivers), [*told, *doubts]
 
 
@@ -191,7 +167,7 @@ def _positions(path: Path, rows: dict[str, list[Any]], missing: Missing, told: l
     )
     name = _estimator(rows)
     if not rows["POS"] or not rows[name]:
-        raise DataFlashError(
+        raise AutopilotLogError(
             f"{path} holds no positions with velocities (POS, and XKF1 or NKF1): set LOG_BITMASK for them"
         )
     moving = _core(path, rows, name, places, told)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dappled.clock import TimeOfDayClock
 from dappled.decode.array_types import Floats
+from dappled.decode.geometry.camera_pose import matrix_of
 from dappled.drivers.mavlink import log_packets
 from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, BootMap, ReceiverFix, Timed
 from dappled.drivers.mavlink.sample_judge import (
@@ -23,7 +24,6 @@ from dappled.drivers.mavlink.sample_judge import (
     OF_VELOCITIES,
     point_m,
     steady,
-    turned,
 )
 from dappled.drivers.utc_choice import Date, UtcBounds, rolled_over
 from dappled.findings import Code, Finding, Subject, finding
@@ -172,7 +172,7 @@ def attitudes(message: str, boots_us: NDArray[np.int64], attitude: Floats, missi
     length = np.linalg.norm(attitude, axis=1)
     rows = np.flatnonzero(missing.count(message, in_time(boots_us) & (length > 0.5) & (length < 2.0)))
     rows = rows[np.argsort(boots_us[rows], kind="stable")]
-    matrices = np.stack(turned(*(attitude[rows] / length[rows, None]).T))
+    matrices = matrix_of(tuple((attitude[rows] / length[rows, None]).T)).reshape(9, -1)
     for n in rows[missing.count(message, steady(boots_us[rows], matrices, OF_ATTITUDES))]:
         w, x, y, z = attitude[n].tolist()
         yield log_packets.attitude(int(boots_us[n]), (w, x, y, z))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import Quaternion, Vector3
 from dappled.drivers.mavlink.links import MavlinkMessage, mavlink, pack
-from dappled.errors import DappledError
+from dappled.errors import DappledError, first_line
 from dappled.findings import Code, Finding, Subject, finding
 
 FIX_3D = 3
@@ -27,6 +28,19 @@ Timed = tuple[int, MavlinkMessage]  # µs since boot
 
 class AutopilotLogError(DappledError):
     """An autopilot's log can't be used; one sentence."""
+
+
+@contextlib.contextmanager
+def sound(path: Path, by: str) -> Iterator[None]:
+    """What damage does to the reader of a log of `by`, or to a field of a message, is one sentence."""
+    try:
+        yield
+    except OSError as error:
+        raise AutopilotLogError(f"{path} can't be read: {error.strerror}") from None
+    except MemoryError as error:
+        raise AutopilotLogError(f"{path} is damaged as a log of {by}, or made to exhaust memory: {error}") from None
+    except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
+        raise AutopilotLogError(f"{path} is damaged as a log of {by} ({first_line(error)}): copy it again") from None
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,15 +41,6 @@ def point_m(lat_rad: Any, lon_rad: Any, alt_m: Any) -> tuple[Any, Any, Any]:
     return across * np.cos(lon_rad), across * np.sin(lon_rad), (_EARTH_M + alt_m) * np.sin(lat_rad)
 
 
-def turned(w: Any, x: Any, y: Any, z: Any) -> tuple[Any, ...]:
-    """A unit quaternion as its rotation matrix: the same for q and -q."""
-    return (
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    )  # fmt: skip
-
-
 @dataclass(slots=True, eq=False)
 class Track:
     """Samples that follow from each other."""

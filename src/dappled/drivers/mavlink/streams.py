@@ -22,14 +22,8 @@ _NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO,
 """Errors of `accept` that are the client's and not the listening socket's: see accept(2)."""
 
 
-class ByteStream:
-    """A descriptor that carries bytes both ways. What it can't take at once waits: whole packets, at most 64 KiB."""
-
-    datagrams = False
-
-    def __init__(self, fd: int, close: Callable[[], None], port: int = 0) -> None:
-        self._fd, self._close, self._port = fd, close, port
-        self._waiting = bytearray()
+class OnePeer:
+    """The part of a `ByteChannel` where one alone can be at the other end, and nothing waits to be written."""
 
     @property
     def origin(self) -> int:
@@ -37,6 +31,28 @@ class ByteStream:
 
     def ask_proof(self) -> None:
         return
+
+    def shown(self, evidence: Shown) -> None:
+        return
+
+    def source(self) -> str:
+        return ""
+
+    def wants_write(self) -> bool:
+        return False
+
+    def flush(self) -> None:
+        return
+
+
+class ByteStream(OnePeer):
+    """A descriptor that carries bytes both ways. What it can't take at once waits: whole packets, at most 64 KiB."""
+
+    datagrams = False
+
+    def __init__(self, fd: int, close: Callable[[], None], port: int = 0) -> None:
+        self._fd, self._close, self._port = fd, close, port
+        self._waiting = bytearray()
 
     def descriptors(self) -> Sequence[int]:
         return (self._fd,)
@@ -47,18 +63,12 @@ class ByteStream:
         except BlockingIOError:
             return b""
 
-    def shown(self, evidence: Shown) -> None:
-        return
-
     def write(self, data: bytes) -> bool:
         if len(self._waiting) + len(data) > _OUTBOX_LIMIT:
             return False
         self._waiting += data
         self.flush()
         return True
-
-    def source(self) -> str:
-        return ""
 
     def wants_write(self) -> bool:
         return bool(self._waiting)

@@ -6,7 +6,6 @@ the receiver `vehicle_gps_position` (or `sensor_gps`). UTC comes from the receiv
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,7 +29,7 @@ from dappled.drivers.mavlink.log_packets import AutopilotLogError, BootMap, Logg
 from dappled.drivers.mavlink.sample_judge import FASTEST_M_S, HIGHEST_M
 from dappled.drivers.reader_process import Budget
 from dappled.drivers.utc_choice import ROLLOVER_NS, UtcBounds, rollovers
-from dappled.errors import first_line, install_extra
+from dappled.errors import install_extra
 from dappled.findings import Finding
 
 _PLACES, _SPEEDS, _TURNS, _HOME = (
@@ -55,7 +54,7 @@ def packets(
     """(running number, stamp in µs UTC, packet), in the order of time. `report` gets what is to be said of the log;
     `bounds` say which dates can be true (None: up to now). Raises AutopilotLogError."""
     missing = Missing()
-    with _sound(path):
+    with log_packets.sound(path, "PX4"):
         log = _Topics.read(path, [_PLACES, _SPEEDS, _TURNS, _HOME])
         clock, counting, told = _clock(path, log, bounds)
         messages = [*_positions(path, log, missing), *_attitudes(path, log, missing)]
@@ -70,7 +69,7 @@ def packets(
 def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
     """The camera's triggers: camera_trigger, of which some may be contacts of a feedback pin, or without it
     camera_capture. Where nothing but contacts is logged, each of them is a trigger. Raises AutopilotLogError."""
-    with _sound(path):
+    with log_packets.sound(path, "PX4"):
         log = _Topics.read(path, [_PLACES, _TRIGGERS, _CAPTURES])
         clock, _, _ = _clock(path, log, bounds)
         topics = log.first
@@ -92,15 +91,6 @@ def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
         return TriggerLog(
             "PX4", ordered, contacts, int(all_us.min()), int(all_us.max()), clock, f"{_TRIGGERS} or {_CAPTURES}"
         )
-
-
-@contextlib.contextmanager
-def _sound(path: Path) -> Iterator[None]:
-    """What damage left of a topic is used, or is one sentence."""
-    try:
-        yield
-    except (ValueError, TypeError, KeyError, IndexError, ArithmeticError) as error:
-        raise AutopilotLogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
 
 
 def _cut_short(data: bytes) -> bool:
@@ -161,16 +151,9 @@ def _opened(path: Path, names: Sequence[str]) -> dict[tuple[str, int], dict[str,
     """These topics and the receivers', by name and instance."""
     if importlib.util.find_spec("pyulog") is None:  # an extra; only this log needs it
         raise AutopilotLogError(f"{path} is a log of PX4, and that needs pyulog; {install_extra('ground')}")
-    try:
-        arrays, _ = reader_process.read(
-            "dappled.drivers.mavlink.ulog_reader", path, (*names, *_RECEIVERS), library="pyulog", budget=_BUDGET
-        )
-    except OSError as error:
-        raise AutopilotLogError(f"{path} can't be read: {error.strerror}") from None
-    except MemoryError as error:
-        raise AutopilotLogError(f"{path} is damaged as a log of PX4, or made to exhaust memory: {error}") from None
-    except ValueError as error:
-        raise AutopilotLogError(f"{path} is damaged as a log of PX4 ({first_line(error)}): copy it again") from None
+    arrays, _ = reader_process.read(
+        "dappled.drivers.mavlink.ulog_reader", path, (*names, *_RECEIVERS), library="pyulog", budget=_BUDGET
+    )
     topics: dict[tuple[str, int], dict[str, Any]] = {}
     for name, values in arrays.items():
         topic, instance, field = name.split("/", 2)
@@ -196,11 +179,8 @@ def _clock(
     merged, own = given
     if not merged and not own:
         raise AutopilotLogError(f"{path} holds no messages of a satellite receiver: its time in UTC is not known")
-    try:
-        counting, told = log_evidence.chosen(path, merged if any(one.fixed.any() for one in merged) else own or merged)
-        clock, doubts = log_evidence.utc_clock(path, counting, [*merged, *own], bounds)
-    except AutopilotLogError as error:
-        raise AutopilotLogError(str(error)) from None
+    counting, told = log_evidence.chosen(path, merged if any(one.fixed.any() for one in merged) else own or merged)
+    clock, doubts = log_evidence.utc_clock(path, counting, [*merged, *own], bounds)
     return clock, log_evidence.in_turn(counting, own), [*told, *doubts]
 
 
