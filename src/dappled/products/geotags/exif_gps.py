@@ -201,10 +201,6 @@ def _entries(order: str, where: Place) -> list[Entry]:
         minutes, rest = divmod(units, 60 * 10**6)
         return ratios((minutes // 60, 1), (minutes % 60, 1), (rest, 10**6))
 
-    def text(words: str) -> tuple[int, bytes]:
-        coded = words.encode("ascii") + b"\0"
-        return len(coded), coded
-
     entries: list[Entry] = [
         (0x00, _BYTE, 4, bytes((2, 3, 0, 0))),
         (0x01, _ASCII, 2, b"S\0" if where.latitude_deg < 0 else b"N\0"),
@@ -213,15 +209,15 @@ def _entries(order: str, where: Place) -> list[Entry]:
         (0x04, _RATIONAL, 3, angle(where.longitude_deg)),
         (0x05, _BYTE, 1, bytes((where.altitude_m < 0,))),
         (0x06, _RATIONAL, 1, ratios((round(abs(where.altitude_m) * 1000), 1000))),
-        (0x12, _ASCII, *text("WGS-84")),
+        text_entry(0x12, "WGS-84"),
     ]
     if where.utc_ns is not None:
         taken = datetime.fromtimestamp(where.utc_ns // 10**9, UTC)
         seconds = (taken.second * 10**6 + where.utc_ns % 10**9 // 1000, 10**6)
         entries.append((0x07, _RATIONAL, 3, ratios((taken.hour, 1), (taken.minute, 1), seconds)))
-        entries.append((0x1D, _ASCII, *text(taken.strftime("%Y:%m:%d"))))
+        entries.append(text_entry(0x1D, taken.strftime("%Y:%m:%d")))
     if where.satellites is not None:
-        entries.append((0x08, _ASCII, *text(str(where.satellites))))
+        entries.append(text_entry(0x08, str(where.satellites)))
     if where.dop is not None:
         entries.append((0x0B, _RATIONAL, 1, ratios((round(where.dop * 100), 100))))
     if where.direction_deg is not None:
