@@ -27,7 +27,7 @@ if not words_only:
     from dappled.decode.spectrum.peaks import Measured, displaced, measure
     from dappled.decode.spectrum.pictures import Look, around, spectrum_boxes
     from dappled.decode.spectrum.transform import padded_shape, transform
-    from dappled.drivers.raw.darkroom import Darkroom, known_to
+    from dappled.drivers.raw.darkroom import Darkroom, known_to, naming
     from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
     from dappled.products.exports import prints
 
@@ -142,7 +142,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
     def _measured(self, frame: Path) -> tuple[Plane, Table]:
         darkroom = Darkroom(self.recipe())
         raw = darkroom.read(frame)
-        with darkroom.naming(frame):
+        with naming(frame):
             plane = darkroom.plane(raw)
             shape = (plane.shape[0], plane.shape[1])
             if self.mask == profiles.LENSLET:

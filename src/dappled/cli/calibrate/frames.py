@@ -19,7 +19,7 @@ if not words_only:
     from dappled.decode.calibration.fit import CalibrationFrame, from_lattices, lattice_of
     from dappled.decode.calibration.lattice_fit import FrameLattice
     from dappled.decode.optics import MaskedOptics
-    from dappled.drivers.raw.darkroom import Darkroom
+    from dappled.drivers.raw.darkroom import Darkroom, naming
     from dappled.drivers.raw.raw_file import RawFile, exposure, not_linear
 
 
@@ -57,7 +57,7 @@ def view_of(darkroom: Darkroom, path: Path, given: Given = _NOTHING) -> Calibrat
         )
     camera = darkroom.camera(raw.camera_model or "")
     stops = camera.f_numbers
-    with darkroom.naming(path):
+    with naming(path):
         plane = darkroom.plane(raw)
         shape = plane.shape[0], plane.shape[1]
         shown = lattice_of(

@@ -16,7 +16,7 @@ if not words_only:
     from numpy.typing import NDArray
 
     from dappled.config import profiles
-    from dappled.drivers.raw.darkroom import Darkroom, Recipe
+    from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
     from dappled.products import chessboard
 
 
@@ -102,7 +102,7 @@ def _picture(
         length = focal_length_mm or made.raw.focal_length_mm
         return image, made.light_field.grid, (int(rows), int(columns)), made.raw.camera_model or "", length
     raw = darkroom.read(path)
-    with darkroom.naming(path):
+    with naming(path):
         plane = darkroom.plane(raw)
     grid = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     length = focal_length_mm or raw.focal_length_mm

@@ -20,7 +20,7 @@ if not words_only:
     from dappled.decode.depth.ranging import Target, fit_targets, target_shift
     from dappled.decode.lightfield import ViewStack
     from dappled.drivers.raw import calibration_files
-    from dappled.drivers.raw.darkroom import Darkroom, Recipe
+    from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
     from dappled.products import opened
     from dappled.products.opened import OpenedLightField
 
@@ -83,7 +83,7 @@ def from_frames(
     for path, distance in zip(bar, metres, strict=True):
         made = darkroom.decode(path, focal_length_mm=focal_length_mm, joint_views=False)  # depth is made from slices
         field = OpenedLightField(made.light_field, path)
-        with darkroom.naming(path):
+        with naming(path):
             targets.append(Target(distance, *target_shift(field.depth(), field.stack)))
         doubts += of_subject(made.doubts, Subject("frame", path.name))
         stops.add(None if recipe.mask == profiles.LENSLET else field.attributes.get("f_number"))

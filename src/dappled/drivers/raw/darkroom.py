@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -295,10 +295,6 @@ class Darkroom:
         if not isinstance(decoder, MaskDecoder):
             raise DappledError("lenslets have no mask to predict carriers of")
         return decoder
-
-    def naming(self, path: Path | str) -> AbstractContextManager[None]:
-        """Context in which a DecodeError becomes a DappledError with the file's name."""
-        return naming(path)
 
     def camera(self, model: str) -> CameraProfile:
         """Return the camera's profile: the recipe's, or by model. Raises DappledError."""

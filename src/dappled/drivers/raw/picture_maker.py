@@ -24,7 +24,7 @@ from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
 from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of, shadow_of, told_by
 from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding
@@ -141,7 +141,7 @@ class PictureMaker:
         same mask (see `beside`) tell of its shadow, it among them or not. Raises DappledError."""
         frame = self._frame(LensFrame(Path(path), focal_length_mm, f_number))
         raw, decoder, lens = frame.raw, frame.decoder, frame.lens
-        with self._darkroom.naming(path):
+        with naming(path):
             shadow = self._shadow(frame, [one for one in told if one.alike == frame.alike])
             made = picture_of(frame.mosaic, shadow, period_of(shadow.lattice))
         found = self._findings(Subject("frame", str(path)), raw, made, decoder, lens)
@@ -150,7 +150,7 @@ class PictureMaker:
     def tell(self, one: LensFrame) -> ToldShadow | None:
         """What a frame tells of its shadow; None where it shows none. Raises DappledError."""
         frame = self._frame(one)
-        with self._darkroom.naming(one.path):
+        with naming(one.path):
             turned, scaled = frame.reach
             own = told_by(frame.mosaic, *frame.expected, turned=turned, scaled=scaled, others=self._known(frame))
         return ToldShadow(one.path, frame.alike, own) if own.seen else None
@@ -160,7 +160,7 @@ class PictureMaker:
         focal_length_mm = one.focal_length_mm or raw.focal_length_mm
         if focal_length_mm is None:
             raise DappledError(f"{one.path}: its focal length is unknown: give it with --focal-length")
-        with self._darkroom.naming(one.path):
+        with naming(one.path):
             mosaic = self._mosaic(raw)
             decoder = self._darkroom.mask_decoder(mosaic.shape, raw.camera_model or "")
         return _Frame(one.path, raw, mosaic, decoder, (focal_length_mm, one.f_number or raw.f_number))
@@ -203,7 +203,7 @@ class PictureMaker:
 
     def _white_shadow(self, frame: _Frame) -> Shadow:
         if self._white is None:
-            with self._darkroom.naming(self._recipe.white):
+            with naming(self._recipe.white):
                 mosaic = self._mosaic(self._darkroom.read(self._recipe.white))
                 found = shadow_of(mosaic, *frame.expected, turned=_TURNED, scaled=_SCALED)
                 self._white = replace(found, source=ShadowFrom.WHITE)
