@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from dappled import durable
+from dappled.bounds.claims import ClaimError
 from dappled.errors import DappledError
 
 
@@ -46,11 +47,14 @@ def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
 
 @contextmanager
 def disk_errors(doing: str, path: Path) -> Iterator[None]:
-    """Context of work on a file or folder: raises FlightError, the sentence of `disk_error`, for an OSError in it."""
+    """Context of work on a file or folder: raises FlightError, the sentence of `disk_error`, for an OSError in it, and
+    for a file that claims too much."""
     try:
         yield
     except OSError as error:
         raise disk_error(doing, path, error) from error
+    except ClaimError as error:
+        raise FlightError(f"cannot {doing} {path}: {error}") from error
 
 
 _LEDGER_REASONS = {

@@ -11,10 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import codec, durable
-from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored, parse_json, read_log
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight.errors import FlightError, disk_error, disk_errors
+from dappled.flight.errors import disk_errors
 from dappled.flight.logs import MAVLINK_1, MAVLINK_2, TelemetrySummary, packet_length
 from dappled.flight.records import Shot
 
@@ -36,14 +35,11 @@ def read_journal(path: Path) -> JournalContents:
 
     Raises FlightError when the file can't be read.
     """
-    try:
-        data = read_log(path)
-    except FileNotFoundError:
-        return JournalContents((), ())
-    except OSError as error:
-        raise disk_error("read the shot journal", path, error) from error
-    except ClaimError as error:
-        raise FlightError(f"the shot journal {path} can't be read: {error}") from error
+    with disk_errors("read the shot journal", path):
+        try:
+            data = read_log(path)
+        except FileNotFoundError:
+            return JournalContents((), ())
     tail = data[data.rfind(b"\n") + 1 :]
     shots: dict[int, Shot] = {}
     problems: list[Finding] = []
@@ -82,14 +78,9 @@ def read_telemetry(
     Bytes that are not a packet are skipped up to the next place where two records follow each other, or one ends the
     file. `report` gets each such gap. Raises FlightError when the file can't be read.
     """
-    try:
-        with open(path, "rb", opener=durable.plain_file) as file:
-            size = check_stored(file.fileno())
-            data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
-    except OSError as error:
-        raise disk_error("read the telemetry", path, error) from error
-    except ClaimError as error:
-        raise FlightError(f"the telemetry {path} can't be read: {error}") from error
+    with disk_errors("read the telemetry", path), open(path, "rb", opener=durable.plain_file) as file:
+        size = check_stored(file.fileno())
+        data = mmap.mmap(file.fileno(), 0, prot=mmap.PROT_READ) if size else None
     if data is not None:
         with data:
             for number, (stamp_us, raw) in enumerate(split(data, report, path)):

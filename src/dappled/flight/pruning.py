@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import codec, durable
-from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.codec import canonical
 from dappled.findings import Code, Subject, finding
-from dappled.flight.errors import FlightError, disk_error, disk_errors
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader
 from dappled.flight.trees import FileIdentity, Tree
@@ -43,14 +42,11 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
     """The files that were removed from a flight, by name. Raises FlightError where the record is not the one that the
     ledger vouches for."""
     path = folder.file(RECORD)
-    try:
-        data = read_log(path)
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise disk_error("read", path, error) from error
-    except ClaimError as error:
-        raise FlightError(f"{path} can't be read: {error}") from error
+    with disk_errors("read", path):
+        try:
+            data = read_log(path)
+        except FileNotFoundError:
+            return {}
     with LedgerReader.open(folder.ledger) as ledger:
         noted = [found for event in ledger.events() if event.kind == EVENT and (found := event.finding) is not None]
     if hashlib.sha256(data).hexdigest() not in [one.facts.get("sha256") for one in noted]:

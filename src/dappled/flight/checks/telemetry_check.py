@@ -8,11 +8,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from dappled import durable
-from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.chain import ChainLink
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import disk_errors
 from dappled.flight.tables import TELEMETRY
 
 
@@ -22,20 +21,17 @@ def compare(path: Path, links: Mapping[int, ChainLink]) -> Iterator[Finding]:
     if not blocks:
         return
     about = Subject("file", path.name)
-    try:
-        with open(path, "rb", opener=durable.plain_file) as file:
-            size = check_stored(file.fileno())
-            for link in blocks:
-                start, end = _range(link.key)
-                file.seek(min(start, size))
-                if hashlib.sha256(file.read(min(end, size) - min(start, size))).hexdigest() != link.sha256:
-                    yield finding(Code.TELEMETRY_BLOCK_CHANGED, about, name=path.name, start=start, end=end)
-    except FileNotFoundError:
-        yield finding(Code.TELEMETRY_BLOCKS_MISSING, about, name=path.name, blocks=len(blocks))
-    except OSError as error:
-        raise disk_error("read the telemetry", path, error) from error
-    except ClaimError as error:
-        raise FlightError(f"the telemetry {path} can't be read: {error}") from error
+    with disk_errors("read the telemetry", path):
+        try:
+            with open(path, "rb", opener=durable.plain_file) as file:
+                size = check_stored(file.fileno())
+                for link in blocks:
+                    start, end = _range(link.key)
+                    file.seek(min(start, size))
+                    if hashlib.sha256(file.read(min(end, size) - min(start, size))).hexdigest() != link.sha256:
+                        yield finding(Code.TELEMETRY_BLOCK_CHANGED, about, name=path.name, start=start, end=end)
+        except FileNotFoundError:
+            yield finding(Code.TELEMETRY_BLOCKS_MISSING, about, name=path.name, blocks=len(blocks))
 
 
 def _range(key: str) -> tuple[int, int]:
