@@ -8,11 +8,12 @@ from dappled.clock import RecordedClock
 from dappled.config.settings import PoseSettings
 from dappled.daemon.camera_protocol.camera_status import CameraFacts, Captured
 from dappled.daemon.camera_protocol.component import Component
+from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
 from dappled.daemon.camera_protocol.parameters import Parameters
 from dappled.daemon.navigation import BodyLatency, ExposureTime, Telemetry, clocks
 from dappled.daemon.pipeline.shutter import Shutter
-from dappled.daemon.pipeline.spacing import Spacing
+from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.decode.geometry import Pose
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkMessage, Packet, mavlink, pack
@@ -36,19 +37,10 @@ class _Body:
         raise AssertionError(name)
 
 
-class _NoSeries:
-    """Photographs by distance are asked of nobody here."""
+class _NothingEarlier(EarlierOutcomes):
+    def __init__(self) -> None:
+        pass
 
-    def begin(self, wanted: Spacing, source: str, *, at_once: bool = False) -> None: ...
-
-    def begin_configured(self, source: str) -> bool:
-        return False
-
-    def end(self) -> bool:
-        return False
-
-
-class _NothingEarlier:
     def summary(self) -> None:
         """Nothing was lost."""
 
@@ -92,7 +84,7 @@ class Daemon:
             Parameters(_Body()),
             model=self,
             earlier=_NothingEarlier(),
-            series=_NoSeries(),
+            series=DistanceTrigger(self.shutter, self, self.clock, mount=self.mount),
         )
 
     def receive(self, link: int, message: MavlinkMessage, raw: bytes) -> None:
@@ -138,6 +130,15 @@ class Daemon:
 
     def pose(self) -> Pose | None:
         return None
+
+    def height(self) -> None:
+        """Photographs by distance are asked of nobody here."""
+
+    def field(self) -> None:
+        """As above."""
+
+    def busy(self) -> bool:
+        return False
 
     def troubled(self) -> bool:
         return False
