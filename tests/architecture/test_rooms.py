@@ -38,6 +38,7 @@ UNREAD = {
     "peak_mb": "in a batch's report, by the codec",
     "horizontal_mm": "in a carrier table, by the codec",
     "vertical_mm": "in a carrier table, by the codec",
+    "phase_pattern": "in a carrier table, by the codec",
     "frequency_scale": "in the laser bench's findings, by the codec",
     "turn_deg": "in the report of a map's refinement, by the codec",
     "periods_sigma": "in a light field's attributes, by the codec",
