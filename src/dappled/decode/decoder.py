@@ -20,8 +20,9 @@ from dappled.decode.calibration.calibration import Calibration, LatticeFit, move
 from dappled.decode.calibration.testimony import LatticeChange, lattice_change
 from dappled.decode.errors import DecodeError
 from dappled.decode.joint.clipping import clipped_shares, unclipped
-from dappled.decode.joint.frame_views import TakenSlices, place_of, views_of, witness_of
+from dappled.decode.joint.frame_views import TakenSlices, views_of, witness_of
 from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, carrier_changes
+from dappled.decode.joint.placed import placed
 from dappled.decode.lightfield.aperture import (
     Aperture,
     UsedAperture,
@@ -68,7 +69,6 @@ _BY_CHANCE = 3  # carriers, with the mean, that a scene may seem to show
 _CARRIERS_NATS = 20.0  # that the mask is there, where more carriers than by chance are seen
 _LEAST_CLIPPED = 1e-4  # of the pixels: defects are fewer
 _UNLIKE = frozenset({Code.APERTURE_DISAGREES, Code.APERTURE_UNEXPLAINED})
-_PLACED = 6  # times a mask is looked for where it was found, until it stands: a turn of 2.3 degrees, 4 % of scale
 _ONLY_NOISE = 1.15  # of the noise's variance: frames of noise alone have 0.97 to 1.02
 _LEAST_THROUGH = 0.1  # of a carrier: where the aperture leaves less, the mask's transfer can't be measured
 
@@ -255,7 +255,6 @@ class MaskDecoder:
             noise = noise_rms(spectrum)
         few = carriers_from == "calibrated" and sum(one is not None for one in measured) <= _BY_CHANCE
         if views:
-            clips = self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
             made = self.views(
                 slices,
                 lattice,
@@ -263,7 +262,7 @@ class MaskDecoder:
                 focal_length_mm=focal_length_mm,
                 f_number=f_number,
                 noise_rms=noise,
-                plane=plane if clips else None,
+                plane=plane,
             )
         else:
             nats = (
@@ -421,8 +420,9 @@ class MaskDecoder:
         noise_rms: float,
         plane: Source | None = None,
     ) -> MadeViews:
-        """Views of slices that were cut before. With their `plane`, its clipped pixels count as what is around them
-        tells, if there is a calibration and the mask hasn't turned since."""
+        """Views of slices that were cut before. With a calibration and their `plane`, slices of a mask that has turned
+        since, or is of another scale, are cut again for them; else clipped pixels count as what is around them tells.
+        """
         none = MadeViews(*no_views(slices.values.shape[1:]))
         if f_number is None:
             return none
@@ -435,7 +435,9 @@ class MaskDecoder:
             turn = turn_between(lattice, self.lattice_at(focal_length_mm))
             found = self._calibrated(taken, lattice, known, turn)
             far = found[2] and found[2].far()
-            if plane is not None and found[1].fits and not (far and (far.turn_rad or far.off)):
+            if plane is not None and far and (far.turn_rad or far.off):
+                found = self._cut_again(taken, far, plane, lattice=lattice, known=known, turn_rad=turn) or found
+            elif plane is not None and self._clips and found[1].fits:
                 taken = replace(taken, values=self._unclipped(found[0], plane, lattice))
                 again = self._calibrated(taken, lattice, known, turn)
                 found, told = (again, True) if again[1].fits else (found, False)
@@ -534,6 +536,36 @@ class MaskDecoder:
         used = replace(kept[0], values=slices.values, noise_variance=taken.noise_variance).used()
         return kept[1].nats(used.values, used.noise(), self.workers)
 
+    @property
+    def _clips(self) -> bool:
+        return self.joint_views and self.clipped is not None and float(self.clipped.mean()) > _LEAST_CLIPPED
+
+    def _cut_again(
+        self,
+        taken: TakenSlices,
+        far: MaskPlace,
+        plane: Source,
+        *,
+        lattice: Lattice,
+        known: LatticeFit,
+        turn_rad: float,
+    ) -> tuple[TakenSlices, UsedAperture, MaskPlace | None] | None:
+        """As `_calibrated`, by slices that are cut where a turn and a scale put the carriers; None where the mask isn't
+        seen there, or carriers are off the sensor."""
+        there = far.change.of(lattice)
+        carriers = there.carriers(taken.orders)
+        if not all(one.on_sensor for one in carriers):
+            return None
+        size = self.slice_size(lattice)
+        with self.buffers.lend(self.optics.sensor.shape) as tiles:
+            spectrum = transform(plane, tiles=tiles, workers=self.workers)
+            values = extract(spectrum, carriers, size, taper=self.taper, workers=self.workers).values
+        taken = replace(taken, values=values, carriers=carriers)
+        at, width, place = self._calibrated(taken, there, known, turn_rad + turn_between(there, lattice))
+        if place is None or not place.seen:
+            return None
+        return at, width, place.beyond((0.0, 0.0), far.turn_rad, far.off)
+
     def _unclipped(self, taken: TakenSlices, plane: Source, lattice: Lattice) -> NDArray[np.complex64]:
         """The slices of a plane whose clipped pixels are as bright as what is around them tells."""
         assert self.clipped is not None
@@ -555,28 +587,8 @@ class MaskDecoder:
         if not self.joint_views:
             width = taken.width(distance_known=known.distance_fitted)
             return taken.through(width), width, None
-        changes, distance_known = carrier_changes(lattice, self.optics.sensor), known.distance_fitted
-        by_means = taken.shift(distance_known=distance_known)  # else the aperture is fitted to moved phases
-        at = taken.moved(by_means)
-        width = at.width(distance_known=distance_known)
-        still, place = (at, width), None
-        for _ in range(_PLACED):
-            rest = place_of(at.through(width).used(), changes, taken.samples_px, workers=self.workers)
-            if rest is None:
-                break
-            place = rest.beyond(by_means) if place is None else rest.beyond(place.periods, place.turn_rad, place.off)
-            if not rest.moved:
-                break
-            at = replace(
-                at.moved(rest.periods),
-                values=rest.undone(at.values, taken.orders, changes, taken.samples_px),
-                rotation_rad=at.rotation_rad + rest.turn_rad,
-            )
-            width = at.width(distance_known=distance_known)
-            if not rest.far().moved:
-                break
-        if place is not None and not place.seen:
-            (at, width), place = still, place.nowhere().beyond(by_means)
+        changes = carrier_changes(lattice, self.optics.sensor)
+        at, width, place = placed(taken, changes, distance_known=known.distance_fitted, workers=self.workers)
         return at.through(width), width, place
 
     def _away(self, place: MaskPlace) -> tuple[Finding, ...]:
@@ -584,8 +596,7 @@ class MaskDecoder:
         far, printed = place.far(), self.optics.mask.frequency_per_mm
         if not far.off:
             return moved(far.periods, far.turn_rad, printed)
-        change = LatticeChange(place.off, place.off_sigma, place.turn_rad, place.turn_sigma_rad)
-        return change.finding, *moved(far.periods, 0.0, printed)
+        return place.change.finding, *moved(far.periods, 0.0, printed)
 
     def _shown(
         self, width: UsedAperture | None, turns: float, focal_length_mm: float

@@ -100,6 +100,20 @@ def test_another_scale_and_a_small_move_are_made_good_where_no_carriers_measure_
 
 
 @pytest.mark.slow
+def test_a_shadow_that_faded_and_a_turn_of_two_degrees_are_made_good_where_the_stop_leaves_no_carriers() -> None:
+    """Half the contrast was nothing, and 46.4 dB; the mask was not seen."""
+    for seed, changed, least, doubt in (
+        (110, "contrast told_mm", 48.5, "mask.contrast"),
+        (20, "turned_deg", 51, "mask.turned"),
+    ):
+        one = Mixture.disturbed(seed)
+        assert one.changed == changed
+        views, _, doubts = _views(one)
+        assert views > least, changed
+        assert doubts == [doubt]
+
+
+@pytest.mark.slow
 def test_an_f_number_told_two_stops_wrong_is_no_mask_that_moved() -> None:
     one = Mixture.disturbed(92)
     assert one.changed == "told_f"

@@ -5,7 +5,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dappled.decode.lightfield.aperture import Aperture, angular_frequencies, transfer, used_aperture
+from dappled.decode.lightfield.aperture import (
+    Aperture,
+    ShownContrast,
+    angular_frequencies,
+    transfer,
+    used_aperture,
+)
 from dappled.decode.lightfield.views import from_slices
 from dappled.decode.optics.carriers import Mask
 from dappled.findings import Code
@@ -143,3 +149,20 @@ def test_what_no_contrast_explains_either_is_no_contrast() -> None:
     slices[2::2] *= 0.79
     found = used_aperture(slices, TRANSFERS, ORDERS, nominal_kappa=0.61, rotation_rad=0.0, aperture=Aperture(5))
     assert found.contrast == 1.0
+
+
+@pytest.mark.parametrize(("shown", "contrast"), [(0.6, 0.6), (0.93, 1.0)])
+def test_a_faded_shadow_is_told_by_texture_where_the_stop_leaves_no_carriers(shown: float, contrast: float) -> None:
+    slices = _slices(0.99, 0.0, Aperture(5), texture=0.01)
+    slices[1:] *= contrast
+    found = used_aperture(
+        slices,
+        TRANSFERS,
+        ORDERS,
+        nominal_kappa=1.0,
+        rotation_rad=0.0,
+        aperture=Aperture(5),
+        texture=ShownContrast(1.0, shown, 0.02),
+    )
+    assert found.contrast == pytest.approx(contrast, abs=0.02)
+    assert found.kappa == pytest.approx(0.99, abs=0.004)

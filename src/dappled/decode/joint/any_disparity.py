@@ -126,10 +126,10 @@ def _each_of(rows: Doubles, beside: Terms) -> list[_Hypothesis]:
     ]
 
 
-def _together(directions: _Directions, beside: Terms, share: Floats) -> _Hypothesis:
-    """All disparities at once, in shares (D,) of the texture."""
+def _together(each: Doubles, beside: Terms, share: Floats) -> _Hypothesis:
+    """All disparities at once, in shares (D,) of the texture, from rows of `each` (F, D, R, r)."""
     scale = np.sqrt(share)[None, :, None, None]
-    rows = (directions.rows * scale).reshape(len(beside), -1, directions.rows.shape[3])
+    rows = (each * scale).reshape(len(beside), -1, each.shape[3])
     strength, left = np.linalg.eigh(rows.swapaxes(1, 2) @ rows.conj())
     strength, left = strength[:, -_ALL:], left[:, :, -_ALL:]
     # What few slices don't see is rounding, not a direction.
@@ -152,27 +152,48 @@ def views_at_any(
     beside = some.viewed * size - alone.reshape(some.viewed.shape)
     directions = _Directions.of(some, own, background.whitener)
     low = times(directions.projector, spectra)
-    likely = _likely(directions, low, frame.weights)
-    looked = np.flatnonzero(likely.any(axis=1))
-    single = _each_of(directions.rows[:, looked], beside[:, looked])
-    gains = _gains(single, likely[looked], low, frame.weights)
-    _, prior = _weighed(gains, np.full(len(gains), 1 / len(gains)))
-    histogram = np.zeros(len(likely))
-    histogram[looked] = prior.reshape(len(single), -1).sum(axis=1)
-    together = _together(directions, beside, 0.98 * histogram + 0.02 / len(histogram))
-    gains = np.concatenate([gains, together.gains(low, frame.weights)])
-    count = len(STRENGTHS)
-    odds, _ = _weighed(gains, np.concatenate([0.8 * prior, np.full(count, 0.2 / count)]))
+    hypotheses, gains, prior = _hypotheses(directions.rows, beside, low, frame.weights)
+    odds, _ = _weighed(gains, prior)
     for few in spans(spectra.shape[2], AT_A_TIME):
-        moved, variance = _expected(frame, [*single, together], odds[:, few], low[:, :, few])
+        moved, variance = _expected(frame, hypotheses, odds[:, few], low[:, :, few])
         moved += times(background.unmixed, spectra[:, :, few])
         yield few, moved, variance
 
 
-def _likely(directions: _Directions, low: Complexes, weights: Singles) -> NDArray[np.bool_]:
-    """(D, N) which disparities projected patches (F, r, N) may have, by a few frequencies."""
+def flat_nats(seen: Terms, whitener: Doubles, white: Complexes, weights: Singles) -> Floats:
+    """(N,) log likelihoods, but for a constant, of patches at one disparity each, or at all of them, before a
+    background that the `whitener` (F, A, A) makes white, as it made the patches `white` (F, A, N). `seen` (F, D, A) is
+    what slices hold of their texture at each disparity."""
+    rows = (seen @ whitener.transpose(0, 2, 1))[:, :, None]
+    no_views = np.zeros((*rows.shape[:3], 0), dtype=np.float32)
+    _, gains, prior = _hypotheses(rows, no_views, white, weights)
+    total = gains + np.log(_weighed(gains, prior)[1])[:, None]
+    return np.asarray(np.logaddexp.reduce(total, axis=0))
+
+
+def _hypotheses(
+    rows: Doubles, beside: Terms, low: Complexes, weights: Singles
+) -> tuple[list[_Hypothesis], Floats, Floats]:
+    """What projected patches (F, r, N) may be, by a range's `rows` (F, D, R, r) and what views hold `beside`
+    (F, D, R, V·U) the slices' own; `gains` of each at each strength (C, N), and the prior (C,) to begin with."""
+    likely = _likely(rows, low, weights)
+    looked = np.flatnonzero(likely.any(axis=1))
+    each = _each_of(rows[:, looked], beside[:, looked])
+    gains = _gains(each, likely[looked], low, weights)
+    _, prior = _weighed(gains, np.full(len(gains), 1 / len(gains)))
+    histogram = np.zeros(len(likely))
+    histogram[looked] = prior.reshape(len(each), -1).sum(axis=1)
+    together = _together(rows, beside, 0.98 * histogram + 0.02 / len(histogram))
+    gains = np.concatenate([gains, together.gains(low, weights)])
+    count = len(STRENGTHS)
+    return [*each, together], gains, np.concatenate([0.8 * prior, np.full(count, 0.2 / count)])
+
+
+def _likely(each: Doubles, low: Complexes, weights: Singles) -> NDArray[np.bool_]:
+    """(D, N) which disparities projected patches (F, r, N) may have, by a few frequencies of `each`'s rows
+    (F, D, R, r)."""
     few = slice(None, None, _TRIED)
-    rows = directions.rows[few]
+    rows = each[few]
     no_views = np.zeros((*rows.shape[:3], 0), dtype=np.float32)
     best = np.stack([one.gains(low[few], weights[few]).max(axis=0) for one in _each_of(rows, no_views)])
     return np.asarray(best >= best.max(axis=0) - _LIKELY_NATS)

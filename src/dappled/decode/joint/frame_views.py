@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.joint.joint_views import PatchShares, joint_views
-from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, mask_place
+from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, mask_place, place_farther
 from dappled.decode.joint.patch_model import FARTHEST, SIDE
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import (
     Aperture,
+    ShownContrast,
     UsedAperture,
     angular_frequencies,
     shift_shown,
@@ -78,8 +79,14 @@ class TakenSlices:
     clipped: NDArray[np.bool_] | None = None
     unexplained: float = 0.0
 
-    def width(self, *, distance_known: bool) -> UsedAperture:
-        """The aperture that the slices' means show."""
+    def width(
+        self,
+        *,
+        distance_known: bool,
+        texture: ShownContrast | None = None,
+        faded: Sequence[bool] = (False, True),
+    ) -> UsedAperture:
+        """The aperture that the slices' means show; `texture` and `faded` as in `used_aperture`."""
         return used_aperture(
             self.values,
             self.transfers,
@@ -88,6 +95,8 @@ class TakenSlices:
             rotation_rad=self.rotation_rad,
             aperture=self.aperture,
             distance_known=distance_known,
+            texture=texture,
+            faded=faded,
         )
 
     def shift(self, *, distance_known: bool) -> tuple[float, float]:
@@ -169,12 +178,13 @@ class TakenSlices:
 
 
 def place_of(
-    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, workers: int = 1
+    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, farther: bool = False, workers: int = 1
 ) -> MaskPlace | None:
-    """Where the slices place the mask (see `mask_place`); None where the joint model is not for them."""
+    """Where the slices place the mask (see `mask_place`), or `farther` (`place_farther`); None where the joint model is
+    not for them."""
     if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
         return None
-    return mask_place(
+    return (place_farther if farther else mask_place)(
         taken.values,
         taken.model(),
         samples_px=taken.samples,

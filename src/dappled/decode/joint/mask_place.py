@@ -29,12 +29,15 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from dappled.decode.array_types import Complexes, Floats
+from dappled.decode.calibration.testimony import LatticeChange
+from dappled.decode.joint.contrast import even_spectra, shadow_contrast
 from dappled.decode.joint.patch_model import (
     AT_REST,
     KINDS,
     SIDE,
     USUAL,
     FrameModel,
+    PatchKind,
     TexturePower,
     detail_of,
     likelihoods,
@@ -58,6 +61,12 @@ _TRIED = 3  # of so many frequencies one is looked at to choose the kind of witn
 _STEPS = 48  # of a period: how finely moves are tried, up to half a period
 _MOST, _CHANGES = 0.007, 81  # of a turn in radians and of the scale, to either side, and how many are tried
 _ROUNDS = 8  # of Newton's method, from the best that was tried
+# Turns in radians and changes of scale that a mask is looked for around: to 2.8 degrees and 2.1 %.
+_FARTHER = (
+    *((side * turn, 0.0) for turn in (0.014, 0.028, 0.042) for side in (-1, 1)),
+    *((0.0, side * 0.014) for side in (-1, 1)),
+)
+_ABOUT_THERE = 10.0  # nats: frames without a mask have up to 0.1, at the most probable place around each of those
 _FAR_PERIODS, _FAR = 0.03, 6e-4  # clean frames reach 0.017 periods, and 3e-4 in turn and scale
 # Of the patches may lie in anything that places no mask, edges between depths or no parallax: any share is as probable.
 _ASTRAY = (np.arange(32) + 0.5) / 32
@@ -70,7 +79,8 @@ class MaskPlace:
     """Where a frame's own slices place the mask, from where its calibration has it: `periods` (ky, kx) at the frame's
     middle, `turn_rad`, and `off`, the share by which carriers stand farther out, 0 where the calibration's place
     explains the frame as well; and their standard errors. `nats` are the log odds of a mask there against none, by
-    `patches`."""
+    `patches`. `contrast` is that of its shadow over the model's, by texture (see `shadow_contrast`); None where
+    nothing tells."""
 
     periods: tuple[float, float]
     periods_sigma: tuple[float, float]
@@ -80,11 +90,23 @@ class MaskPlace:
     off_sigma: float
     nats: float
     patches: int
+    contrast: float | None = None
+    contrast_sigma: float | None = None
+
+    @classmethod
+    def at(cls, periods: tuple[float, float], turn_rad: float = 0.0, off: float = 0.0) -> MaskPlace:
+        """A place that no patch has told."""
+        return cls(periods, (math.inf, math.inf), turn_rad, math.inf, off, math.inf, -math.inf, 0)
 
     @property
     def moved(self) -> bool:
         """Whether it is anywhere else."""
         return bool(any(self.periods) or self.turn_rad or self.off)
+
+    @property
+    def change(self) -> LatticeChange:
+        """Its turn and scale, as carriers would show them: their turn counts the other way."""
+        return LatticeChange(self.off, self.off_sigma, -self.turn_rad, self.turn_sigma_rad)
 
     def far(self) -> MaskPlace:
         """It with what is so far from the calibrated place that frames of a mask in it don't show it."""
@@ -115,7 +137,8 @@ class MaskPlace:
         """Slices as a mask without turn and scale would make them; `changes` and `steps_px` as in `mask_place`."""
         if not (self.turn_rad or self.off):
             return slices
-        away = self.turn_rad * changes[0] + self.off * changes[1]
+        turned = math.sin(self.turn_rad) * changes[0] + math.cos(self.turn_rad) * changes[1]
+        away = (1 + self.off) * turned - changes[1]
         cycles = np.array(orders, dtype=np.float64) @ away  # (K, 2) for each sensor pixel
         down, across = (
             np.exp(-2j * np.pi * np.outer(along, (np.arange(side) - (side - 1) / 2) * px)).astype(np.complex64)
@@ -155,8 +178,7 @@ def mask_place(
         return None
     seen, patches = _Textured.of(witness, slices, noise, _MOST_PATCHES), witness.patches
     frame, spectra = seen.frame, seen.spectra
-    corners = np.array(patches.corners)[seen.patches] - SIDE
-    middles = corners + SIDE / 2 - np.array(shape) / 2
+    away = seen.away(shape, steps_px, changes)
     place: MaskPlace | None = None
     likely = -np.inf
     for some in (USUAL, AT_REST):  # at rest only where it matters: it costs half as much again
@@ -171,11 +193,60 @@ def mask_place(
             break
         likely = float(found.max())
         differences, terms = _terms(seen, wholes[int(found.argmax())], workers)
-        away = (middles * np.array(steps_px)) @ changes.swapaxes(1, 2)
         place = _Likelihood(differences, terms, away).place()
+        if some == USUAL and not place.far().moved:
+            kind = kinds[int(found.argmax())]
+            place = _with_contrast(place, slices, seen, kind, away=away, patches=patches, reach=reach)
         if place.seen:
             break
     return place
+
+
+def place_farther(
+    slices: Complexes,
+    model: SliceModel,
+    *,
+    samples_px: tuple[float, float],
+    noise: Floats,
+    reach: float,
+    changes: Floats,
+    steps_px: tuple[float, float],
+    workers: int = 1,
+) -> MaskPlace | None:
+    """About where the mask is, by fewer patches, around turns and changes of scale as far as hands and lenses go; None
+    where patches agree on no place."""
+    shape = (slices.shape[1], slices.shape[2])
+    witness = MaskWitness.of(shape, model, samples_px=samples_px, reach=reach, workers=workers)
+    best, most = None, _ABOUT_THERE
+    for turn_rad, off in _FARTHER if witness else ():
+        assert witness is not None
+        start = MaskPlace.at((0.0, 0.0), turn_rad, off)
+        seen = _Textured.of(witness, start.undone(slices, model.half, changes, steps_px), noise, _WITNESSES)
+        differences, terms = _terms(seen, witness.likeliest(seen, workers), workers)
+        likely = _Likelihood(differences, terms, seen.away(shape, steps_px, changes))
+        move = likely.anywhere()
+        if (nats := likely.nats(move)) > most:
+            best, most = likely.at(move, nats).beyond(start.periods, turn_rad, off), nats
+    return best
+
+
+def _with_contrast(
+    place: MaskPlace,
+    slices: Complexes,
+    seen: _Textured,
+    kind: PatchKind,
+    *,
+    away: Floats,
+    patches: Patches,
+    reach: float,
+) -> MaskPlace:
+    """The place with its shadow's contrast, by patches (N,) of this kind; `away` as in `_Likelihood`."""
+    some = slice(None, None, -(-len(seen.patches) // _WITNESSES))
+    at = place.periods + np.tensordot([place.turn_rad, place.off], away[:, some], axes=1)
+    back = np.exp(-2j * np.pi * seen.frame.model.orders @ at.T).astype(np.complex64)
+    spectra = even_spectra(slices, patches, seen.patches[some]) * back
+    told = shadow_contrast(seen.frame, seen.spectrum, kind, spectra, mean=seen.mean, reach=reach)
+    return place if told is None else replace(place, contrast=told[0], contrast_sigma=told[1] * math.sqrt(_OVERLAP))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,16 +273,20 @@ class MaskWitness:
         silent = np.zeros(len(model.orders))
         return cls(patches, FrameModel.of(patches, model, samples_px, silent, reach, ranges=(USUAL,), workers=workers))
 
-    def nats(self, slices: Complexes, noise: Floats, workers: int = 1) -> float:
-        """The log odds of a mask in its place against none, by a frame with this `noise` (K,)."""
-        seen = _Textured.of(self, slices, noise, _WITNESSES)
+    def likeliest(self, seen: _Textured, workers: int) -> Complexes:
+        """(F, A, A) the covariance of the kind that explains patches best, by a few frequencies."""
         frame, spectra = seen.frame, seen.spectra
         kinds = [kind for kind in KINDS if kind.range == USUAL]
         rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
         few, detail = slice(None, None, _TRIED), detail_of(frame.ranges[USUAL].seen, seen.own)
         wholes = [rests.whole(number, detail[few], few) for number in range(len(kinds))]
         found = likelihoods(wholes, spectra[few], frame.weights[few], workers).sum(axis=1)
-        whole = rests.whole(int(found.argmax()), detail)
+        return rests.whole(int(found.argmax()), detail)
+
+    def nats(self, slices: Complexes, noise: Floats, workers: int = 1) -> float:
+        """The log odds of a mask in its place against none, by a frame with this `noise` (K,)."""
+        seen = _Textured.of(self, slices, noise, _WITNESSES)
+        whole = self.likeliest(seen, workers)
         # By parallax alone: by its means a mask that has moved by little would be no mask.
         differences, terms = _terms(replace(seen, lit=np.zeros_like(seen.lit)), whole, workers)
         return _Likelihood(differences, terms, np.zeros((2, len(terms), 2))).nats(np.zeros(4))
@@ -219,12 +294,14 @@ class MaskWitness:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Textured:
-    """The `patches` (N,) of a frame with the most texture: its model, the power of their texture, `own` (F,) at their
-    frequencies, the root of their mean square `mean`, and their `spectra` (F, A, N), so that none outvotes the others,
-    less those of their means: `lit` (N,) of them in the slice (0, 0) times `flat` (F,) and what is common to all.
+    """The `patches` (N,) of a frame with the most texture, which begin at `corners` (N, 2): its model, the power of
+    their texture, `own` (F,) at their frequencies, the root of their mean square `mean`, and their `spectra` (F, A, N),
+    so that none outvotes the others, less those of their means: `lit` (N,) of them in the slice (0, 0) times `flat`
+    (F,) and what is common to all.
     """
 
     patches: NDArray[np.intp]
+    corners: NDArray[np.intp]
     frame: FrameModel
     spectrum: TexturePower
     own: Floats
@@ -250,7 +327,14 @@ class _Textured:
         root = np.sqrt(np.maximum(strength, _FAINT))
         spectra /= np.asarray(root, dtype=np.float32)
         flat = patches.spectra(np.ones((1, 1, SIDE, SIDE), dtype=np.complex64))[:, 0, 0]
-        return cls(best, frame, spectrum, own, float(np.sqrt(np.mean(means**2))), spectra, means / root, flat)
+        corners = np.array(patches.corners)[best] - SIDE
+        return cls(best, corners, frame, spectrum, own, float(np.sqrt(np.mean(means**2))), spectra, means / root, flat)
+
+    def away(self, shape: tuple[int, int], steps_px: tuple[float, float], changes: Floats) -> Floats:
+        """(2, N, 2) by how many periods a turn of one radian, and a scale twice as large, move the mask at each patch
+        of slices (h, w)."""
+        middles = self.corners + SIDE / 2 - np.array(shape) / 2
+        return np.asarray((middles * np.array(steps_px)) @ changes.swapaxes(1, 2))
 
 
 def _terms(seen: _Textured, whole: Complexes, workers: int) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:
@@ -306,13 +390,19 @@ class _Likelihood:
         """The most probable place: the calibrated one where no other is surer."""
         found, nats = np.zeros(4), self.nats(np.zeros(4))
         still = self._best(np.zeros((1, 4)))
-        for one in (still, self._changed()):
+        for one in (still, self.anywhere()):
             if (more := self.nats(one)) > nats + SEEN_NATS:
                 found, nats = one, more
         if found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP:
             found = np.zeros(4)  # patches that gain, each for a reason of its own
             nats = self.nats(found)
-        periods, sigma = found.tolist(), self._sigma(found).tolist()
+        if nats > SEEN_NATS:  # else it would be off by what is not sure enough to be another place
+            found = self._risen(found, np.arange(4))
+        return self.at(found, nats)
+
+    def at(self, move: Floats, nats: float) -> MaskPlace:
+        """A move (4,) as a place."""
+        periods, sigma = move.tolist(), self._sigma(move).tolist()
         return MaskPlace(
             (periods[0], periods[1]),
             (sigma[0], sigma[1]),
@@ -328,9 +418,9 @@ class _Likelihood:
         """The log odds of a mask there, against a place for each patch."""
         waves = np.zeros((len(self.terms), _STEPS, _STEPS), dtype=np.complex64)
         waves[:, *(self.differences.T % _STEPS)] = self.terms
-        anywhere = (fft.ifft2(waves, norm="forward").real).reshape(len(waves), -1)
-        most = anywhere.max(axis=1)
-        mean = most + np.log(np.exp(anywhere - most[:, None]).mean(axis=1))
+        everywhere = (fft.ifft2(waves, norm="forward").real).reshape(len(waves), -1)
+        most = everywhere.max(axis=1)
+        mean = most + np.log(np.exp(everywhere - most[:, None]).mean(axis=1))
         here = self.patches(move)
         placed, astray = np.log1p(-_ASTRAY)[:, None], np.log(_ASTRAY)[:, None]
         shares = np.logaddexp(placed + here - mean, astray).sum(axis=1) / _OVERLAP
@@ -344,7 +434,7 @@ class _Likelihood:
         at = move[:2] + np.tensordot(move[2:], self.changed, axes=1)
         return np.asarray(self.terms * np.exp(2j * np.pi * at @ self.differences.T))
 
-    def _changed(self) -> Floats:
+    def anywhere(self) -> Floats:
         """The most probable move with a turn and another scale."""
         along = np.linspace(-_MOST, _MOST, _CHANGES)[:, None]
         turns, scales = along * np.eye(4)[2], along * np.eye(4)[3]
@@ -360,7 +450,10 @@ class _Likelihood:
         found = (np.exp(2j * np.pi * tried @ self.differences.T) @ sums).real
         shift, change = np.unravel_index(int(found.argmax()), found.shape)
         move = np.array([*tried[shift], *changes[change, 2:]])
-        free = np.flatnonzero(np.append([True, True], changes[:, 2:].any(axis=0)))
+        return self._risen(move, np.flatnonzero(np.append([True, True], changes[:, 2:].any(axis=0))))
+
+    def _risen(self, move: Floats, free: NDArray[np.intp]) -> Floats:
+        """The most probable move (4,) near one, by what of it is `free`."""
         for _ in range(_ROUNDS):
             gradient, curvature = self._slopes(move)
             step = np.linalg.lstsq(curvature[np.ix_(free, free)], gradient.sum(axis=0)[free], rcond=None)[0]

@@ -78,6 +78,11 @@ class SliceModel:
         turns = np.where(size > 0, self.transfers / np.where(size > 0, size, 1), 1)
         return replace(self, transfers=size, turns=self.turns * turns)
 
+    @property
+    def half(self) -> list[Order]:
+        """The orders of the half plane, DC first."""
+        return [(int(ky), int(kx)) for ky, kx in self.orders[: (len(self.orders) + 1) // 2]]
+
     def common(self) -> NDArray[Any]:
         """(A,) what each slice holds of a scene without texture, over what slice (0, 0) holds."""
         return np.asarray(self.transfers * self.aperture.transform(self.angular).real)

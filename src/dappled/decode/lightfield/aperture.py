@@ -53,7 +53,9 @@ _GAIN_SIGMA = 0.1  # relative: of a film's contrast; chosen by hand, as no print
 _DRAWN = 0.01  # of the mean: a weaker order of the design says nothing
 _MOVES, _COARSER = 48, 10  # of a period: how finely moves are tried, and κ with them in steps
 _MOVED = 30.0  # squared deviations: a smaller gain is no move, and no other contrast
-_FAINTEST, _STRONGEST = 0.3, 1.25  # contrast of a shadow over the calibrated one: less may be no mask
+FAINTEST, STRONGEST = 0.3, 1.25  # contrast of a shadow over the calibrated one: less may be no mask
+_SELDOM_FADED = 16.0  # squared deviations: what another contrast costs where texture tells of it
+_TEXTURE_CONTRAST = 0.03  # beside its standard error: of what texture shows of the contrast
 _EXPLAINED = 2.0  # mean squared deviation that may be left: what no contrast explains either speaks for none
 _FADED = 0.1  # of the contrast: a smaller change is not told, six-bladed stops look like it
 _AGREEMENT = 6.0  # times their own error: means further from those of any aperture are not fitted
@@ -247,6 +249,36 @@ class UsedAperture:
         return finding(Code.APERTURE_DISAGREES, FRAME, shown=f_number / self.share, told=f_number)
 
 
+@dataclass(frozen=True, slots=True)
+class ShownContrast:
+    """The contrast of a shadow over the calibrated one that texture shows: through an aperture of `kappa` periods, by
+    how much more for each unit of its logarithm, and the standard error."""
+
+    kappa: float
+    contrast: float
+    sigma: float
+    slope: float = 0.0
+
+    def beside(self, kappa: float, contrast: float) -> ShownContrast:
+        """It with what texture shows through another aperture."""
+        apart = math.log(kappa / self.kappa)
+        return replace(self, slope=(contrast - self.contrast) / apart) if abs(apart) > _STEP else self
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the calibrated contrast is less probable than others."""
+        return abs(self.contrast - 1) > 2 * self.error
+
+    @property
+    def error(self) -> float:
+        """The standard error, with that of the model."""
+        return math.hypot(self.sigma, _TEXTURE_CONTRAST)
+
+    def at(self, kappas: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(n,) through each of these."""
+        return np.clip(self.contrast + self.slope * np.log(kappas / self.kappa), FAINTEST, STRONGEST)
+
+
 def used_aperture(
     slices: NDArray[np.complex64],
     transfers: NDArray[np.complex128],
@@ -256,13 +288,16 @@ def used_aperture(
     rotation_rad: float,
     aperture: Aperture,
     distance_known: bool = True,
+    texture: ShownContrast | None = None,
+    faded: Sequence[bool] = (False, True),
 ) -> UsedAperture:
     """The aperture of a frame from its slices complex64 (K, h, w), DC first, and their known transfers T_k (K,).
 
     The most probable κ within a factor `SEARCHED` of `nominal_kappa`. An f-number is near the truth, or now and then
     told wrong altogether; where the mask's distance is only known to some percent (not `distance_known`), so is κ. The
     nominal one where the means carry no information or fit no aperture. Another contrast of the shadow is taken only
-    where it explains the means, which are far from those of all apertures with the calibrated one.
+    where it explains the means, which are far from those of all apertures with the calibrated one, or where that is
+    far from what `texture` shows. `faded` says whether another contrast is tried.
     """
     sigma, far = (_NOMINAL_SIGMA, _FAR_NOMINAL) if distance_known else (_UNKNOWN_SIGMA, _FAR_UNKNOWN)
     nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
@@ -275,12 +310,22 @@ def used_aperture(
     least = math.inf
     kappas = nominal_kappa * np.exp(off)
     there = _expected(wanted, kappas, rotation_rad, aperture.views)
-    for faded in (False, True):
-        if faded and least <= _MOVED:
+    price = _MOVED if texture is None else _SELDOM_FADED
+    for another in faded:
+        if another and least <= price:
             break  # another contrast costs as much
         for shape, means in zip(SHAPES, there, strict=True):
             at = Aperture(aperture.views, shape)
-            found, cost = _fitted(seen.real, error, means, kappas, aperture=at, prior=prior, faded=faded)
+            found, cost = _fitted(
+                seen.real,
+                error,
+                means,
+                kappas,
+                aperture=at,
+                prior=prior + price * another,
+                faded=another,
+                texture=texture,
+            )
             if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
                 best, least = found, cost
     if best is None:
@@ -422,19 +467,22 @@ def _fitted(
     aperture: Aperture,
     prior: NDArray[np.float64],
     faded: bool,
+    texture: ShownContrast | None,
 ) -> tuple[UsedAperture | None, float]:
     """The most probable of `kappas`, evenly spaced in the logarithm, and its cost; None for no fit.
 
     `there` are the means through the aperture (see `_expected`), `prior` is what each costs before the frame is seen.
-    `faded`: with the contrast that suits each best.
+    `faded`: with the contrast that suits each, and `texture`, best.
     """
-    cost, contrast, agreement = prior, np.ones(len(kappas)), _AGREEMENT**2
+    contrast, agreement = np.ones(len(kappas)), _AGREEMENT**2
+    shown, weight = (texture.at(kappas), texture.error**-2) if texture else (contrast, 0.0)
     if faded:
-        agreement = _EXPLAINED
-        contrast = (there * seen / error**2).sum(axis=1) / np.maximum((there**2 / error**2).sum(axis=1), 1e-30)
-        contrast = np.clip(contrast, _FAINTEST, _STRONGEST)
-        cost = cost + _MOVED
+        agreement = agreement if texture else _EXPLAINED
+        wanted = (there * seen / error**2).sum(axis=1) + weight * shown
+        contrast = wanted / np.maximum((there**2 / error**2).sum(axis=1) + weight, 1e-30)
+        contrast = np.clip(contrast, FAINTEST, STRONGEST)
         there = there * contrast[:, None]
+    cost = prior + weight * (contrast - shown) ** 2
     deviations = ((there - seen) / error) ** 2
     cost = deviations.sum(axis=1) + cost
     best = int(np.argmin(cost))
