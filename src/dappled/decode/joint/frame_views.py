@@ -178,13 +178,29 @@ class TakenSlices:
 
 
 def place_of(
-    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, farther: bool = False, workers: int = 1
+    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, moved: bool, workers: int = 1
 ) -> MaskPlace | None:
-    """Where the slices place the mask (see `mask_place`), or `farther` (`place_farther`); None where the joint model is
-    not for them."""
+    """Where the slices place the mask (see `mask_place`); None where the joint model is not for them."""
     if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
         return None
-    return (place_farther if farther else mask_place)(
+    return mask_place(
+        taken.values,
+        taken.model(),
+        samples_px=taken.samples,
+        noise=taken.noise(),
+        reach=taken.reach,
+        changes=changes,
+        steps_px=steps_px,
+        moved=moved,
+        workers=workers,
+    )
+
+
+def place_farther_of(
+    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, workers: int = 1
+) -> MaskPlace | None:
+    """About where the slices place a mask that is far off (see `place_farther`); of slices that `place_of` is for."""
+    return place_farther(
         taken.values,
         taken.model(),
         samples_px=taken.samples,

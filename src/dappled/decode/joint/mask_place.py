@@ -165,12 +165,14 @@ def mask_place(
     reach: float,
     changes: Floats,
     steps_px: tuple[float, float],
+    moved: bool = False,
     workers: int = 1,
 ) -> MaskPlace | None:
     """The mask's place by slices complex64 (K, h, w), the half plane of `model`, DC first; None for too small ones.
 
     `samples_px`, `noise` and `reach` as for `joint_views`. `changes` (2, 2, 2) are `carrier_changes`, `steps_px` is by
-    how many rows and columns of the sensor a sample steps.
+    how many rows and columns of the sensor a sample steps. Slices of a mask that has `moved` were turned back to where
+    it was found: it lies beside that by what is most probable, however little.
     """
     shape = (slices.shape[1], slices.shape[2])
     witness = MaskWitness.of(shape, model, samples_px=samples_px, reach=reach, workers=workers)
@@ -193,7 +195,7 @@ def mask_place(
             break
         likely = float(found.max())
         differences, terms = _terms(seen, wholes[int(found.argmax())], workers)
-        place = _Likelihood(differences, terms, away).place()
+        place = _Likelihood(differences, terms, away).place(moved=moved)
         if some == USUAL and not place.far().moved:
             kind = kinds[int(found.argmax())]
             place = _with_contrast(place, slices, seen, kind, away=away, patches=patches, reach=reach)
@@ -386,8 +388,8 @@ class _Likelihood:
     terms: NDArray[np.complex128]
     changed: Floats
 
-    def place(self) -> MaskPlace:
-        """The most probable place: the calibrated one where no other is surer."""
+    def place(self, *, moved: bool) -> MaskPlace:
+        """The most probable place: the calibrated one where no other is surer, unless the mask has `moved`."""
         found, nats = np.zeros(4), self.nats(np.zeros(4))
         still = self._best(np.zeros((1, 4)))
         for one in (still, self.anywhere()):
@@ -396,7 +398,7 @@ class _Likelihood:
         if found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP:
             found = np.zeros(4)  # patches that gain, each for a reason of its own
             nats = self.nats(found)
-        if nats > SEEN_NATS:  # else it would be off by what is not sure enough to be another place
+        if nats > SEEN_NATS and (moved or found.any()):  # else off by what is not sure enough to be another place
             found = self._risen(found, np.arange(4))
         return self.at(found, nats)
 

@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 from dappled.decode.array_types import Floats
-from dappled.decode.joint.frame_views import TakenSlices, place_of
+from dappled.decode.joint.frame_views import TakenSlices, place_farther_of, place_of
 from dappled.decode.joint.mask_place import MaskPlace
 from dappled.decode.lightfield.aperture import ShownContrast, UsedAperture
 
@@ -33,7 +33,7 @@ def placed(
         return found.at, found.width, found.place
     at = search.moved(taken, by_means)
     width = at.width(distance_known=distance_known)
-    start = place_of(taken.through(width).used(), changes, taken.samples_px, farther=True, workers=workers)
+    start = place_farther_of(taken.through(width).used(), changes, taken.samples_px, workers=workers)
     farther = None if start is None else search.settled(start)
     if farther is not None and farther.place is not None and farther.place.seen:
         return farther.at, farther.width, farther.place
@@ -62,15 +62,16 @@ class _Search:
         back = by.undone(at.values, at.orders, self.changes, at.samples_px)
         return replace(at.moved(by.periods), values=back, rotation_rad=at.rotation_rad + by.turn_rad)
 
-    def place(self, at: TakenSlices, width: UsedAperture) -> MaskPlace | None:
-        return place_of(at.through(width).used(), self.changes, at.samples_px, workers=self.workers)
+    def place(self, at: TakenSlices, width: UsedAperture, *, moved: bool) -> MaskPlace | None:
+        through = at.through(width).used()
+        return place_of(through, self.changes, at.samples_px, moved=moved, workers=self.workers)
 
     def settled(self, start: MaskPlace) -> _Found:
         """From a place on, again from what was found until it stands."""
         at, place = self.moved(self.taken, start), start
         width = at.width(distance_known=self.distance_known)
         for number in range(_ROUNDS):
-            rest = self.place(at, width)
+            rest = self.place(at, width, moved=place.moved)
             if rest is None:
                 return _Found(at, width, None)
             place = rest.beyond(place.periods, place.turn_rad, place.off)
@@ -90,7 +91,7 @@ class _Search:
         if shown is None or not shown.doubtful:
             return shown
         other = at.width(distance_known=self.distance_known, texture=shown, faded=(True,))
-        there = self.place(at, other)
+        there = self.place(at, other, moved=False)
         then = None if there is None else _shown(there, other)
         return shown if then is None else shown.beside(then.kappa, then.contrast)
 
