@@ -234,9 +234,10 @@ def _expected(
     # One hypothesis has no variance between hypotheses.
     several = np.count_nonzero(probable.any(axis=1), axis=0) > 1
     multiplicity = frame.multiplicity.astype(np.float32)
-    moved = np.zeros((len(low), frame.alone.shape[1], patches), dtype=np.complex64)
-    variance = np.zeros(moved.shape[1:])
-    for one, odd in zip(hypotheses, probable, strict=True):
+    variance = np.zeros((frame.alone.shape[1], patches))
+    ends = np.cumsum([one.rows.shape[1] for one in hypotheses])
+    freedom = np.zeros((len(low), ends[-1], patches), dtype=np.complex64)  # of patches, in all hypotheses
+    for one, odd, end in zip(hypotheses, probable, ends, strict=True):
         used = np.flatnonzero(odd.sum(axis=0))
         if not len(used):
             continue
@@ -245,14 +246,16 @@ def _expected(
         shown = one.rows.shape[1]
         shrunk = np.tensordot(shares[:, :, -shown:], odd[:, used], axes=(0, 0)).astype(np.float32)
         found = shrunk * times(one.rows, some_of(low, used))
+        freedom[:, end - shown : end, used] = found
         viewed = one.viewed[:, -shown:]
-        moved[:, :, used] += times(viewed.transpose(0, 2, 1), found)
         between = several[used]
         if between.any():
             squares = _squares(viewed, some_of(found, between), multiplicity)
             variance[:, used[between]] += squares / odd[:, used[between]].sum(axis=0)
-        weighted = (np.abs(one.viewed) ** 2 * multiplicity[:, None, None]).reshape(-1, moved.shape[1])
+        weighted = (np.abs(one.viewed) ** 2 * multiplicity[:, None, None]).reshape(-1, len(variance))
         variance += (shares.reshape(count, -1) @ weighted).T @ odd
+    viewed = np.concatenate([one.viewed[:, -one.rows.shape[1] :] for one in hypotheses], axis=1)
+    moved = times(viewed.transpose(0, 2, 1), freedom)
     if several.any():
         some = moved[:, :, several]
         variance[:, several] -= np.einsum("fvn,f->vn", some.real**2 + some.imag**2, multiplicity)

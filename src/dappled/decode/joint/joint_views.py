@@ -305,7 +305,7 @@ def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
     """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, which `kinds`
-    (M,) with parallax they are likely to be, and their `spectra` (F, A, M)."""
+    (M,) with parallax they are likely to be, ascending, and their `spectra` (F, A, M)."""
 
     members: NDArray[np.intp]
     frame: FrameModel
@@ -327,8 +327,10 @@ class _Looked:
         tried = [first, *(rests_in(one, first, mean) for one in frames[1:])]
         kinds = likely_kinds(frame, tried[0], spectra, with_parallax=True)
         likely = likely_errors(frames, tried, kinds, spectra)
+        order = np.argsort(kinds, kind="stable")
+        apart = (order[likely[order] == number] for number in range(len(frames)))
         return [
             cls(members[some], one, rests, kinds[some], some_of(spectra, some))
-            for one, rests, some in zip(frames, tried, (likely == n for n in range(len(frames))), strict=True)
-            if some.any()
+            for one, rests, some in zip(frames, tried, apart, strict=True)
+            if len(some)
         ]

@@ -332,8 +332,12 @@ def single(values: Doubles) -> Terms:
 
 
 def some_of(spectra: Complexes, which: NDArray[np.bool_] | NDArray[np.intp]) -> Complexes:
-    """Those of `which` patches, of (F, A, N); by an index NumPy would leave them with the patches apart in memory."""
-    return np.asarray(spectra.take(np.flatnonzero(which) if which.dtype == np.bool_ else which, axis=2))
+    """Those of `which` patches, of (F, A, N), no copy where they are one after the other; by an index NumPy would leave
+    them with the patches apart in memory."""
+    places = np.flatnonzero(which) if which.dtype == np.bool_ else which
+    if len(places) and (np.diff(places) == 1).all():
+        return spectra[:, :, places[0] : places[-1] + 1]
+    return np.asarray(spectra.take(places, axis=2))
 
 
 def times(matrix: NDArray[Any], spectra: NDArray[Any]) -> NDArray[Any]:
@@ -453,7 +457,7 @@ def _at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra
                 left = left - np.complex64(turn) * spectra[:, 0, some_patches]
             nats = shrunk * -(left.real**2 + left.imag**2)
             nats -= volume
-            found[:, some_patches] += np.tensordot(_means_of_odds(nats), frame.weights, axes=(1, 0))
+            found[:, some_patches] += frame.weights @ _means_of_odds(nats)
     return np.asarray(found.max(axis=0))
 
 
