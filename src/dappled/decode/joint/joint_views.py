@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +143,8 @@ def joint_views(
         for share in np.unique(stray[alike])
     ]
     parts.sort(key=lambda part: -len(part[1]))  # a large one that is left to the end is waited for
+    spectra_of = _PatchSpectra(patches, slices, back.astype(np.complex64), common)
+    made = _PatchViews.empty(patches, means, model.aperture.views)
     found: dict[int, list[_Looked]] = {}
 
     def look(part: int) -> None:
@@ -150,25 +153,22 @@ def joint_views(
         ringing = rings * mean if group[members[0]] == _TEXTURES else np.zeros(len(rings))
         here = replace(frame, noise=frame.noise + ringing**2, astray=float(stray[members[0]]))
         power = (np.abs(patches.spectra(first[:, alike])[:, 0]) ** 2).mean(axis=1)
-        spectra = np.empty((len(frame.frequencies), len(frame.noise), len(members)), dtype=np.complex64)
-        for some in spans(len(members), AT_A_TIME):
-            cut = patches.cut(slices, members[some]) * back[:, None, None, None].astype(np.complex64)
-            spectra[:, :, some] = patches.spectra(patches.less_means(cut, common)[0])
-        found[part] = _Looked.of(here, power, mean, members, spectra)
+        looked = _Looked.of(here, power, mean, members, spectra_of(members))
+        for one, spectra in looked:
+            made.solve(one, spectra)
+        found[part] = [one for one, _ in looked]
 
     each(look, range(len(parts)), workers)
     looked = [one for part in range(len(parts)) for one in found[part]]
-    made = _PatchViews.empty(patches, means, model.aperture.views)
-    each(made.solve, looked, workers)
     still = likely = np.zeros(len(means), dtype=bool)
     told: list[ToldPatches] = []
     if model.aperture.views >= _FEWEST_VIEWS:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
-        made.solve_at_rest(looked, still, workers)
+        made.solve_at_rest(looked, still, spectra_of, workers)
         shares = shares_of(depths, frame.ranges[USUAL].disparities, patches)
         shares[still] = 0
-        each(lambda one: told.extend(made.told(one, shares)), looked, workers)
+        each(lambda one: told.extend(made.told(one, shares, spectra_of)), looked, workers)
         likely = likely_told(told, patches)
     apart = made.apart()
     variance = made.variance + made.of_apart * apart
@@ -186,6 +186,27 @@ def joint_views(
         in_band=sum(np.count_nonzero(part.in_band) for part in told) / len(means),
     )
     return JointViews(views, sigma.reshape(*shape, *patches.grid), how)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _PatchSpectra:
+    """The spectra of patches of `slices` (K, h, w), which are turned by `back` (K,) and taken what they have in
+    `common` (K,) with the first. They are computed when they are asked for: those of all patches would take four times
+    the memory of the slices."""
+
+    patches: Patches
+    slices: Complexes
+    back: Complexes
+    common: NDArray[Any]
+
+    def __call__(self, members: NDArray[np.intp]) -> Complexes:
+        """(F, A, M)"""
+        bins, orders = len(self.patches.multiplicity), 2 * len(self.slices) - 1
+        spectra = np.empty((bins, orders, len(members)), dtype=np.complex64)
+        for some in spans(len(members), AT_A_TIME):
+            cut = self.patches.cut(self.slices, members[some]) * self.back[:, None, None, None]
+            spectra[:, :, some] = self.patches.spectra(self.patches.less_means(cut, self.common)[0])
+        return spectra
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,59 +230,70 @@ class _PatchViews:
         variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
         return cls(patches, lit, windowed, variance, of_apart, np.zeros(len(means), dtype=bool))
 
-    def solve(self, one: _Looked) -> None:
-        """With any disparity."""
-        self._solve(one, np.arange(len(one.members)), one.kinds, np.ones(len(one.members), dtype=bool))
+    def solve(self, one: _Looked, spectra: Complexes) -> None:
+        """A part with these `spectra` (F, A, M), with any disparity."""
+        self._solve(one, one.members, spectra, one.kinds, np.ones(len(one.members), dtype=bool))
 
-    def solve_at_rest(self, looked: Sequence[_Looked], still: NDArray[np.bool_], workers: int) -> None:
+    def solve_at_rest(
+        self, looked: Sequence[_Looked], still: NDArray[np.bool_], spectra_of: _PatchSpectra, workers: int
+    ) -> None:
         """With hardly any parallax where patches are `still` (N,), and with none that a patch could tell where the
         frame is motionless."""
-        resting = [one for one in looked if still[one.members].any()]
+        resting = [(one, one.members[still[one.members]]) for one in looked if still[one.members].any()]
+        taken: dict[int, Complexes] = {}
         moved = np.full(len(still), np.inf)
-        if still.mean() > MOST_STILL:
 
-            def ask(one: _Looked) -> None:
-                here = still[one.members]
-                moved[one.members[here]] = moved_nats(one.frame, one.rests, some_of(one.spectra, here))
+        def ask(number: int) -> None:
+            one, members = resting[number]
+            taken[number] = spectra_of(members)
+            if still.mean() > MOST_STILL:
+                moved[members] = moved_nats(one.frame, one.rests, taken[number])
 
-            each(ask, resting, workers)
+        each(ask, range(len(resting)), workers)
         if not (still.any() and is_motionless(moved[still])):
             moved[:] = np.inf
 
-        def rest(one: _Looked) -> None:
-            here = np.flatnonzero(still[one.members])
-            kinds = likely_kinds(one.frame, one.rests, some_of(one.spectra, here), with_parallax=False)
-            self._solve(one, here, kinds, moved[one.members[here]] >= MOVES_NATS)
+        def rest(number: int) -> None:
+            (one, members), spectra = resting[number], taken.pop(number)
+            kinds = likely_kinds(one.frame, one.rests, spectra, with_parallax=False)
+            self._solve(one, members, spectra, kinds, moved[members] >= MOVES_NATS)
 
-        each(rest, resting, workers)
+        each(rest, range(len(resting)), workers)
 
-    def _solve(self, one: _Looked, which: NDArray[np.intp], kinds: NDArray[np.intp], moved: NDArray[np.bool_]) -> None:
-        """Solve `which` (N,) patches of a part, of these `kinds` (N,); those at rest that have not `moved` (N,) have no
-        parallax that a patch could tell."""
+    def _solve(
+        self,
+        one: _Looked,
+        which: NDArray[np.intp],
+        spectra: Complexes,
+        kinds: NDArray[np.intp],
+        moved: NDArray[np.bool_],
+    ) -> None:
+        """Solve `which` (N,) patches of a part, with these `spectra` (F, A, N), of these `kinds` (N,); those at rest
+        that have not `moved` (N,) have no parallax that a patch could tell."""
         frame, own = one.frame, one.rests.own
         for number in np.unique(kinds):
             kind = KINDS[number]
             background = PatchBackground.of(one.rests.of(number), frame.alone, kind.alone * own)
             left = variance_of_views(frame.multiplicity @ background.left)[:, None] / SIDE**2
             for still in (False, True):
-                chosen = which[(kinds == number) & (moved != still)]
+                chosen = np.flatnonzero((kinds == number) & (moved != still))
                 if not len(chosen):
                     continue
                 some = frame.ranges[MOTIONLESS_RANGE if still else kind.range]
-                members = one.members[chosen]
+                members = which[chosen]
                 self.of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
                 self.beyond[members] = kind.range == BEYOND
-                for few, made, found in views_at_any(frame, some, own, background, some_of(one.spectra, chosen)):
+                for few, made, found in views_at_any(frame, some, own, background, some_of(spectra, chosen)):
                     self.windowed[members[few]] = self.patches.images(views_of(made), self.lit[members[few]])
                     self.variance[:, members[few]] = of_alone * left + of_rest * variance_of_views(found)
 
-    def told(self, one: _Looked, shares: Floats) -> list[ToldPatches]:
+    def told(self, one: _Looked, shares: Floats, spectra_of: _PatchSpectra) -> list[ToldPatches]:
         """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
         here = np.isin(one.kinds, USUAL_KINDS) & shares[one.members].any(axis=1)
         if not here.any():
             return []
         members = one.members[here]
-        spectra, kinds = some_of(one.spectra, here), one.kinds[here]
+        spectra, kinds = spectra_of(members), one.kinds[here]
         found = views_told(one.frame, one.rests, spectra, shares[members])
         gained = found.nats - usual_nats(one.frame, one.rests, kinds, spectra)
         windowed = self.patches.images(views_of(found.spectra), self.lit[members])
@@ -304,21 +336,20 @@ def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Looked:
-    """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, which `kinds`
-    (M,) with parallax they are likely to be, ascending, and their `spectra` (F, A, M)."""
+    """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, and which `kinds`
+    (M,) with parallax they are likely to be, ascending."""
 
     members: NDArray[np.intp]
     frame: FrameModel
     rests: Rests
     kinds: NDArray[np.intp]
-    spectra: Complexes
 
     @classmethod
     def of(
         cls, frame: FrameModel, power: Floats, mean: float, members: NDArray[np.intp], spectra: Complexes
-    ) -> list[_Looked]:
-        """Those of each likely error, from the mean power (F,) of the first slice and the mean of all patches that look
-        alike."""
+    ) -> list[tuple[_Looked, Complexes]]:
+        """Those of each likely error with their spectra, from the mean power (F,) of the first slice and the mean of
+        all patches that look alike."""
         radius = frame.radius(frame.frequencies)
         spectrum = TexturePower.of(np.maximum(power - frame.noise[0], 0), radius)
         strength = spectrum.at(radius)
@@ -330,7 +361,7 @@ class _Looked:
         order = np.argsort(kinds, kind="stable")
         apart = (order[likely[order] == number] for number in range(len(frames)))
         return [
-            cls(members[some], one, rests, kinds[some], some_of(spectra, some))
+            (cls(members[some], one, rests, kinds[some]), some_of(spectra, some))
             for one, rests, some in zip(frames, tried, apart, strict=True)
             if len(some)
         ]

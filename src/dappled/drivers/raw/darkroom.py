@@ -385,9 +385,12 @@ class FrameLineariser:
             return spread(rows.plane(self._recipe.workers))
         return rows
 
-    def clipped(self, raw: RawFile) -> Plane:
-        """Return 1 where a masked frame's pixel is clipped and 0 elsewhere; spread, local means stay the same."""
+    def clipped(self, raw: RawFile) -> Plane | None:
+        """Return 1 where a masked frame's pixel is clipped and 0 elsewhere; spread, local means stay the same. None
+        where none is."""
         found = (shares_of_white(raw, 1) >= WHITE_SHARE).astype(np.float32)
+        if not found.any():
+            return None
         return spread(found) if self._is_staggered(raw.mosaic.shape, raw.camera_model or "") else found
 
     def _is_staggered(self, shape: tuple[int, int], model: str) -> bool:
