@@ -69,11 +69,9 @@ the caller's waited for a core for about as long (`/proc/PID/schedstat`); in a t
 libgphoto2's waited 30 ms, so that no delayed acknowledgement is in it. The service's unit has CPUWeight=400 against
 this.
 
-**Joint views in 400 MB for 10 MP.** A decode of 10.24 MP to 5 × 5 views holds 610 MB at most (allocations of Python,
-one worker). In use at the same time are: the frame as it was read, as linear values and in the padded transform 104 MB,
-its slices 24, tables of disparities and folded detail 120, spectra of its patches 106, windowed views 98, the views 23;
-and for a moment 120 MB of matching costs, or 115 of hypotheses. The frame's and the patches' shares grow with its size,
-the tables don't: 2.5 MP take 271 MB.
+**Joint views in 400 MB for 10 MP.** A decode of 10.24 MP to 5 × 5 views holds 390 MB at most (allocations of Python,
+one worker; 611 before views were made by real numbers, and spectra when they are asked for). Its frame's and its
+patches' shares grow with its size, its tables of disparities and folded detail don't.
 
 ## What is not measured
 
