@@ -288,7 +288,7 @@ class PlainMaker(PictureMaker):
         }
         picture = UnmaskedPicture(trusted=plane > 0, dark_share=0.0, soft_share=0.0, sure_noise=1.0, **facts)
         clipped = finding(Code.PICTURE_CLIPPED, FRAME, share=0.03)
-        rest: Any = {"raw": SimpleNamespace(colour_names=("G",)), "sensor": None}
+        rest: Any = {"raw": SimpleNamespace(colour_names=("G",)), "sensor": None, "corner": (0, 0)}
         return MadePicture(picture, focal_length_mm=50.0, f_number=8.0, colour_matrix=None, findings=(clipped,), **rest)
 
 

@@ -13,7 +13,8 @@ from dappled.decode.optics.carriers import Lattice, MaskedOptics, Order, Sensor
 from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import MosaicPlane
 from dappled.decode.picture.picture import picture_of
-from dappled.decode.picture.shadow import Shadow, ShadowEvidence, ShadowFrom, period_of, shadow_of, told_by
+from dappled.decode.picture.shadow import Shadow, ShadowEvidence, ShadowFrom, period_of
+from dappled.decode.picture.shadow_fit import shadow_of, told_by
 from tests.decode.picture.drawn import COUNT, FILMS, SHAPE, V_MM, Drawn, draw
 from tests.decode.ray_trials import mask_of
 

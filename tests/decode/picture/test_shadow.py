@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import UnmaskedPicture, interpolated, picture_of
-from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of, shadow_of
+from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of
+from dappled.decode.picture.shadow_fit import shadow_of
 from tests.decode.picture.full_rays import Shot, psnr
 
 MASK = Mask(15.5, 2)

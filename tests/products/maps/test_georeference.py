@@ -24,7 +24,7 @@ from dappled.clock import RecordedClock
 from dappled.config.profiles import CameraProfile
 from dappled.decode.geometry import camera_pose, from_euler
 from dappled.decode.lightfield.light_field import LightField
-from dappled.decode.picture import shadow
+from dappled.decode.picture import shadow_fit
 from dappled.decode.picture.blocks import MosaicPlane
 from dappled.drivers.raw import picture_maker
 from dappled.drivers.raw.darkroom import Darkroom
@@ -375,8 +375,8 @@ def test_a_flight_s_shadow_is_measured_once_in_each_frame(
 
         return one
 
-    monkeypatch.setattr(picture_maker, "told_by", counted(shadow.told_by))
-    monkeypatch.setattr(picture_maker, "shadow_of", counted(shadow.shadow_of))
+    monkeypatch.setattr(picture_maker, "told_by", counted(shadow_fit.told_by))
+    monkeypatch.setattr(picture_maker, "shadow_of", counted(shadow_fit.shadow_of))
     output = tmp_path / "maps"
     main(words(short_flight, output, "--as", "cog", "--gsd", "0.1", "--workers", "1"))
     frames = json.loads((output / "report.json").read_text())["frames"]

@@ -8,7 +8,6 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import FullSizePicture
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import SlicesDecoder
@@ -17,7 +16,7 @@ from dappled.decode.lightfield import LightField
 from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import PictureMaker
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Level, told
+from dappled.findings import FRAME, told
 from dappled.flight import FlightFolder, Tag
 from dappled.flight.flight_report import FlightContents
 
@@ -111,9 +110,7 @@ class FlightFrames:
             if self._maker is None:
                 raise DappledError(_NO_MASK)
             made = self._maker.picture(path, focal_length_mm=tag.focal_length_mm, f_number=tag.f_number)
-            jpeg = pictures.jpeg((developing.developed(made) >> 8).astype(np.uint8), 90)
-            doubts = tuple(one for one in made.findings if one.level > Level.NOTE)
-            self._last = index, FullSizePicture(jpeg, doubts)
+            self._last = index, FullSizePicture(developing.jpeg(made), made.doubts)
         return self._last[1]
 
     def _file(self, index: int) -> tuple[str, Tag]:

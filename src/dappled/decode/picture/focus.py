@@ -157,20 +157,19 @@ def _ghosts(
     both, count = np.concatenate([carriers, middles]), len(carriers)
     ghost, detail, pixels, steep = np.zeros((4, *blocks, count))
     for colour in {one.place.colour for one in samples}:  # its places together: what repeats with the pattern goes
-        sums = [np.zeros((*blocks, len(both)), dtype=np.complex64) for _ in range(2)]
+        sums = np.zeros((2, *blocks, len(both)), dtype=np.complex64)
         yy, yx, xx, number = np.zeros((4, *blocks))
         apart = _apart(carriers, [one.place for one in samples if one.place.colour == colour], shadow)
         for one, band in zip(samples, bands, strict=True):
             if one.place.colour == colour:
                 rows, columns = one.place.at(shadow.shape)
                 own = rest[one.place.cut]
-                slopes = [np.gradient(band, each, axis=axis).astype(np.float32) for axis, each in enumerate(step)]
-                for axis, slope in enumerate(slopes):
-                    sums[axis] += wave_sums(own * slope, rows, columns, both, (edges[0], edges[1]))
+                slopes = np.stack([np.gradient(band, each, axis=axis) for axis, each in enumerate(step)])
+                sums += wave_sums(own * slopes, rows, columns, both, (edges[0], edges[1]))
                 yy += block_sums(slopes[0] * slopes[0], *edges)
                 yx += block_sums(slopes[0] * slopes[1], *edges)
                 xx += block_sums(slopes[1] * slopes[1], *edges)
-                number += block_sums(np.ones_like(own), *edges)
+                number += np.outer(*(np.diff(one, append=n) for one, n in zip(edges, own.shape, strict=True)))
         power = (
             xx[..., None] * np.abs(sums[0]) ** 2
             + yy[..., None] * np.abs(sums[1]) ** 2

@@ -20,8 +20,6 @@ _CLEAR = 5.5  # standard deviations of what the search finds where no carriers a
 def searched(part: Singles, lattice: Lattice, orders: Sequence[Order], *, turned: float, scaled: float) -> Lattice:
     """The lattice, turned (radians) and scaled (a share) by no more than given, at which the spectrum of `part` (h, w),
     frame over local mean less 1, has its peaks; the given one where it has none."""
-    if not (turned or scaled):
-        return lattice
     part = part * np.outer(np.hanning(part.shape[0]), np.hanning(part.shape[1])).astype(np.float32)
     size = [fft.next_fast_len(side, real=True) for side in part.shape]
     power = np.abs(fft.rfft2(part, s=size)) ** 2

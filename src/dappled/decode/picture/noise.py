@@ -120,16 +120,14 @@ def _spectrum(image: Singles, side: int) -> Floats:
     """Mean power over blocks (side, side // 2 + 1); of white noise its variance."""
     window = np.hanning(side + 2)[1:-1]
     window = np.outer(window, window).astype(np.float32) / np.mean(window**2)
-    total = np.zeros((side, side // 2 + 1))
     starts = [
         np.unique(np.linspace(0, whole - side, min(_BLOCKS, max(1, 2 * (whole // side) - 1))).astype(int))
         for whole in image.shape
     ]
-    for row, column in itertools.product(*starts):
-        block = image[row : row + side, column : column + side]
-        waves = fft.rfft2((block - block.mean()) * window)
-        total += waves.real**2 + waves.imag**2
-    return np.asarray(total / (len(starts[0]) * len(starts[1]) * side * side))
+    blocks = np.stack([image[row : row + side, column : column + side] for row, column in itertools.product(*starts)])
+    waves = fft.rfft2((blocks - blocks.mean(axis=(1, 2), keepdims=True)) * window)
+    power = (waves.real**2 + waves.imag**2).mean(axis=0, dtype=np.float64)
+    return np.asarray(power / side**2)
 
 
 @lru_cache(maxsize=8)

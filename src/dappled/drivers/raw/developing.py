@@ -12,6 +12,7 @@ import numpy as np
 import rawpy
 import tifffile
 from numpy.typing import NDArray
+from PIL import Image
 
 from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
@@ -27,6 +28,7 @@ _SRGB_OF_XYZ = np.array(
     [[3.2404542, -1.5371385, -0.4985314], [-0.9692660, 1.8760108, 0.0415560], [0.0556434, -0.2040259, 1.0572252]]
 )
 _GREY_OF_SRGB = np.array([0.2126, 0.7152, 0.0722], dtype=np.float32)  # BT.709
+_QUALITY = 90
 _CURVE = (2.4, 12.92)  # sRGB's, as LibRaw takes it
 
 
@@ -35,6 +37,13 @@ def developed(made: MadePicture) -> NDArray[np.uint16]:
     if _bayer(made) is not None:
         return _by_libraw(made, _CURVE)
     return np.asarray(np.round(srgb.encoded(np.clip(_everywhere(made), 0, 1)) * 65535), dtype=np.uint16)
+
+
+def jpeg(made: MadePicture) -> bytes:
+    """A JPEG in sRGB, to look at."""
+    file = io.BytesIO()
+    Image.fromarray((developed(made) >> 8).astype(np.uint8)).save(file, "JPEG", quality=_QUALITY)
+    return file.getvalue()
 
 
 def linear(made: MadePicture, *, colour: bool = True) -> Singles:

@@ -21,13 +21,14 @@ from dappled.decode.optics import LAWS, Lattice, Order, Sensor
 from dappled.decode.optics.visibility import OrderStrength, order_strengths
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
-from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of, shadow_of, told_by
+from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of
+from dappled.decode.picture.shadow_fit import shadow_of, told_by
 from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.findings import Code, Finding, Level, Subject, above_note, finding
 
 _TURNED, _SCALED = 0.03, 0.02  # radians, and of the period: how far a mask may lie from a law's prediction
 _TURNED_SINCE, _SCALED_SINCE = 0.02, 0.006  # since its calibration
@@ -80,16 +81,23 @@ class ToldShadow:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MadePicture:
-    """The picture of one file: `raw` is the file's, `sensor` that of `picture` (a staggered chip's is spread),
+    """The picture of one file: `raw` is the file's, `sensor` that of the whole frame (a staggered chip's is spread), of
+    which `picture` begins at row and column `corner`.
     `colour_matrix` (3, 3) from XYZ to the camera's red, green and blue, None where LibRaw knows none."""
 
     picture: UnmaskedPicture
     raw: RawFile
     sensor: Sensor
+    corner: tuple[int, int]
     focal_length_mm: float
     f_number: float | None
     colour_matrix: Floats | None
     findings: tuple[Finding, ...]
+
+    @property
+    def doubts(self) -> tuple[Finding, ...]:
+        """What speaks against it."""
+        return tuple(above_note(self.findings))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,6 +105,7 @@ class _Frame:
     path: Path
     raw: RawFile
     mosaic: MosaicPlane
+    corner: tuple[int, int]
     decoder: MaskDecoder
     lens: _Lens
 
@@ -116,11 +125,12 @@ class _Frame:
 
 
 class PictureMaker:
-    """Makes pictures of frames by one recipe; keeps the shadow of its white frame."""
+    """Makes pictures of frames by one recipe, with `most_px` of their middle alone, at most so many pixels on a side;
+    keeps the shadow of its white frame."""
 
-    def __init__(self, recipe: Recipe) -> None:
+    def __init__(self, recipe: Recipe, most_px: int | None = None) -> None:
         self._darkroom = Darkroom(replace(recipe, white=""))
-        self._recipe = recipe
+        self._recipe, self._most_px = recipe, most_px
         self._white: Shadow | None = None
 
     def check(self) -> None:
@@ -145,7 +155,7 @@ class PictureMaker:
             shadow = self._shadow(frame, [one for one in told if one.alike == frame.alike])
             made = picture_of(frame.mosaic, shadow, period_of(shadow.lattice))
         found = self._findings(Subject("frame", str(path)), raw, made, decoder, lens)
-        return MadePicture(made, raw, decoder.optics.sensor, *lens, _colour_matrix(path, raw), found)
+        return MadePicture(made, raw, decoder.optics.sensor, frame.corner, *lens, _colour_matrix(path, raw), found)
 
     def tell(self, one: LensFrame) -> ToldShadow | None:
         """What a frame tells of its shadow; None where it shows none. Raises DappledError."""
@@ -161,24 +171,15 @@ class PictureMaker:
         if focal_length_mm is None:
             raise DappledError(f"{one.path}: its focal length is unknown: give it with --focal-length")
         with naming(one.path):
-            mosaic = self._mosaic(raw)
-            decoder = self._darkroom.mask_decoder(mosaic.shape, raw.camera_model or "")
-        return _Frame(one.path, raw, mosaic, decoder, (focal_length_mm, one.f_number or raw.f_number))
+            mosaic, corner = self._mosaic(raw)
+            shape = mosaic.shape[0] + 2 * corner[0], mosaic.shape[1] + 2 * corner[1]
+            decoder = self._darkroom.mask_decoder(shape, raw.camera_model or "")
+        return _Frame(one.path, raw, mosaic, corner, decoder, (focal_length_mm, one.f_number or raw.f_number))
 
-    def _mosaic(self, raw: RawFile) -> MosaicPlane:
-        """A frame's linear values with its colours as they are; a staggered chip's samples at their places."""
-        cfa, black = raw.colour_pattern()
-        pattern = np.zeros((1, 1), dtype=np.intp) if cfa is None else np.asarray(cfa, dtype=np.intp)
+    def _mosaic(self, raw: RawFile) -> tuple[MosaicPlane, tuple[int, int]]:
+        staggered = self._darkroom.camera(raw.camera_model or "").staggered(raw.mosaic.shape)
         dark = reading.read(Path(self._recipe.dark)).mosaic if self._recipe.dark else None
-        ones = np.ones(int(pattern.max()) + 1)
-        plane = planes.to_plane(raw.mosaic, black=black, white=raw.white, cfa=cfa, balance=ones, dark=dark)
-        if raw.developed:
-            plane = np.asarray(srgb.decoded(np.clip(plane, 0, 1)), dtype=np.float32)
-        valid = shares_of_white(raw, 1) < WHITE_SHARE
-        profile = self._darkroom.camera(raw.camera_model or "")
-        if profile.staggered(plane.shape):
-            plane, valid, pattern = _spread(plane), _spread(valid), _spread_pattern(pattern)
-        return MosaicPlane(plane, pattern, None if valid.all() else valid)
+        return mosaic_of(raw, self._most_px, staggered=staggered, dark=dark)
 
     def _shadow(self, frame: _Frame, told: Sequence[ToldShadow]) -> Shadow:
         decoder, known = frame.decoder, self._known(frame)
@@ -204,7 +205,7 @@ class PictureMaker:
     def _white_shadow(self, frame: _Frame) -> Shadow:
         if self._white is None:
             with naming(self._recipe.white):
-                mosaic = self._mosaic(self._darkroom.read(self._recipe.white))
+                mosaic, _ = self._mosaic(self._darkroom.read(self._recipe.white))
                 found = shadow_of(mosaic, *frame.expected, turned=_TURNED, scaled=_SCALED)
                 self._white = replace(found, source=ShadowFrom.WHITE)
         return self._white
@@ -239,6 +240,33 @@ class PictureMaker:
         if made.soft_share > 0:
             found.append(finding(Code.PICTURE_SOFT, subject, share=made.soft_share))
         return tuple(found)
+
+
+def mosaic_of(
+    raw: RawFile, most_px: int | None = None, *, staggered: bool, dark: NDArray[Any] | None = None
+) -> tuple[MosaicPlane, tuple[int, int]]:
+    """A frame's linear values with its colours as they are, of a `staggered` chip its samples at their places, and the
+    row and column that they begin at. With `most_px` its middle of at most so many pixels on a side."""
+    cfa, black = raw.colour_pattern()
+    pattern = np.zeros((1, 1), dtype=np.intp) if cfa is None else np.asarray(cfa, dtype=np.intp)
+    wide = 2 if staggered else 1
+    top, left = (
+        0 if most_px is None else max(0, -(-(side - most_px // across) // (4 * step))) * 2 * step
+        for side, step, across in zip(raw.mosaic.shape, pattern.shape, (1, wide), strict=True)
+    )
+    inner = slice(top, raw.mosaic.shape[0] - top), slice(left, raw.mosaic.shape[1] - left)
+    part = replace(raw, mosaic=raw.mosaic[inner])
+    ones = np.ones(int(pattern.max()) + 1)
+    dark = None if dark is None else dark[inner]
+    plane = planes.to_plane(part.mosaic, black=black, white=raw.white, cfa=cfa, balance=ones, dark=dark)
+    if raw.developed:
+        plane = np.asarray(srgb.decoded(np.clip(plane, 0, 1)), dtype=np.float32)
+    good = shares_of_white(part, 1) < WHITE_SHARE
+    valid = None if good.all() else good
+    if staggered:
+        plane, pattern = _spread(plane), _spread_pattern(pattern)
+        valid = None if valid is None else _spread(valid)
+    return MosaicPlane(plane, pattern, valid), (top, wide * left)
 
 
 def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[Order]:

@@ -1,0 +1,412 @@
+"""What a frame tells of the mask's shadow, by least squares.
+
+With L the frame's local mean over a period, frame − L is regressed on L · e^{2πi k·F x}. Blocks weigh by what they
+leave unexplained, clipped and defective pixels by nothing, each colour has coefficients of its own, and these vary over
+the frame as polynomials where that explains blocks that were held out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from dappled.decode.array_types import Floats, Singles
+from dappled.decode.optics import Lattice, Order
+from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, kept_by_mean, local_mean, wave_sums
+from dappled.decode.picture.lattice_search import searched
+from dappled.decode.picture.shadow import (
+    Coefficients,
+    Fit,
+    OwnShadow,
+    Shadow,
+    ShadowEvidence,
+    ShadowFrom,
+    lattice_bins,
+    lattice_of_bins,
+    period_of,
+    terms_at,
+)
+
+# Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
+
+_BLOCK_PX, _BLOCK_PERIODS = 64, 4  # a block's side is at least both
+_RIDGE = 1e-6  # of the mean of the diagonal: orders that fall together on a coarse pattern share what they explain
+_DEGREES = (0, 2)  # of the polynomials that are tried
+_SEARCH_SIDE = 2048  # pixels of the frame's middle that the lattice is searched in
+_FOUND_BINS = 0.5  # standard error of the lattice after the search
+_DEEP = 0.2  # standard deviation of W from which on local means are taken again with the shadow known
+_KEPT = 0.02  # of a carrier in local means: from which on it counts that it is missing beside them
+_STEPS = 3  # of Gauss and Newton, at most
+_ENOUGH = 0.1  # of the frame
+_SHEARED = 5e-4  # of a print on its way: longer along one axis, or at no right angle
+_STILL_BINS = 3e-3  # of a frame: a lattice so near is kept
+_LEAST = 1e-3  # of the frame's mean: darker local means tell nothing of the shadow
+_UNPULLED = 0.2  # where a few blocks make the whole fit, their scatter tells next to nothing
+
+
+def shadow_of(
+    mosaic: MosaicPlane,
+    lattice: Lattice,
+    orders: Sequence[Order],
+    *,
+    turned: float = 0.0,
+    scaled: float = 0.0,
+    others: Sequence[Shadow] = (),
+    beside: Sequence[ShadowEvidence] = (),
+) -> Shadow:
+    """The shadow that explains a frame best: its own, one of `others` (a white frame's, a calibration's), or none.
+    What frames `beside` it tell, of the same mask, lens, stop and orders, is averaged with its own, those left out
+    whose shadow is another.
+
+    `lattice` is where the carriers are expected, `orders` those of the half plane without the mean. The search for the
+    lattice allows for a turn (radians) and for a print's scale to either side. What a shadow explains is counted on
+    blocks that it was not fitted to.
+    """
+    if beside:
+        lattice = lattice_of_bins(
+            mosaic.shape, np.median([lattice_bins(mosaic.shape, one.lattice) for one in beside], axis=0)
+        )
+    return told_by(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others).shadow(others, beside)
+
+
+def told_by(
+    mosaic: MosaicPlane,
+    lattice: Lattice,
+    orders: Sequence[Order],
+    *,
+    turned: float = 0.0,
+    scaled: float = 0.0,
+    others: Sequence[Shadow] = (),
+) -> OwnShadow:
+    """What one frame tells of its shadow, and of `others`, see `shadow_of`."""
+    equations, means = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
+    at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
+    gains = []
+    for one in others:
+        if (where := (one.lattice, one.orders)) not in at:
+            at[where] = _Equations.of(means, *where)
+        gains.append(at[where].explained(one, equations.weights) - equations.unexplained)
+    return OwnShadow(equations.evidence(), tuple(gains))
+
+
+def _equations_of(
+    mosaic: MosaicPlane, lattice: Lattice, orders: Sequence[Order], *, turned: float, scaled: float
+) -> tuple[_Equations, _Means]:
+    """The equations of a frame's own shadow, at its own lattice; and the local means that they are of."""
+    half = tuple(order for order in orders if order != (0, 0))
+    mosaic = _unclipped(mosaic, period_of(lattice))
+    means = _Means.of(mosaic, period_of(lattice))
+    found = lattice
+    if turned or scaled:
+        found = searched(means.quotient(), lattice, half, turned=turned, scaled=scaled)
+    equations = _Equations.of(means, found, half)
+    for _ in range(_STEPS):
+        if (finer := equations.lattice()) is None:
+            break
+        # Where pixels are left out, a block's middle is not where its samples are.
+        equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half, found)
+    first = equations.evidence((0,)).shadow(ShadowFrom.FRAME, degree=0)
+    assert first is not None
+    kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
+    lost = bool(np.any(np.abs(kept) > _KEPT))
+    if lost:
+        first = replace(
+            first, coefficients=first.coefficients / np.where(np.abs(1 - kept) > 0.1, 1 - kept, 0.1)[:, None]
+        )
+    if known := first.depth > _DEEP or mosaic.valid is not None or lost:
+        means = _Means.of(mosaic, means.period, first)  # where the light was is known better behind a known shadow
+    if known or equations.at != found:
+        equations = _Equations.of(means, equations.at, half, found)
+    if mosaic.valid is None and equations.at != found and (finer := equations.lattice()) is not None:
+        equations = _Equations.of(means, finer, half, found)
+    return equations, means
+
+
+def _unclipped(mosaic: MosaicPlane, period: float) -> MosaicPlane:
+    """Without what lies within a period of a clipped pixel, where enough is left: of pixels as bright as a bright part
+    of the mask makes them, only those of dark places of the scene are not clipped."""
+    if mosaic.valid is None:
+        return mosaic
+    here = mosaic.there
+    sound = ndimage.minimum_filter(mosaic.valid | ~here, 2 * math.ceil(period / 2) + 1) & here
+    return replace(mosaic, valid=sound) if float(sound.sum()) > _ENOUGH * float(here.sum()) else mosaic
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Means:
+    """A mosaic with the local means of each place's samples."""
+
+    mosaic: MosaicPlane
+    period: float
+    means: tuple[tuple[PatternPlace, Singles, Singles | None], ...]
+
+    @classmethod
+    def of(cls, mosaic: MosaicPlane, period: float, shadow: Shadow | None = None) -> _Means:
+        made = []
+        for place in mosaic.places():
+            values = np.ascontiguousarray(mosaic.plane[place.cut])
+            good = None if mosaic.valid is None else mosaic.valid[place.cut].astype(np.float32)
+            weights = good
+            if shadow is not None:  # least squares: Σ frame·W / Σ W²
+                values, weights = values * (known := shadow.at(place)), known * known
+                if good is not None:
+                    weights *= good
+            mean = local_mean(values if good is None else values * good, period, place.step, weights)
+            made.append((place, mean, good))
+        return cls(mosaic, period, tuple(made))
+
+    def floor(self) -> float:
+        return _LEAST * max(float(np.mean([mean[::7, ::7].mean() for _, mean, _ in self.means])), 1e-9)
+
+    def quotient(self) -> Singles:
+        """(frame − local mean) / local mean in the frame's middle."""
+        shape, floor = self.mosaic.shape, self.floor()
+        made = np.zeros(shape, dtype=np.float32)
+        for place, mean, good in self.means:
+            part = self.mosaic.plane[place.cut] / np.maximum(mean, floor) - 1
+            made[place.cut] = np.clip(part if good is None else part * good, -2, 4)
+        start = [max(0, (side - _SEARCH_SIDE) // 2) for side in shape]
+        return made[start[0] : start[0] + _SEARCH_SIDE, start[1] : start[1] + _SEARCH_SIDE]
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """Normal equations of the coefficients, block by block: `gram` (colours, blocks, n, n) and `right` (colours,
+    blocks, n) of the mean, `orders` and their opposites. `energy` and `count` are of each block's frame − L."""
+
+    shape: tuple[int, int]
+    at: Lattice
+    like: Lattice  # but for a turn and a scale, about as it is
+    orders: tuple[Order, ...]
+    centres: Floats
+    gram: NDArray[np.complex64]
+    right: NDArray[np.complex64]
+    energy: Floats
+    count: Floats
+    odd: NDArray[np.bool_]
+    sound: float  # share of the samples that aren't left out
+
+    @classmethod
+    def of(cls, means: _Means, lattice: Lattice, orders: tuple[Order, ...], like: Lattice | None = None) -> _Equations:
+        mosaic, floor = means.mosaic, means.floor()
+        every = np.array([(0, 0), *orders, *((-ky, -kx) for ky, kx in orders)], dtype=np.intp)
+        apart = every[:, None] - every[None, :]
+        sign = np.where((apart[..., 0] > 0) | ((apart[..., 0] == 0) & (apart[..., 1] >= 0)), 1, -1)
+        unique, index = np.unique((apart * sign[..., None]).reshape(-1, 2), axis=0, return_inverse=True)
+        index = index.reshape(len(every), len(every))
+        side = max(_BLOCK_PX, math.ceil(_BLOCK_PERIODS * means.period))
+        steps = mosaic.pattern.shape
+        across = [math.ceil(side / step) * step for step in steps]
+        blocks = [max(1, whole // one) for whole, one in zip(mosaic.shape, across, strict=True)]
+        shape = (mosaic.colours, blocks[0] * blocks[1])
+        n, half = len(every), len(orders) + 1
+        gram = np.zeros((*shape, len(unique)), dtype=np.complex64)
+        right = np.zeros((*shape, n), dtype=np.complex64)
+        energy, count = np.zeros(shape), np.zeros(shape)
+        matrix = lattice.matrix()
+        for place, mean, good in means.means:
+            rows, columns = place.at(mosaic.shape)
+            high = mosaic.plane[place.cut] - mean
+            known = mean > floor
+            keep = known.astype(np.float32) if good is None else good * known
+            high *= keep
+            weight = mean * keep
+            edges = tuple(
+                np.arange(number) * (one // step) for number, one, step in zip(blocks, across, steps, strict=True)
+            )
+            waves = wave_sums(weight * high, rows, columns, every[:half] @ matrix, (edges[0], edges[1]))
+            right[place.colour, :, :half] += waves.reshape(shape[1], -1)
+            sums = wave_sums(weight * mean, rows, columns, unique @ matrix, (edges[0], edges[1]))
+            gram[place.colour] += sums.reshape(shape[1], -1)
+            for values, into in ((high * high, energy), (keep, count)):
+                into[place.colour] += block_sums(values, edges[0], edges[1]).ravel()
+        right[..., half:] = right[..., 1:half].conj()
+        whole = np.ascontiguousarray(gram[..., index])
+        np.conjugate(whole, out=whole, where=sign < 0)
+        middles = []
+        for number, one, full in zip(blocks, across, mosaic.shape, strict=True):
+            ends = np.append(np.arange(number) * one, full)  # the last is longer
+            middles.append((ends[1:] + ends[:-1]) / 2 - full / 2)
+        y, x = np.meshgrid(*middles, indexing="ij")
+        odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
+        centres = np.column_stack([y.ravel(), x.ravel()])
+        sound = float(np.mean([1 if good is None else good.mean() for _, _, good in means.means]))
+        return cls(mosaic.shape, lattice, like or lattice, orders, centres, whole, right, energy, count, odd, sound)
+
+    def moved(self, lattice: Lattice) -> _Equations:
+        """About the same at a lattice so near that waves turn little within a block."""
+        every = np.array([(0, 0), *self.orders, *((-ky, -kx) for ky, kx in self.orders)], dtype=np.float64)
+        off = self.centres @ (every @ (lattice.matrix() - self.at.matrix())).T
+        turns = np.exp(-2j * np.pi * off).astype(np.complex64)
+        gram = self.gram * turns[:, :, None] * turns[:, None, :].conj()
+        return replace(self, at=lattice, gram=gram, right=self.right * turns)
+
+    @cached_property
+    def _gram_parts(self) -> Floats:
+        """`gram` (colours, blocks, 2 n n), real and imaginary."""
+        return self.gram.reshape(*self.gram.shape[:2], -1).astype(np.complex128).view(np.float64)
+
+    @cached_property
+    def weights(self) -> Floats:
+        """(colours, blocks): one over what a block leaves unexplained, per pixel."""
+        made = []
+        for colour in range(len(self.right)):
+            plain = np.where(self.count[colour] > 0, 1.0, 0.0)
+            c = self._solved(colour, plain, 0)
+            left = self.energy[colour] - self._gains(colour, self._local(c, 0))
+            spread = np.maximum(left, 0) / np.maximum(self.count[colour], 1)
+            usual = float(np.median(spread[self.count[colour] > 0])) if plain.any() else 1.0
+            made.append(plain / np.maximum(spread + 0.05 * usual, 1e-12))
+        return np.array(made)
+
+    def _terms(self, degree: int) -> Floats:
+        return terms_at(self.centres, self.shape, degree)
+
+    def _local(self, c: Coefficients, degree: int) -> Coefficients:
+        """(blocks, n) the coefficients at each block, of c (n, terms)."""
+        return np.asarray(self._terms(degree) @ c.T)
+
+    def _gains(self, colour: int, c: Coefficients) -> Floats:
+        """(blocks,) how much of a block's energy coefficients (blocks, n) explain."""
+        first = 2 * (c.conj() * self.right[colour]).sum(axis=1).real
+        image = np.matmul(self.gram[colour], c[:, :, None].astype(np.complex64))[:, :, 0]
+        return np.asarray(first - (c.conj() * image).sum(axis=1).real)
+
+    def _solved(self, colour: int, weights: Floats, degree: int) -> Coefficients:
+        """Coefficients (n, terms)."""
+        whole, right = self._normal(colour, weights, degree)
+        return np.asarray(np.linalg.solve(whole, right).reshape(self.right.shape[2], -1))
+
+    def _normal(self, colour: int, weights: Floats, degree: int) -> tuple[Coefficients, Coefficients]:
+        """The normal equations of coefficients (n, terms): matrix and right side."""
+        terms, n = self._terms(degree), self.right.shape[2]
+        count = terms.shape[1]
+        first, second = np.triu_indices(count)
+        pairs = weights[:, None] * terms[:, first] * terms[:, second]
+        gram = np.empty((count, count, n, n), dtype=np.complex128)
+        gram[first, second] = (pairs.T @ self._gram_parts[colour]).view(np.complex128).reshape(-1, n, n)
+        gram[second, first] = gram[first, second]
+        whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count)
+        right = (self.right[colour].T @ (weights[:, None] * terms)).reshape(n * count).astype(np.complex128)
+        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole).real) / len(whole), 1e-30)
+        return whole, right
+
+    def held_out(self, degree: int) -> float:
+        """Log likelihood that coefficients gain over the mean alone, on the blocks that they were not fitted to."""
+        total = -self.unexplained
+        for colour, weights in enumerate(self.weights):
+            for fold in (self.odd, ~self.odd):
+                if not fold.any() or fold.all():
+                    continue
+                c = self._solved(colour, np.where(fold, 0.0, weights), degree)
+                total += float((weights * self._gains(colour, self._local(c, degree)))[fold].sum()) / 2
+        return total
+
+    @cached_property
+    def unexplained(self) -> float:
+        """`explained` without a shadow."""
+        return self.explained(None)
+
+    def explained(self, other: Shadow | None, weights_of_blocks: Floats | None = None) -> float:
+        """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none.
+        (Those of several shadows compare where blocks weigh the same.)"""
+        total, n = 0.0, self.right.shape[2]
+        for colour, weights in enumerate(self.weights if weights_of_blocks is None else weights_of_blocks):
+            local = np.zeros((len(weights), n), dtype=np.complex128)
+            if other is not None:
+                c = other.coefficients[min(colour, len(other.coefficients) - 1)]
+                local = terms_at(self.centres, self.shape, other.degree) @ np.concatenate([0 * c[:1], c, c.conj()]).T
+            local[:, 0] = 1
+            image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
+            found = (local.conj() * (self.right[colour] + self.gram[colour][:, :, 0])).sum(axis=1).real
+            whole = (local.conj() * image).sum(axis=1).real
+            local *= (weights @ found) / max(float(weights @ whole), 1e-30)
+            local[:, 0] -= 1
+            total += float((weights * self._gains(colour, local)).sum()) / 2
+        return total
+
+    def evidence(self, degrees: Sequence[int] = _DEGREES) -> ShadowEvidence:
+        """What the frame tells, with polynomials of these degrees."""
+        sure = np.asarray(np.linalg.inv(self._lattice_step[1] + 1e-8 * np.eye(4)))
+        return ShadowEvidence(self.shape, self.at, self.orders, sure, tuple(map(self._fitted, degrees)))
+
+    def _unpulled(self, colour: int, weights: Floats, terms: Floats) -> Floats:
+        """(blocks,) 1 − how far a block draws the fit towards itself, by which its residual is too small."""
+        sure = weights * self.gram[colour][:, 0, 0].real
+        whole = np.einsum("bi,b,bj->ij", terms, sure, terms)
+        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole)), 1e-30)
+        pull = sure * np.einsum("bi,ij,bj->b", terms, np.linalg.inv(whole), terms)
+        return np.asarray(np.maximum(1 - pull, _UNPULLED))
+
+    def _fitted(self, degree: int) -> Fit:
+        """Coefficients, and their errors by the scatter between blocks."""
+        half = slice(1, len(self.orders) + 1)
+        found, spread = [], []
+        terms = self._terms(degree)
+        for colour, weights in enumerate(self.weights):
+            whole, right = self._normal(colour, weights, degree)
+            inverse = np.linalg.inv(whole)
+            c = (inverse @ right).reshape(-1, terms.shape[1])
+            local = self._local(c, degree)
+            image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
+            scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
+            errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
+            errors /= self._unpulled(colour, weights, terms)[:, None, None]
+            # Where pixels are clipped dark places alone are left, which err alike.
+            spread.append((np.abs(errors) ** 2).sum(axis=0)[half] / max(self.sound, _LEAST) ** 2)
+            found.append(c[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
+        return Fit(degree, np.array(found), np.array(spread), self.held_out(degree))
+
+    def lattice(self) -> Lattice | None:
+        """The lattice that the phases of the blocks agree on best, by one Gauss–Newton step; None where it is so near
+        that nothing changes."""
+        step, _ = self._lattice_step
+        if float(np.abs(step).max()) < _STILL_BINS:
+            return None
+        return lattice_of_bins(self.shape, lattice_bins(self.shape, self.at) + step)
+
+    @cached_property
+    def _lattice_step(self) -> tuple[Floats, Floats]:
+        """(4,) how far the lattice lies off, in bins of rows of ky and kx, of columns of ky and kx; and (4, 4) the
+        covariance of its error, by the scatter between blocks."""
+        half, count = np.array(self.orders, dtype=np.float64), len(self.orders)
+        normal, scores = np.zeros((4 + count, 4 + count)), np.zeros((len(self.centres), 4 + count))
+        levers = 2 * np.pi * np.einsum("bd,kj,d->bkdj", self.centres, half, 1 / np.array(self.shape))
+        levers = levers.reshape(len(self.centres), count, 4)
+        parts = []
+        for colour, weights in enumerate(self.weights):
+            c = self._solved(colour, weights, 0)[1 : count + 1, 0]
+            turned = weights[:, None] * (c.conj() * self.right[colour][:, 1 : count + 1]).imag
+            sure = (weights * self.gram[colour][:, 0, 0].real)[:, None] * np.abs(c) ** 2
+            parts.append(sure)
+            normal[:4, :4] += np.einsum("bki,bk,bkj->ij", levers, sure, levers)
+            normal[:4, 4:] += np.einsum("bki,bk->ik", levers, sure)
+            normal[4:, 4:] += np.diag(sure.sum(axis=0))
+            scores[:, :4] += np.einsum("bki,bk->bi", levers, turned)
+            scores[:, 4:] += turned
+        normal[4:, :4] = normal[:4, 4:].T
+        normal += np.diag([*[1 / _FOUND_BINS**2] * 4, *[1e-9] * count])
+        total = scores.sum(axis=0)
+        back, bins = np.linalg.inv(self.like.matrix()), 1 / np.array(self.shape)
+        moves = np.einsum("ak,jb,j->jkab", back, np.eye(2), bins).reshape(4, 2, 2)
+        now = back @ self.at.matrix()
+        for unlike, pull in (
+            (moves[:, 0, 0] - moves[:, 1, 1], now[0, 0] - now[1, 1]),
+            (moves[:, 0, 1] + moves[:, 1, 0], now[0, 1] + now[1, 0]),
+        ):
+            normal[:4, :4] += np.outer(unlike, unlike) / _SHEARED**2
+            total[:4] -= unlike * pull / _SHEARED**2
+        inverse = np.linalg.inv(normal)
+        step = inverse @ total
+        sure = np.sum(parts, axis=0)
+        explained = sure * (levers @ step[:4] + step[4:])
+        scores[:, :4] -= np.einsum("bki,bk->bi", levers, explained)
+        scores[:, 4:] -= explained
+        errors = scores @ inverse[:, :4]
+        return step[:4], np.asarray(errors.T @ errors)
