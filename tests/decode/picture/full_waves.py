@@ -8,16 +8,72 @@ The wave that a lens with a square stop focuses on the sensor point x₀ passes 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 Grid = NDArray[np.float64]
-PITCH_UM, DISTANCE_UM, PER_UM = 10.0, 480.0, 15.5e-3
 COLOURS_UM = (0.45, 0.55, 0.65)
-FINER, ORDERS = 4, 6  # samples a pixel; the film's amplitude has more orders than its transmittance
+FINER = 4  # samples a pixel
+
+
+@dataclass(frozen=True)
+class WaveCamera:
+    """A film of transmittance (1 + Σ cos)(1 + Σ cos) ("diagonal": Σ cos·cos), black where that is lowest, of the `p`
+    harmonics of its frequency that it can draw, before a sensor of this pitch (rows, columns)."""
+
+    per_um: float
+    p: int
+    pattern: Literal["full", "diagonal"]
+    pitch_um: tuple[float, float]
+    distance_um: float
+    px_per_um: float = math.inf  # of the film
+
+    @property
+    def orders(self) -> int:
+        """Of the film's amplitude, which has more than its transmittance."""
+        return 2 * self.drawn + 2
+
+    @property
+    def drawn(self) -> int:
+        """The highest harmonic."""
+        return self.p if math.isinf(self.px_per_um) else min(self.p, int(self.px_per_um / 2 / self.per_um + 1e-9))
+
+    @cached_property
+    def amplitudes(self) -> NDArray[np.complex128]:
+        """t_k for −orders … orders on both axes: the film's phase is flat, its transmittance of mean 1."""
+        n = 16 * self.orders
+        turns = 2 * np.pi * np.arange(n) / n
+        waves = np.array([np.cos(m * turns) for m in range(1, self.drawn + 1)])
+        if self.pattern == "full":
+            line = 1 + waves.sum(axis=0)
+            light = np.outer(line, line)
+        else:
+            light = waves.T @ waves
+        light = light - light.min()
+        if not math.isinf(self.px_per_um):  # a film's pixels are squares
+            blur = np.sinc(fft.fftfreq(n, 1 / n) * self.per_um / self.px_per_um)
+            light = np.maximum(fft.ifft2(fft.fft2(light) * np.outer(blur, blur)).real, 0)
+        found = fft.fft2(np.sqrt(light / light.mean())) / n**2
+        orders = np.arange(-self.orders, self.orders + 1)
+        return np.asarray(found[np.ix_(orders, orders)])
+
+
+def canon(period_px: int, p: int) -> WaveCamera:
+    """A 450D with one of the thesis' masks on 4k film."""
+    return WaveCamera(113.8e-3 / period_px, p, "diagonal", (14.8e3 / 2848, 22.2e3 / 4272), 1010.0, 113.8e-3)
+
+
+REFERENCE = WaveCamera(15.5e-3, 2, "full", (10.0, 10.0), 480.0)
+CAMERAS = {
+    "reference": REFERENCE,
+    **{f"mask-{number}": canon(*one) for number, one in enumerate(((5, 2), (10, 2), (10, 4), (20, 10), (20, 5)), 1)},
+}
 
 
 @dataclass(frozen=True)
@@ -30,13 +86,27 @@ class WaveShot:
     shape: tuple[int, int] = (192, 192)
     contrast: float = 0.12
     masked: bool = True
+    camera: WaveCamera = REFERENCE
+    seed: int = 5
+
+    def shadow(self) -> Grid:
+        """What the film makes of a white page, 1 in the mean."""
+        return replace(self, contrast=0.0).light() / 0.4
+
+    def band(self, frame: Grid) -> Grid:
+        """What a slice around the mean holds: half of the carriers' distance to each side."""
+        half = 0.5 * self.camera.per_um
+        keep = [
+            np.abs(fft.fftfreq(side, one)) < half for side, one in zip(self.shape, self.camera.pitch_um, strict=True)
+        ]
+        return np.asarray(fft.ifft2(fft.fft2(frame) * np.outer(*keep)).real)
 
     def scene(self) -> Grid:
         """On the fine grid, without detail that pixels can't sample."""
         fy, fx = fft.fftfreq(self.shape[0])[:, None], fft.fftfreq(self.shape[1])[None, :]
         f = np.hypot(fy, fx)
         f[0, 0] = 1
-        waves = fft.fft2(np.random.default_rng(5).normal(size=self.shape)) * f**-self.exponent
+        waves = fft.fft2(np.random.default_rng(self.seed).normal(size=self.shape)) * f**-self.exponent
         waves[0, 0] = 0
         waves[self.shape[0] // 2] = waves[:, self.shape[1] // 2] = 0
         wide = np.zeros([FINER * side for side in self.shape], dtype=complex)
@@ -47,12 +117,18 @@ class WaveShot:
 
     def light(self) -> Grid:
         """The frame, free of noise, of mean transmittance 1."""
-        scene, total = self.scene(), np.zeros(self.shape)
-        amplitudes = film_amplitudes() if self.masked else np.pad([[1.0]], ORDERS)
-        y, x = ((np.arange(side) / FINER - (side / FINER - 1) / 2) * PITCH_UM for side in scene.shape)
-        fy, fx = (fft.fftfreq(side, PITCH_UM / FINER) for side in scene.shape)
-        pixel = np.outer(*(np.sinc(f * PITCH_UM) for f in (fy, fx)))
-        reach = 4  # orders of the transmittance that are worth a wave
+        scene, total, camera = self.scene(), np.zeros(self.shape), self.camera
+        amplitudes = camera.amplitudes
+        if not self.masked:
+            amplitudes = np.zeros_like(amplitudes)
+            amplitudes[camera.orders, camera.orders] = 1
+        y, x = (
+            (np.arange(side) / FINER - (side / FINER - 1) / 2) * pitch
+            for side, pitch in zip(scene.shape, camera.pitch_um, strict=True)
+        )
+        fy, fx = (fft.fftfreq(side, pitch / FINER) for side, pitch in zip(scene.shape, camera.pitch_um, strict=True))
+        pixel = np.outer(*(np.sinc(f * pitch) for f, pitch in zip((fy, fx), camera.pitch_um, strict=True)))
+        reach = camera.drawn + 2  # orders of the transmittance that are worth a wave
         for colour in COLOURS_UM:
             seen = np.zeros(scene.shape, dtype=complex)
             for m in np.ndindex(2 * reach + 1, 2 * reach + 1):
@@ -60,24 +136,14 @@ class WaveShot:
                 pairs = amplitudes * shifted(amplitudes, my, mx).conj()
                 if np.abs(pairs).max() < 1e-4:
                     continue
-                kernel = kernels(fy, my, colour, self.f_number).T @ pairs @ kernels(fx, mx, colour, self.f_number)
-                turn = np.outer(*(np.exp(2j * np.pi * PER_UM * k * at) for k, at in ((my, y), (mx, x))))
-                seen += fft.fft2(scene * turn) * kernel
+                down, across = (kernels(camera, f, k, colour, self.f_number) for f, k in ((fy, my), (fx, mx)))
+                turn = np.outer(*(np.exp(2j * np.pi * camera.per_um * k * at) for k, at in ((my, y), (mx, x))))
+                seen += fft.fft2(scene * turn) * (down.T @ pairs @ across)
             total += fft.ifft2(seen * pixel).real[::FINER, ::FINER]
         return total / len(COLOURS_UM)
 
     def noise(self) -> Grid:
         return np.random.default_rng(77).normal(size=self.shape) * 0.4 / self.snr
-
-
-def film_amplitudes() -> NDArray[np.complex128]:
-    """t_k for −ORDERS … ORDERS on both axes: the film's phase is flat, its transmittance of mean 1."""
-    n = 64
-    turns = 2 * np.pi * np.arange(n) / n
-    line = 1 + np.cos(turns) + np.cos(2 * turns)
-    found = fft.fft2(np.sqrt((np.outer(line, line) + 0.375) / 1.375)) / n**2
-    orders = np.arange(-ORDERS, ORDERS + 1)
-    return np.asarray(found[np.ix_(orders, orders)])
 
 
 def shifted(amplitudes: NDArray[np.complex128], my: int, mx: int) -> NDArray[np.complex128]:
@@ -90,15 +156,15 @@ def shifted(amplitudes: NDArray[np.complex128], my: int, mx: int) -> NDArray[np.
     return made
 
 
-def kernels(frequencies: Grid, m: int, colour_um: float, f_number: float) -> NDArray[np.complex128]:
+def kernels(camera: WaveCamera, frequencies: Grid, m: int, colour_um: float, f_number: float) -> NDArray[np.complex128]:
     """(orders k, frequencies): the transform of A(x − s k) A*(x − s (k − m)) along one axis, s = λ d f; 1 at 0 for
     m = 0."""
     edge = 1 / (2 * colour_um * f_number)
-    step = colour_um * DISTANCE_UM * PER_UM
+    step = colour_um * camera.distance_um * camera.per_um
     low, high = np.maximum(-edge, frequencies - edge), np.minimum(edge, frequencies + edge)
     width, middle = np.maximum(high - low, 0), (high + low) / 2
     both = width * np.sinc(step * m * width) * np.exp(-2j * np.pi * step * m * middle) / (2 * edge)
-    k = np.arange(-ORDERS, ORDERS + 1)[:, None]
+    k = np.arange(-camera.orders, camera.orders + 1)[:, None]
     return np.asarray(both * np.exp(-2j * np.pi * step * (k - m) * frequencies))
 
 
@@ -110,3 +176,18 @@ def contrast_left(found: NDArray[np.floating], truth: Grid, band: tuple[float, f
     f = np.hypot(fft.fftfreq(one.shape[0])[:, None], fft.fftfreq(one.shape[1])[None, :])
     inside = (f >= band[0]) & (f < band[1])
     return float((one * other.conj()).real[inside].sum() / (np.abs(other) ** 2)[inside].sum())
+
+
+def draw(count: int = 24, seed: int = 44) -> list[tuple[str, WaveShot]]:
+    """Exposures in focus by Latin hypercube, each camera equally often."""
+    from scipy.stats import qmc  # noqa: PLC0415  half a second, which each collection of tests would take
+
+    made = []
+    for number, row in enumerate(qmc.LatinHypercube(4, rng=np.random.default_rng(seed)).random(count)):
+        name = list(CAMERAS)[math.floor(row[0] * len(CAMERAS))]
+        f_number, snr = (
+            float(low * (high / low) ** at) for at, low, high in zip(row[1:3], (5.6, 20), (22, 300), strict=True)
+        )
+        shot = WaveShot(f_number, 1.1 + 0.9 * row[3], snr, (160, 160), camera=CAMERAS[name], seed=number)
+        made.append((name, shot))
+    return made

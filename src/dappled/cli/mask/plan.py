@@ -17,7 +17,9 @@ if not words_only:
     from dappled.decode.optics import MaskedOptics, carrier_tables, lenses
     from dappled.decode.optics.lenses import SingleFrameDepth, SurveyPlan
     from dappled.decode.optics.mask_design import SMALL_VIEW_PX
+    from dappled.decode.optics.picture_contrast import PictureContrast, picture_contrast
 
+_FREQUENCIES = (0.1, 0.2, 0.3, 0.4)  # cycles a pixel
 _SHALLOW = 0.05  # of the altitude: a house is no higher
 
 
@@ -52,17 +54,19 @@ class PlanFlight(AltitudeArguments, Verb):
 
     def run(self, output: Output) -> Report:
         camera, sensor, length = self.camera_set()
-        columns, warnings, depth = None, list[str](), None
+        columns, warnings, depth, contrast = None, list[str](), None, None
         if self.mask:
             optics = MaskedOptics(sensor, profiles.mask(self.mask).mask, camera.law, camera.mask_distance_mm)
+            f_number = self.f_number or optics.mask.frequency_per_mm * optics.distance_mm
+            contrast = picture_contrast(optics, f_number, _FREQUENCIES)
             size = carrier_tables.slice_size(carrier_tables.lattice_of(optics, length), sensor.shape)
             columns = size[1] if size else None
             warnings = list(_warnings(camera, optics, length))
             if columns is not None:
-                width_mm, ideal = sensor.size_mm[1], optics.mask.frequency_per_mm * optics.distance_mm
+                width_mm = sensor.size_mm[1]
                 depth = lenses.frame_depth(
                     focal_length_mm=length,
-                    f_number=self.f_number or ideal,
+                    f_number=f_number,
                     distance_m=self.altitude,
                     pixel_mm=width_mm / sensor.shape[1],
                     view_pixel_mm=width_mm / columns,
@@ -87,6 +91,7 @@ class PlanFlight(AltitudeArguments, Verb):
         lines = [
             f"footprint  {made.footprint_m[1]:.1f} m across, {made.footprint_m[0]:.1f} m along the flight",
             f"ground     {made.ground_sample_m * 100:.2f} cm per pixel{views}",
+            *(() if contrast is None else [_contrast_line(contrast)]),
             *(() if depth is None else [_depth_line(depth)]),
             f"interval   {made.interval_s:.2f} s, {made.spacing_m:.2f} m; lines {made.line_m:.1f} m apart",
             f"body       must sustain {made.frames_per_minute:.1f} frames per minute",
@@ -94,8 +99,18 @@ class PlanFlight(AltitudeArguments, Verb):
             f"disk       {made.frames} frames, {made.disk_bytes / 1e9:.1f} GB, on the card and again on the disk",
             *(f"warning: {warning}" for warning in warnings),
         ]
-        said = {**codec.plain(made), "frame_depth": codec.plain(depth), "warnings": warnings}
+        brings = {"frame_depth": codec.plain(depth), "picture_contrast": codec.plain(contrast)}
+        said = {**codec.plain(made), **brings, "warnings": warnings}
         return Report(said, lines)
+
+
+def _contrast_line(contrast: PictureContrast) -> str:
+    """What the mask leaves of the picture's contrast."""
+    pairs = zip(contrast.cycles_per_px, contrast.left, strict=True)
+    each = ", ".join(f"{one:.2f} at {at:g}" for at, one in pairs)
+    return (
+        f"picture    contrast in focus against the camera without a mask (f/{contrast.f_number:.3g}): {each} cycles/px"
+    )
 
 
 def _depth_line(depth: SingleFrameDepth) -> str:

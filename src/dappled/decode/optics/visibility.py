@@ -131,13 +131,17 @@ def _on_the_way(
     mask: Mask, k: NDArray[np.float64], mask_distance_mm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(K,) what the film keeps of each order, and what diffraction leaves of it between mask and sensor."""
+    numbers = _WAVELENGTHS_MM * mask_distance_mm * ((k * mask.frequency_per_mm) ** 2).sum(axis=1)[:, None]  # λ·d·f²
+    return film_transfer(mask, k), np.asarray(np.sqrt((np.cos(np.pi * numbers) ** 2).mean(axis=1)))
+
+
+def film_transfer(mask: Mask, k: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(K,) what the film keeps of each order (K, 2)."""
+    if mask.film_px_per_mm is None:
+        return np.ones(len(k))
     on_film = k * mask.frequency_per_mm
-    film = np.ones(len(k))
-    if mask.film_px_per_mm is not None:
-        drawn = np.abs(on_film).max(axis=1) <= mask.film_px_per_mm / 2 * (1 + 1e-9)
-        film = np.where(drawn, np.sinc(on_film / mask.film_px_per_mm).prod(axis=1), 0.0)
-    numbers = _WAVELENGTHS_MM * mask_distance_mm * (on_film**2).sum(axis=1)[:, None]  # λ·d·f²
-    return film, np.asarray(np.sqrt((np.cos(np.pi * numbers) ** 2).mean(axis=1)))
+    drawn = np.abs(on_film).max(axis=1) <= mask.film_px_per_mm / 2 * (1 + 1e-9)
+    return np.asarray(np.where(drawn, np.sinc(on_film / mask.film_px_per_mm).prod(axis=1), 0.0))
 
 
 def under_stops(
