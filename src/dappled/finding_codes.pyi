@@ -145,6 +145,7 @@ class Code(StrEnum):
     FRAME_OFF_PLAN = "frame.off_plan"
     FRAME_ONLY_NOISE = "frame.only_noise"
     FRAME_PICKED_UP = "frame.picked_up"
+    FRAME_PICTURE_DEFOCUSED = "frame.picture_defocused"
     FRAME_REFUSED = "frame.refused"
     FRAME_REQUEST_LATE = "frame.request_late"
     FRAME_RIVAL_PICTURE = "frame.rival_picture"

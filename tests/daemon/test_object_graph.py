@@ -30,7 +30,7 @@ from tests.waiting import eventually
 _PARTS = {
     "Service", "MavlinkLinks", "PacketSender", "Component", "OwnAutopilot", "Parameters", "FlightControl", "Shutter",
     "ShotEvents", "Pipeline", "Capture", "Tagging", "Decoding", "DecodeProcess", "LiveDepth", "Answers", "Publisher",
-    "Recording", "Navigation", "Logbook",
+    "LivePictures", "Recording", "Navigation", "Logbook",
 }  # fmt: skip
 _NOT_WALKED = (str, bytes, int, float, type, types.ModuleType, logging.Logger, weakref.ref, BaseException)
 

@@ -143,6 +143,9 @@ class MemoryStream:
     def publish(self, topic: str, facts: Mapping[str, Any], body: Any = None) -> None:
         self.messages.append((topic, facts))
 
+    def wanted(self, topic: str) -> bool:
+        return False
+
     def statistics(self) -> PublisherStatistics:
         return PublisherStatistics({}, {}, 0, 0, 0)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import signal
 import socket
@@ -12,6 +13,7 @@ from pathlib import Path
 import jsonschema
 import numpy as np
 import pytest
+from PIL import Image
 
 from dappled.cli import main
 from dappled.daemon.stream.subscriber import Subscriber
@@ -127,6 +129,31 @@ def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> N
             daemon.wait(30)
         finally:
             daemon.kill()
+
+
+@pytest.mark.slow
+def test_a_picture_comes_to_those_who_subscribe_to_it(tmp_path: Path, sockets: Path) -> None:
+    """As the schema says, in each pixel of the sensor, while slices go on."""
+    endpoint = f"ipc://{sockets}/picture"
+    (tmp_path / "dappled.toml").write_text(
+        f'[record]\ndirectory = "flights"\n[publish]\nslices = "{endpoint}"\npicture_interval_s = 0\n'
+    )
+    daemon = flies(tmp_path)
+    try:
+        with Subscriber(endpoint, topics=["picture", "slices"]) as subscriber:
+            topics: list[str] = []
+            while "picture" not in topics or "slices" not in topics:
+                message = subscriber.receive(120)
+                assert message is not None
+                topics.append(message.topic)
+                if message.topic == "picture":
+                    jsonschema.validate(message.header, schema("picture"))
+                    with Image.open(io.BytesIO(message.body)) as picture:
+                        assert picture.size == (message.header["width"], message.header["height"])
+                        assert list(picture.size[::-1]) == message.header["frame_shape"]
+    finally:
+        daemon.terminate()
+        daemon.communicate(timeout=120)
 
 
 @pytest.mark.parametrize(

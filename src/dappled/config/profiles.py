@@ -44,7 +44,7 @@ class Lens:
 @dataclass(frozen=True, slots=True)
 class VerdictBounds:
     """Bounds by which the frames of a flight are judged: above the first of a pair a frame is only usable, above the
-    second it is bad. Blur is in pixels of a view."""
+    second it is bad. Blur is in pixels of a view, and of the frame for the picture at the sensor's own resolution."""
 
     blur_usable_px: float = setting(
         0.5, "motion blur above which a frame is only usable", unit="view px", low=0, high=100
@@ -54,6 +54,9 @@ class VerdictBounds:
         0.7, "defocus above which a frame is only usable", unit="view px", low=0, high=100
     )
     defocus_bad_px: float = setting(1.3, "defocus above which a frame is bad", unit="view px", low=0, high=100)
+    picture_usable_px: float = setting(
+        2.0, "blur of the picture above which a frame is only usable", unit="px", low=0, high=1000
+    )
     clipped_usable: float = setting(0.01, "clipped share above which a frame is only usable", low=0, high=1)
     clipped_bad: float = setting(0.05, "clipped share above which a frame is bad", low=0, high=1)
     black_usable: float = setting(0.5, "black share above which a frame is only usable", low=0, high=1)

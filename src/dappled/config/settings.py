@@ -247,6 +247,13 @@ class PublishSettings:
     preview_interval_s: float = setting(
         1.0, "Shortest time between two previews; 0: one for every frame", unit="s", low=0, high=3600
     )
+    picture_interval_s: float = setting(
+        5.0,
+        "Shortest time between two pictures at the sensor's own resolution, which are made for who subscribes to them",
+        unit="s",
+        low=0,
+        high=3600,
+    )
     socket_mode: str = setting("0660", "Permissions of ipc sockets, as for chmod", choices=SOCKET_MODES)
     keys: str = setting(
         "", "Secret CURVE key for tcp endpoints, made by dappled keys make; empty: tcp on loopback only"

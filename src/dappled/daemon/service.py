@@ -19,6 +19,7 @@ from typing import Any, Protocol, runtime_checkable
 import dappled
 from dappled import codec, findings
 from dappled.clock import Clock, SystemClock
+from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.body_plan import BodyPlan
@@ -47,6 +48,8 @@ from dappled.daemon.pipeline.capture import Observer, PendingShots, ShotEnds
 from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.live_picture import LivePictures
+from dappled.daemon.pipeline.occasional import Occasional
 from dappled.daemon.pipeline.overlap import OverlapWatch
 from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
@@ -117,7 +120,7 @@ class FlightParts:
     parameters: Parameters
     component: Component
     decoder: DecodeProcess | None
-    depth: LiveDepth | None
+    viewers: tuple[Occasional, ...]
     events: ShotEvents
     pipeline: Pipeline
     answers: Answers
@@ -275,25 +278,29 @@ class Service:
             series=distance,
         )
         decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
-        depth: LiveDepth | None = None
-        if recipe is not None and settings.decode.depth:
-            depth = LiveDepth(
-                DecodeProcess(recipe, clock=clock),
-                writer,
-                shots,
-                publisher,
-                method=settings.decode.depth,
-                interval_s=settings.decode.depth_interval_s,
-                clock=clock,
-                nearest=control.send_distance if settings.decode.depth_to_autopilot else None,
-            )
+        viewers: list[Occasional] = []
+        if recipe is not None:
+            making = DecodeProcess(recipe, clock=clock)  # begins with what is first wanted of it
+            common = (making, writer, shots, publisher)
+            if recipe.mask != profiles.LENSLET:
+                every_s = settings.publish.picture_interval_s
+                viewers.append(LivePictures(*common, interval_s=every_s, clock=clock))
+            if settings.decode.depth:
+                depth = LiveDepth(
+                    *common,
+                    method=settings.decode.depth,
+                    interval_s=settings.decode.depth_interval_s,
+                    clock=clock,
+                    nearest=control.send_distance if settings.decode.depth_to_autopilot else None,
+                )
+                viewers.append(depth)
         events = ShotEvents(
             recording,
             reported,
             navigation.utc,
             component=component,
             logbook=self._logbook,
-            depth=depth,
+            viewers=viewers,
             recipe=recipe,
             outside=self._outside,
         )
@@ -325,7 +332,7 @@ class Service:
             parameters,
             component,
             decoder,
-            depth,
+            tuple(viewers),
             events,
             pipeline,
             answers,
@@ -359,9 +366,9 @@ class Service:
         start = wire.start_header(publish, self._clock.utc_ns(), camera=names.camera, mask=names.mask)
         self.parts.publisher.publish("start", start)
         stack.callback(self._publish_end)
-        if self.parts.depth is not None:
-            stack.callback(self.parts.depth.stop)
-            self.parts.depth.start()
+        for one in self.parts.viewers:
+            stack.callback(one.stop)
+            one.start()
         stack.callback(self.parts.pipeline.stop, _STOP_S)
         self.parts.pipeline.start()
         stack.callback(self.parts.shutter.stop)
@@ -474,7 +481,8 @@ class Service:
         viewers: list[HasThreads] = [
             self.parts.publisher,
             self.parts.answers,
-            *(part for part in (self.parts.depth, self._console) if part is not None),
+            *self.parts.viewers,
+            *([] if self._console is None else [self._console]),
         ]
         found = (
             *self.parts.component.findings(),

@@ -1,9 +1,10 @@
-"""Report what becomes of shots and camera: to shutter, ground station, logbook, live depth and outside observers."""
+"""Report what becomes of shots and camera: to shutter, ground station, logbook, viewers' parts, outside observers."""
 
 from __future__ import annotations
 
 import logging
 from collections import deque
+from collections.abc import Sequence
 
 from dappled.daemon.body_plan import BodyNews, BodyTemperature
 from dappled.daemon.camera_protocol.camera_status import ReportedCamera, captured_shot
@@ -11,7 +12,7 @@ from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.health.logbook import Logbook, of_shot
 from dappled.daemon.navigation.clocks import UtcLearner
 from dappled.daemon.pipeline.capture import Observer, PendingShot
-from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.occasional import Occasional
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw.recipe import Recipe
@@ -39,13 +40,13 @@ class ShotEvents(Observer):
         *,
         component: Component,
         logbook: Logbook,
-        depth: LiveDepth | None,
+        viewers: Sequence[Occasional],
         recipe: Recipe | None,
         outside: Observer,
     ) -> None:
         self._recording, self._camera, self._utc = recording, camera, utc
         self._shutter, self._component, self._logbook = component.shutter, component, logbook
-        self._depth, self._recipe, self._outside = depth, recipe, outside
+        self._viewers, self._recipe, self._outside = viewers, recipe, outside
         self.misfit: Finding | None = None
         self.of_body: deque[BodyNews] = deque(maxlen=_OF_BODY)
 
@@ -74,8 +75,8 @@ class ShotEvents(Observer):
     def finished(self, pending: PendingShot) -> None:
         """Nothing more is expected of a shot."""
         self._logbook.add(*of_shot(pending))
-        if self._depth is not None:
-            self._depth.offer(pending)
+        for one in self._viewers:
+            one.offer(pending)
         self._outside.finished(pending)
 
     def camera_changed(self, change: StateChanged) -> None:

@@ -353,6 +353,24 @@ def test_a_depth_message_becomes_a_picture(rig: Rig) -> None:
         assert client.get("/api/frames/4/depth.png").content.startswith(b"\x89PNG")
 
 
+def test_a_picture_of_the_stream_is_shown_at_full_size_with_its_doubts(rig: Rig) -> None:
+    seen(rig, 4)
+    doubt = codec.plain(finding(Code.PICTURE_CLIPPED, FRAME, share=0.03))
+
+    def told() -> bool:
+        rig.feed.hub.globe_asked()  # a viewer
+        rig.publisher.publish("picture", {"frame": 4, "doubts": [doubt]}, b"\xff\xd8 a picture")
+        return bool(rig.feed.frame_event(4)["picture"])
+
+    assert not rig.feed.frame_event(4)["picture"]
+    eventually(told, "the picture is there")
+    with rig.client() as client:
+        assert client.get("/api/frames/4/full.jpg").content == b"\xff\xd8 a picture"
+        assert client.get("/api/frames/4/full.json").json()["doubts"][0].startswith("3.0% of its pixels are clipped")
+        seen(rig, 5)
+        assert "no picture at full size" in client.get("/api/frames/5/full.jpg").json()["error"]
+
+
 def test_a_globe_gets_link_overlay_and_picture(rig: Rig) -> None:
     seen(rig, 4)
     with rig.client() as client:

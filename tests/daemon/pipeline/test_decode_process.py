@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import signal
 import subprocess
@@ -12,6 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
@@ -57,6 +59,14 @@ def test_bad_frames_cost_nothing_but_themselves(decoder: DecodeProcess, frame: s
     assert done.arrays[0]["shape"][0] == len(done.carriers)
     assert done.preview.startswith(b"\xff\xd8")
     assert pid(decoder) == first
+
+
+def test_a_picture_holds_each_pixel_of_the_sensor(decoder: DecodeProcess, frame: str) -> None:
+    made = decoder.picture(frame, None, None)
+    with Image.open(io.BytesIO(made.jpeg)) as picture:
+        assert picture.size == made.size == made.frame_shape[::-1]
+    assert made.corner == (0, 0)
+    assert made.shadow_from == "frame"
 
 
 def test_a_recipe_that_can_t_work_is_told_at_the_warm_up() -> None:

@@ -1,7 +1,8 @@
-"""Depth in flight: one frame now and then, and never in anybody's way."""
+"""Depth and pictures in flight: one frame now and then, and never in anybody's way."""
 
 from __future__ import annotations
 
+import json
 import mmap
 import threading
 from typing import Any, cast
@@ -14,9 +15,16 @@ from dappled import codec
 from dappled.clock import RecordedClock
 from dappled.daemon.navigation import ExposureTime
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
-from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess, DecodeProcessError, FrameDepth
+from dappled.daemon.pipeline.decode_process import (
+    DecodedFrame,
+    DecodeProcess,
+    DecodeProcessError,
+    FrameDepth,
+    FramePicture,
+)
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
+from dappled.daemon.pipeline.live_picture import LivePictures
 from dappled.daemon.pipeline.tagging import FrameSettings as Shown
 from dappled.daemon.pipeline.tagging import tag
 from dappled.daemon.stream import wire
@@ -43,6 +51,10 @@ class FakeMaker:
 
     def close(self) -> None:
         self.closed = True
+
+    def picture(self, path: str, focal_length_mm: float | None, f_number: float | None) -> FramePicture:
+        self.asked.append((path, "picture"))
+        return FramePicture(b"jpeg", (2048, 1388), (0, 76), (1388, 2200), "frame", (DOUBT,))
 
     def depth(self, path: str, focal_length_mm: float | None, f_number: float | None, method: str) -> FrameDepth:
         self.asked.append((path, method))
@@ -86,6 +98,19 @@ class Bench:
             nearest=self.send_distance,
         )
 
+        self.viewers: set[str] = set()
+        self.pictures = LivePictures(
+            cast(DecodeProcess, self.maker),
+            cast(FlightWriter, self),
+            PendingShots(FakeCamera()),
+            cast(Publisher, self),
+            interval_s=interval_s,
+            clock=self.clock,
+        )
+
+    def wanted(self, topic: str) -> bool:
+        return topic in self.viewers
+
     def send_distance(self, nearest_m: tuple[float, float]) -> None:
         self.nearest.append(nearest_m)
 
@@ -100,9 +125,11 @@ class Bench:
 def bench() -> Any:
     one = Bench()
     one.depth.start()
+    one.pictures.start()
     yield one
     one.maker.gate.set()
     one.depth.stop()
+    one.pictures.stop()
 
 
 def test_a_message_as_the_schema_says(bench: Bench) -> None:
@@ -158,3 +185,25 @@ def test_the_nearest_distance_is_told_where_it_is_known(bench: Bench) -> None:
     bench.depth.offer(shot(1))
     eventually(lambda: bench.nearest, "it is told")
     assert bench.nearest == [(7.5, 0.2)]
+
+
+def test_a_picture_is_made_only_while_somebody_has_subscribed_to_it_and_as_the_schema_says(bench: Bench) -> None:
+    bench.pictures.offer(shot(3))
+    bench.viewers.add("picture")
+    bench.pictures.offer(shot(4))
+    bench.pictures.offer(shot(5))  # too soon
+    eventually(lambda: bench.published, "it is published")
+    ((topic, facts, body),) = bench.published
+    assert (topic, body) == ("picture", b"jpeg")
+    header = {"schema": "dappled/picture", "version": 1, "flight": "f", "seq": 0, "dropped": 0, **facts}
+    jsonschema.validate(json.loads(wire.encode(header)), schema("picture"))
+    assert (header["frame"], header["width"], header["height"]) == (4, 2048, 1388)
+    assert header["doubts"] == [codec.plain(DOUBT)]
+    assert bench.maker.asked == [("frames/4.dng", "picture")]
+    bench.viewers.clear()
+    bench.clock.advance(10)
+    bench.pictures.offer(shot(6))
+    bench.viewers.add("picture")
+    bench.pictures.offer(shot(7))
+    eventually(lambda: len(bench.published) == 2, "the next one")
+    assert [path for path, _ in bench.maker.asked] == ["frames/4.dng", "frames/7.dng"]

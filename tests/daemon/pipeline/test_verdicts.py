@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dappled.config.profiles import VerdictBounds
 from dappled.config.settings import PlannedBody
 from dappled.daemon.body_plan import exposure_of, plan_of
-from dappled.daemon.pipeline.picture_facts import PictureFacts, defocus, detail, fineness, noise_of
+from dappled.daemon.pipeline.picture_facts import PictureFacts, defocus, detail, fine_detail, fineness, noise_of
 from dappled.daemon.pipeline.verdicts import (
     FixedPlan,
     FrameFacts,
@@ -86,6 +86,10 @@ def judged(pose: Pose, *, exposure_s: float | None = 1e-3, rates: tuple[float, f
         (GOOD, "good", ""),
         (replace(GOOD, blur_view_px=0.7), "usable", "motion blur 0.7 view pixels (1.5 on the sensor)"),
         (replace(GOOD, blur_view_px=1.3), "bad", "motion blur 1.3"),
+        (replace(GOOD, blur_px=2.5), "usable", "motion blur 0.2 view pixels (2.5 on the sensor)"),
+        (replace(GOOD, picture_px=2.4), "usable", "own resolution is out of focus by 2.4 px"),
+        (replace(GOOD, picture_px=1.6), "good", ""),
+        (replace(GOOD, picture_px=9.0, defocus_view_px=2.0), "bad", "out of focus by 2.0"),
         (replace(GOOD, blur_view_px=None, blur_px=None, blur_unknown="no height"), "unknown", "no height"),
         (replace(GOOD, clipped_share=0.02), "usable", "2.0% of its pixels are clipped"),
         (replace(GOOD, clipped_share=0.06), "bad", "6.0% of its pixels are clipped"),
@@ -335,6 +339,39 @@ def test_a_lens_that_is_knocked_stays_bad_and_other_ground_is_not_out_of_focus()
     assert state(grounds[0], 1) != "bad"
     assert state(grounds[1] * np.exp(smooth * 20), 1) != "bad"  # fields in clouds' shadows
     assert [state(grounds[number % 4], 9) for number in range(100)] == ["bad"] * 100
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_a_picture_that_is_out_of_focus_by_less_than_a_view_s_pixel_is_only_usable(step: int) -> None:
+    """Samples of one colour stand two pixels apart."""
+    rng = np.random.default_rng(8)
+    judge, grounds = Judge(NADIR, on_gimbal=False), [leaves(rng).astype(np.float64) for _ in range(4)]
+    y, x = np.mgrid[-3:4, -3:4]
+    disc = (np.hypot(y, x) <= 2).astype(np.float64)
+
+    def judged(number: int, *, soft: bool) -> Verdict:
+        ground = grounds[number % 4]
+        seen_px = cv2.filter2D(ground, -1, disc / disc.sum()) if soft else ground
+        samples = [(part := seen_px[row::step, row::step], np.full(part.shape, 1e-4)) for row in range(step)]
+        seen = replace(SEEN, fine=fine_detail(samples, (step, step)))
+        return judge.judge(tag(flown()), (0, 0, 0), seen, carriers=(24, 24), doubts=())
+
+    first = [judged(number, soft=False) for number in range(6)]
+    assert {one.state for one in first} == {"good"}
+    assert [one.facts is not None and one.facts.picture_px is None for one in first] == [True] * 5 + [False]
+    for number in range(40):  # for long: what is out of focus does not become the measure
+        blurred = judged(number, soft=True)
+        assert blurred.state == "usable"
+        assert [one.code for one in blurred.reasons] == [Code.FRAME_PICTURE_DEFOCUSED]
+        assert blurred.facts is not None
+        assert blurred.facts.picture_px == pytest.approx(4.5, abs=1.5)
+    assert judged(7, soft=False).state == "good"
+
+
+def test_noise_over_the_finest_detail_leaves_the_picture_unjudged() -> None:
+    flat = np.full((192, 192), 0.3) + np.random.default_rng(2).normal(0, 0.01, (192, 192))
+    fine = fine_detail([(flat, np.full(flat.shape, 0.01))], (1, 1))
+    assert fine.circle_px is None
 
 
 def test_noise_and_shadow_do_not_hide_defocus() -> None:

@@ -89,6 +89,22 @@ def test_seq_counts_each_topic_by_itself(started: Publisher, endpoint: str) -> N
         assert [receive(subscriber, "frame").header["seq"] for _ in range(3)] == [0, 1, 2]
 
 
+def test_what_somebody_has_subscribed_to_is_wanted_until_he_leaves(started: Publisher, endpoint: str) -> None:
+    assert not started.wanted("picture")
+    with Subscriber(endpoint) as usual:
+        connected(started, usual)
+        assert started.wanted("slices")
+        assert not started.wanted("picture"), "a picture is made for those who ask for it"
+        with Subscriber(endpoint, topics=["picture"]) as viewer, Subscriber(endpoint, topics=["picture"]) as other:
+            eventually(lambda: started.wanted("picture"), "it is known")
+            for one in (viewer, other):
+                one.listen("picture", False)
+            eventually(lambda: not started.wanted("picture"), "both have enough")
+            other.listen("", True)  # all topics
+            eventually(lambda: started.wanted("picture"), "it is among all")
+        eventually(lambda: not started.wanted("picture"), "he is gone")
+
+
 def test_a_full_queue_drops_previews_before_slices_and_never_frames(endpoint: str) -> None:
     one = Publisher(endpoint, "", capacity=3)
     for topic in ("preview", "slices", "frame", "slices", "frame", "end"):  # not started: all of it waits
@@ -260,6 +276,32 @@ def test_a_reader_of_slices_that_stops_keeps_four(endpoint: str, before: int) ->
                 pass
         eventually(lambda: len(bodies.alive) <= 4, "what nobody waits for is freed")
         assert bodies.made == 12
+    context.destroy(linger=0)
+    one.stop(0.0)
+
+
+def test_pictures_that_nobody_reads_take_no_place_of_slices(endpoint: str) -> None:
+    bodies, one = Bodies(), Publisher(endpoint, "", high_water_mark=PublishSettings().high_water_mark)
+    one.start("f", no_answer)
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    deaf = context.socket(zmq.SUB)
+    deaf.setsockopt(zmq.RCVHWM, 1)
+    deaf.setsockopt(zmq.RCVBUF, 4096)
+    deaf.subscribe(b"slices")
+    deaf.subscribe(b"picture")
+    deaf.connect(endpoint)
+    with Subscriber(endpoint) as subscriber:
+        connected(one, subscriber)
+        heard(one, deaf, subscriber)
+        for topic in ("picture", "slices"):
+            for number in range(8):
+                one.publish(topic, {"frame": number, "arrays": []}, bodies.make())
+                one.publish("frame", {"frame": number})
+                while receive(subscriber, "frame").header["frame"] != number:
+                    pass
+        dropped = one.statistics().dropped
+        assert dropped["picture"] > 0
+        assert dropped["slices"] == 0
     context.destroy(linger=0)
     one.stop(0.0)
 

@@ -9,7 +9,7 @@ The wave that a lens with a square stop focuses on the sensor point x₀ passes 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -89,18 +89,6 @@ class WaveShot:
     camera: WaveCamera = REFERENCE
     seed: int = 5
 
-    def shadow(self) -> Grid:
-        """What the film makes of a white page, 1 in the mean."""
-        return replace(self, contrast=0.0).light() / 0.4
-
-    def band(self, frame: Grid) -> Grid:
-        """What a slice around the mean holds: half of the carriers' distance to each side."""
-        half = 0.5 * self.camera.per_um
-        keep = [
-            np.abs(fft.fftfreq(side, one)) < half for side, one in zip(self.shape, self.camera.pitch_um, strict=True)
-        ]
-        return np.asarray(fft.ifft2(fft.fft2(frame) * np.outer(*keep)).real)
-
     def scene(self) -> Grid:
         """On the fine grid, without detail that pixels can't sample."""
         fy, fx = fft.fftfreq(self.shape[0])[:, None], fft.fftfreq(self.shape[1])[None, :]
@@ -176,18 +164,3 @@ def contrast_left(found: NDArray[np.floating], truth: Grid, band: tuple[float, f
     f = np.hypot(fft.fftfreq(one.shape[0])[:, None], fft.fftfreq(one.shape[1])[None, :])
     inside = (f >= band[0]) & (f < band[1])
     return float((one * other.conj()).real[inside].sum() / (np.abs(other) ** 2)[inside].sum())
-
-
-def draw(count: int = 24, seed: int = 44) -> list[tuple[str, WaveShot]]:
-    """Exposures in focus by Latin hypercube, each camera equally often."""
-    from scipy.stats import qmc  # noqa: PLC0415  half a second, which each collection of tests would take
-
-    made = []
-    for number, row in enumerate(qmc.LatinHypercube(4, rng=np.random.default_rng(seed)).random(count)):
-        name = list(CAMERAS)[math.floor(row[0] * len(CAMERAS))]
-        f_number, snr = (
-            float(low * (high / low) ** at) for at, low, high in zip(row[1:3], (5.6, 20), (22, 300), strict=True)
-        )
-        shot = WaveShot(f_number, 1.1 + 0.9 * row[3], snr, (160, 160), camera=CAMERAS[name], seed=number)
-        made.append((name, shot))
-    return made

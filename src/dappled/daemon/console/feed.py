@@ -29,7 +29,8 @@ from dappled.errors import DappledError, report
 from dappled.findings import FRAME, Finding, named, remedy, told
 
 log = logging.getLogger(__name__)
-FRAMES, STACK_BYTES, PATH = 400, 72_000_000, 3600
+FRAMES, STACK_BYTES, PICTURE_BYTES, PATH = 400, 72_000_000, 24_000_000, 3600
+_WATCHED = ("slices", "depth", "picture")  # topics that are subscribed to while a viewer is there
 PAGES, WAITING = 24, 64
 GLOBE_S = 30.0  # a virtual globe counts as a viewer for so long after it asked
 _ASK_S, _KEEP_ALIVE_S = 20.0, 10.0
@@ -156,13 +157,14 @@ class Feed:
         self.start: dict[str, Any] | None = None
         self.frames: OrderedDict[int, FeedState] = OrderedDict()
         self._stacks: OrderedDict[int, Message] = OrderedDict()
+        self._pictures: OrderedDict[int, FullSizePicture] = OrderedDict()
         self._asked: dict[int, asyncio.Future[Message]] = {}
         self._stream: AsyncSubscriber | None = None
         self.path: deque[tuple[float, float]] = deque(maxlen=PATH)  # (longitude, latitude) of the vehicle
 
     async def run(self) -> None:
-        """Receive until cancelled. Slices and depth are subscribed to only while a viewer is there."""
-        topics = [topic for topic in wire.TOPICS if topic not in ("slices", "preview", "depth")]
+        """Receive until cancelled. What is large is subscribed to only while a viewer is there."""
+        topics = [topic for topic in wire.TOPICS if topic not in ("preview", *_WATCHED)]
         async with AsyncSubscriber(*self._endpoints, topics=topics, high_water_mark=3, recover=False) as stream:
             self._stream = stream
             if self._endpoints[1]:
@@ -171,7 +173,7 @@ class Feed:
             while True:
                 if self.hub.watched != listening:
                     listening = not listening
-                    for topic in ("slices", "depth"):
+                    for topic in _WATCHED:
                         stream.listen(topic, listening)
                 message = await stream.receive(0.5)
                 if message is not None:
@@ -181,8 +183,15 @@ class Feed:
                         report(log, f"a {message.topic} message was ignored", error)
 
     def full_size(self, frame: int) -> FullSizePicture:
-        """A frame's picture at the sensor's own resolution. Raises DappledError: it is not made in flight."""
-        raise FeedError(f"frame {frame} is shown at full size on the ground: dappled open")
+        """A frame's picture at the sensor's own resolution, of its middle where it is large. Raises DappledError: in
+        flight a frame now and then has one."""
+        if (kept := self._pictures.get(frame)) is None:
+            raise FeedError(f"frame {frame} has no picture at full size, or no longer has one")
+        return kept
+
+    def has_picture(self, frame: int) -> bool:
+        """Whether `full_size` has one to give."""
+        return frame in self._pictures
 
     async def slices(self, frame: int) -> Message:
         """The slices of a frame: as kept, or asked for again. Raises FeedError."""
@@ -235,6 +244,7 @@ class Feed:
             "tag": seen.tag,
             "thumb": seen.thumb is not None,
             "depth": seen.depth is not None,
+            "picture": self.has_picture(index),
             "corners": seen.corners,
             "slices": seen.slices,
             "verdict": seen.verdict,
@@ -265,6 +275,8 @@ class Feed:
                 self._slices(message)
             case "depth":
                 self._depth(message)
+            case "picture":
+                self._picture(message)
             case "end":
                 self.hub.send({"is": "end", "shots": header.get("shots")})
             case "error":
@@ -332,6 +344,15 @@ class Feed:
                 older.depth = None  # only the newest is kept
             seen.depth = message
             self.hub.send(self.frame_event(message.header["frame"]))
+
+    def _picture(self, message: Message) -> None:
+        index, header = message.header["frame"], message.header
+        doubts = codec.read(tuple[Finding, ...], header["doubts"])
+        self._pictures[index] = FullSizePicture(bytes(message.body or b""), doubts)
+        while len(self._pictures) > 1 and sum(len(one.jpeg) for one in self._pictures.values()) > PICTURE_BYTES:
+            self._pictures.popitem(last=False)
+        if index in self.frames:
+            self.hub.send(self.frame_event(index))
 
     def _answer(self, frame: Any, answer: Message | FeedError) -> None:
         waiting = self._asked.pop(frame, None)

@@ -95,6 +95,10 @@ class RecordedFeed(Feed):
         """A frame's picture at the sensor's own resolution."""
         return self._source.full_size(frame)
 
+    def has_picture(self, _frame: int) -> bool:
+        """Whether `full_size` has one to give: it is made when asked for."""
+        return True
+
     async def _decoded(self, frame: int, *, soon: bool) -> Message:
         if (kept := self._stacks.get(frame)) is not None:
             return kept

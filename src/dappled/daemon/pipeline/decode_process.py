@@ -121,6 +121,19 @@ class FrameDepth:
     doubts: tuple[Finding, ...] = ()
 
 
+@dataclass(frozen=True, slots=True)
+class FramePicture:
+    """The picture of one frame at the sensor's own resolution: a JPEG of `size` (width, height), which begins at row
+    and column `corner` of a frame of `frame_shape`. `shadow_from` see `ShadowFrom`, `doubts` what speaks against it."""
+
+    jpeg: bytes
+    size: tuple[int, int]
+    corner: tuple[int, int]
+    frame_shape: tuple[int, int]
+    shadow_from: str
+    doubts: tuple[Finding, ...] = ()
+
+
 class FrameDecoder(Protocol):
     """Decodes recorded frames, for the pipeline and for answers to subscribers."""
 
@@ -215,6 +228,20 @@ class DecodeProcess:
             codec.read(tuple[Finding, ...], depth["doubts"]),
         )
 
+    def picture(self, path: str, focal_length_mm: float | None, f_number: float | None) -> FramePicture:
+        """Make a frame's picture at the sensor's own resolution, of its middle where it is large. Raises
+        DecodeProcessError."""
+        facts = {"path": path, "focal_length_mm": focal_length_mm, "f_number": f_number}
+        with self._turn:
+            answer = self._ask({"do": "picture", **facts})
+        (jpeg_fd,) = answer.fds
+        made = answer.body
+        (width, height), (row, column), (rows, columns) = (made[name] for name in ("size", "corner", "frame_shape"))
+        doubts = codec.read(tuple[Finding, ...], made["doubts"])
+        return FramePicture(
+            _read(jpeg_fd), (width, height), (row, column), (rows, columns), made["shadow_from"], doubts
+        )
+
     def close(self) -> None:
         """End the worker, also in the middle of a frame, which then is not decoded."""
         self._closed = True
@@ -282,15 +309,21 @@ def _mapped(fd: int) -> mmap.mmap:
         raise DecodeProcessError(f"a decoded frame can't be mapped into memory: {error.strerror}") from None
 
 
+def _read(fd: int) -> bytes:
+    """All bytes of a file, which is closed."""
+    with open(fd, "rb") as file:
+        file.seek(0)
+        return file.read()
+
+
 def _decoded(answer: ChannelMessage) -> DecodedFrame:
     facts = answer.body
     body_fd, preview_fd = answer.fds
+    preview = _read(preview_fd)
     try:
         body = _mapped(body_fd)
-        preview = os.pread(preview_fd, os.fstat(preview_fd).st_size, 0)
     finally:
         os.close(body_fd)
-        os.close(preview_fd)
     width, height = facts["preview_size"]
     records: dict[str, Any] = {
         "doubts": codec.read(tuple[Finding, ...], facts["doubts"]),

@@ -19,24 +19,30 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled import codec
+from dappled.config import profiles
 from dappled.config.profiles import VerdictBounds
 from dappled.daemon.pipeline.decode_process import NICENESS, serve
-from dappled.daemon.pipeline.picture_facts import PictureFacts, detail, noise_of
+from dappled.daemon.pipeline.picture_facts import FineDetail, PictureFacts, detail, fine_detail, noise_of
 from dappled.daemon.stream import wire
 from dappled.decode import DecodeError
 from dappled.decode.depth import RANGING, DepthMap, Ranging, estimate, evidence
 from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.light_field import fingerprint, slice_mosaic
+from dappled.decode.picture.shadow import shadow_at
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import ChannelMessage, end_with_parent
+from dappled.drivers.raw import developing
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.picture_maker import PictureMaker, mosaic_of
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError, sentence
 from dappled.findings import FRAME, Code, Finding, finding
 from dappled.shown import guard_output
 
 log = logging.getLogger(__name__)
-DEPTH_NICENESS = 14
+VIEWERS_NICENESS = 14
+PICTURE_PX = 2048  # of a picture's sides, at most: of larger frames the middle is shown
+_JUDGED_PX = 448  # of the middle that tells how sharp a picture is
 WorkerReply = tuple[Mapping[str, Any], tuple[int, ...]]
 
 
@@ -50,6 +56,7 @@ class DecodeWorker:
     def __init__(self) -> None:
         self._darkroom: Darkroom | None = None
         self._decided: Darkroom | None = None
+        self._pictures: PictureMaker | None = None
         self._preview_px = 1024
         self._looks = False
         self._laws = LawLooks()
@@ -62,22 +69,30 @@ class DecodeWorker:
             recipe = codec.read(Recipe, body["recipe"])
             plain = replace(recipe, try_laws=False, keep_law=False)
             self._darkroom = Darkroom(replace(plain, decided=None))
+            self._pictures = PictureMaker(recipe, PICTURE_PX)
             self._looks = recipe.try_laws and recipe.decided is None
             self._decided = None if recipe.decided is None else Darkroom(plain)
             self._preview_px = body["preview_px"]
             return {}, ()
         assert self._darkroom is not None  # "set up" comes first
+        assert self._pictures is not None
         try:
-            if body["do"] == "warm up":
-                self._darkroom.check()
-                return {"ready": True}, ()
-            if body["do"] == "depth":
-                return _depth(self._decided or self._darkroom, body)
-            return self._decode(self._darkroom, body)
+            return self._made(self._darkroom, self._pictures, body)
         except MemoryError:
             return {"error": "there is not enough memory for it"}, ()
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
             return {"error": sentence(error)}, ()
+
+    def _made(self, darkroom: Darkroom, pictures: PictureMaker, asked: Mapping[str, Any]) -> WorkerReply:
+        match asked["do"]:
+            case "warm up":
+                darkroom.check()
+                return {"ready": True}, ()
+            case "depth":
+                return _depth(self._decided or darkroom, asked)
+            case "picture":
+                return _full_picture(pictures, asked)
+        return self._decode(darkroom, asked)
 
     def _decode(self, configured: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         path, index = asked["path"], asked["index"]
@@ -184,6 +199,9 @@ class DecodeWorker:
         seen = PictureFacts(exposed.clipped_share, exposed.black_share, exposed.mean_share, detail(mean), noise)
         if known is None:
             return seen
+        if darkroom.recipe.mask != profiles.LENSLET:
+            staggered = darkroom.camera(key[0]).staggered(done.raw.mosaic.shape)
+            seen = replace(seen, fine=_fine(done, staggered=staggered))
         side_mm, bounds = known
         pixel_mm = side_mm[0] / rows, side_mm[1] / columns
         (down, _, _), (_, right, _) = done.light_field.grid.tolist()
@@ -196,6 +214,25 @@ class DecodeWorker:
         file = io.BytesIO()
         Image.fromarray(mosaic).save(file, "JPEG", quality=80)
         return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+
+
+def _fine(done: DecodeResult, *, staggered: bool) -> FineDetail:
+    """What the picture at the sensor's own resolution has of detail in the frame's middle, in the colour of most of its
+    samples. In focus each slice is the mean one times what the mask's shadow has of its carrier."""
+    field = done.light_field
+    mosaic, corner = mosaic_of(done.raw, _JUDGED_PX, staggered=staggered)
+    middle = np.array(corner) + (np.array(mosaic.shape) - 1) / 2
+    mean, others, carriers = field.slices[0], field.slices[1:], field.carriers[1:]
+    shares = np.array([np.vdot(mean, one) for one in others]) / max(float(np.vdot(mean, mean).real), 1e-30)
+    turned = np.asarray(shares * np.exp(2j * np.pi * carriers[:, 2:] @ middle), dtype=np.complex128)
+    places = list(mosaic.places())
+    most = max(places, key=lambda one: sum(other.colour == one.colour for other in places)).colour
+    sigma, samples = np.float32(done.report.noise_rms or 0.0), []
+    for place in places:
+        if place.colour == most:
+            known = shadow_at(place, mosaic.shape, carriers[:, 2:], turned)
+            samples.append((mosaic.plane[place.cut] / known, sigma / known))
+    return fine_detail(samples, places[0].step)
 
 
 class LawLooks:
@@ -251,9 +288,8 @@ def _lens(done: DecodeResult) -> tuple[float | None, float | None]:
 
 
 def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
-    """Disparity and its sigma of one frame, float32 (h, w) each, at a lower priority than decoding."""
-    if os.nice(0) < DEPTH_NICENESS:
-        os.nice(DEPTH_NICENESS - os.nice(0))
+    """Disparity and its sigma of one frame, float32 (h, w) each."""
+    _give_way()
     lens = {"focal_length_mm": asked["focal_length_mm"], "f_number": asked["f_number"]}
     done = darkroom.decode(asked["path"], **lens, joint_views=False)
     field = done.light_field
@@ -272,6 +308,28 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         "doubts": codec.plain(done.doubts),
     }
     return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
+
+
+def _full_picture(maker: PictureMaker, asked: Mapping[str, Any]) -> WorkerReply:
+    """The picture of one frame at the sensor's own resolution, JPEG."""
+    _give_way()
+    lens = {"focal_length_mm": asked["focal_length_mm"], "f_number": asked["f_number"]}
+    made = maker.picture(asked["path"], **lens)
+    height, width = made.picture.plane.shape
+    facts = {
+        "size": [width, height],
+        "corner": list(made.corner),
+        "frame_shape": list(made.sensor.shape),
+        "shadow_from": made.picture.shadow.source.value,
+        "doubts": codec.plain(made.doubts),
+    }
+    return facts, (Blob.of(developing.jpeg(made), "picture").fd,)
+
+
+def _give_way() -> None:
+    """To the flight's own frames: what is made for viewers has a lower priority than decoding."""
+    if os.nice(0) < VIEWERS_NICENESS:
+        os.nice(VIEWERS_NICENESS - os.nice(0))
 
 
 def nearest(field: LightField, found: DepthMap) -> tuple[float, float] | None:

@@ -20,10 +20,27 @@ DIRECTIONS = {"across": (0, 1), "along": (1, 0), "falling": (1, 1), "rising": (1
 
 
 @dataclass(frozen=True, slots=True)
+class FineDetail:
+    """Of the picture at the sensor's own resolution, in its middle: `detail`, and `noise` of its noise; `step` (rows,
+    columns) is how many pixels its samples stand apart."""
+
+    detail: tuple[tuple[float, ...], ...]
+    noise: float
+    step: tuple[int, int]
+
+    @property
+    def circle_px(self) -> float | None:
+        """The circle of confusion in pixels of the frame; None where noise covers the finest detail."""
+        found = _circles(self.detail, self.noise, self.step)
+        return None if found is None else min(found)
+
+
+@dataclass(frozen=True, slots=True)
 class PictureFacts:
     """What the pixels of a decoded frame say, and the geometry of its camera.
 
-    `detail` is of the mean slice, along rows and along columns (see `detail`), and `noise` of its noise; `side_mm` is
+    `detail` is of the mean slice, along rows and along columns (see `detail`), and `noise` of its noise, `fine` of the
+    picture at the sensor's own resolution (None: not measured); `side_mm` is
     (height, width) of the sensor, `view_mm` and `pixel_mm` the (row, column) pitch of views and of the frame; None
     where the camera has no profile. `bounds` are the profile's.
     """
@@ -37,6 +54,7 @@ class PictureFacts:
     view_mm: tuple[float, float] | None = None
     pixel_mm: tuple[float, float] | None = None
     bounds: VerdictBounds = field(default_factory=VerdictBounds)
+    fine: FineDetail | None = None
 
 
 def fineness(picture: NDArray[Any]) -> dict[str, float]:
@@ -73,10 +91,26 @@ def detail(picture: NDArray[Any]) -> tuple[tuple[float, ...], ...]:
     return tuple(tuple(_differences(logs, (down * n, right * n)) for n in _STEPS) for down, right in ((1, 0), (0, 1)))
 
 
-def noise_of(picture: NDArray[Any], sigma: float) -> float:
-    """What white noise of `sigma` adds to each number of `detail`."""
+def noise_of(picture: NDArray[Any], sigma: float | NDArray[Any]) -> float:
+    """What white noise of `sigma`, of each pixel or of all, adds to each number of `detail`."""
+    sigma = _middle(np.broadcast_to(sigma, picture.shape))
     picture = _middle(picture)
     return float(2 * np.mean((sigma / np.maximum(picture, _floor(picture))) ** 2))
+
+
+def fine_detail(samples: Sequence[tuple[NDArray[Any], NDArray[Any]]], step: tuple[int, int]) -> FineDetail:
+    """Of the pictures of one colour's places, each with the standard error of its noise, whose samples are `step`
+    pixels apart: every second pixel where they are neighbours, as circles of four samples are the largest told."""
+    apart = tuple(max(1, 2 // one) for one in step)
+    samples = [
+        (picture[row :: apart[0], column :: apart[1]], sigma[row :: apart[0], column :: apart[1]])
+        for picture, sigma in samples
+        for row in range(apart[0])
+        for column in range(apart[1])
+    ]
+    each = np.array([detail(picture) for picture, _ in samples]).mean(axis=0)
+    noise = float(np.mean([noise_of(picture, sigma) for picture, sigma in samples]))
+    return FineDetail(tuple(tuple(one) for one in each.tolist()), noise, (step[0] * apart[0], step[1] * apart[1]))
 
 
 def _middle(picture: NDArray[Any]) -> NDArray[Any]:
@@ -95,12 +129,19 @@ def blur_circle(seen: PictureFacts) -> float | None:
     Along the axis where it is smaller: motion blurs along one.
     """
     pitch = seen.view_mm or (1.0, 1.0)
+    found = _circles(seen.detail, seen.noise, pitch)
+    return None if found is None else min(found) / min(pitch)
+
+
+def _circles(detail: Sequence[Sequence[float]], noise: float, pitch: tuple[float, float]) -> tuple[float, float] | None:
+    """The circle of confusion by a picture's detail along each axis, in units of the pitch of its samples; None where
+    noise covers the finest detail."""
     found = []
-    for along, each in zip(seen.detail, pitch, strict=True):
-        if not along[0] > 0 or not seen.noise < _NOISY * along[0]:
+    for along, each in zip(detail, pitch, strict=True):
+        if not along[0] > 0 or not noise < _NOISY * along[0]:
             return None
-        found.append(defocus(tuple(one - seen.noise for one in along)) * each)
-    return min(found) / min(pitch)
+        found.append(defocus(tuple(one - noise for one in along)) * each)
+    return found[0], found[1]
 
 
 def defocus(along: Sequence[float]) -> float:

@@ -52,7 +52,8 @@ class FrameFacts:
     Blur is how far still ground moved over the sensor during the exposure where it moved most, in pixels of the frame
     and of a view; the ground counts as flat, `height_m` below, as `height_source` has it. `blur_unknown` says why it
     isn't known, `focus_unknown` why `defocus_view_px` isn't: the diameter of the circle that a point is drawn as,
-    beyond that of the flight's sharpest frames. `off_plan` is what exposure and lens are instead of the planned ones.
+    beyond that of the flight's sharpest frames. `picture_px` is the same of the picture at the sensor's own resolution,
+    in pixels of the frame. `off_plan` is what exposure and lens are instead of the planned ones.
     """
 
     blur_px: float | None
@@ -72,6 +73,7 @@ class FrameFacts:
     pose_source: str
     position_sigma_m: float | None
     gnss_fix: int | None
+    picture_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +125,7 @@ def _motion(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
     if blur is None or sensor is None:
         return [_one("unknown", Code.FRAME_BLUR_UNKNOWN, why=facts.blur_unknown)]
     state = _worse(blur, bounds.blur_usable_px, bounds.blur_bad_px)
+    state = state or _worse(sensor, bounds.picture_usable_px, math.inf)
     below: dict[str, Value] = {"height_m": facts.height_m or 0.0, "height_by": facts.height_source}
     return [_one(state, Code.FRAME_BLURRED, view_px=blur, sensor_px=sensor, **below)] if state else []
 
@@ -144,8 +147,12 @@ def _focus(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
     blur = facts.defocus_view_px
     if blur is None:
         return [_one("unknown", Code.FRAME_FOCUS_UNKNOWN, why=facts.focus_unknown)]
-    state = _worse(blur, bounds.defocus_usable_px, bounds.defocus_bad_px)
-    return [_one(state, Code.FRAME_DEFOCUSED, view_px=blur)] if state else []
+    if state := _worse(blur, bounds.defocus_usable_px, bounds.defocus_bad_px):
+        return [_one(state, Code.FRAME_DEFOCUSED, view_px=blur)]
+    picture = facts.picture_px
+    if picture is not None and (state := _worse(picture, bounds.picture_usable_px, math.inf)):
+        return [_one(state, Code.FRAME_PICTURE_DEFOCUSED, px=picture)]
+    return []
 
 
 def _rest(facts: FrameFacts, bounds: VerdictBounds) -> Findings:
@@ -207,6 +214,7 @@ class Judge:
     def __init__(self, mount: Sequence[float], *, on_gimbal: bool, plan: HasExposurePlan | None = None) -> None:
         self._mount, self._on_gimbal, self._plan = tuple(mount), on_gimbal, plan or FixedPlan()
         self._sharpest: dict[LensSettings, deque[float]] = {}
+        self._pictures: dict[LensSettings, deque[float]] = {}
         self._states: Counter[VerdictState] = Counter()
         self._newest = -1
         self._lens: LensSettings = (None, None)
@@ -226,7 +234,8 @@ class Judge:
         if seen is None:
             return unjudged("the decoder said nothing about its pixels")
         blur, blur_unknown = self._blur(tag, rates, seen)
-        circle, focus_unknown = self._defocus((tag.focal_length_mm, tag.f_number), seen)
+        lens = tag.focal_length_mm, tag.f_number
+        circle, focus_unknown = self._defocus(lens, seen)
         height = Height.of(tag.pose)
         gnss = tag.pose.gnss
         fresh = gnss is not None and gnss.age_ms <= _SILENT_MS
@@ -248,6 +257,7 @@ class Judge:
             pose_source=tag.pose.source,
             position_sigma_m=tag.pose.position_sigma_m,
             gnss_fix=gnss.fix_type if gnss is not None and fresh else None,
+            picture_px=self._picture(lens, seen),
         )
         return verdict(facts, seen.bounds)
 
@@ -288,6 +298,20 @@ class Judge:
         if reference > seen.bounds.defocus_usable_px:  # an absolute measure: then no frame was seen to be sharp
             return None, f"this flight's sharpest frames have circles of {reference:.1f} view pixels"
         return beyond, ""
+
+    def _picture(self, lens: LensSettings, seen: PictureFacts) -> float | None:
+        """How far the picture is out of focus beyond the sharpest quarter of the frames with the lens as it is; None
+        where noise covers its finest detail, or with too few frames to compare with. What a lens and a sensor's own
+        filter blur is in all of them."""
+        circle = None if seen.fine is None else seen.fine.circle_px
+        if circle is None:
+            return None
+        known = self._pictures.setdefault(lens, deque(maxlen=_MOST))
+        few = len(known) < _LEAST
+        beyond = 0.0 if few else math.sqrt(max(0.0, circle**2 - float(np.quantile(list(known), _SHARPEST)) ** 2))
+        if beyond <= seen.bounds.picture_usable_px:
+            known.append(circle)
+        return None if few else beyond
 
     def _blur(self, tag: Tag, rates: Vector3 | None, seen: PictureFacts) -> tuple[tuple[float, float] | None, str]:
         """How far ground moved over the sensor during the exposure, (down, right) in mm; or None, and why."""

@@ -1,8 +1,9 @@
-"""Publish the stream and receive questions, in one thread that owns both sockets (PUB and ROUTER).
+"""Publish the stream and receive questions, in one thread that owns both sockets (XPUB and ROUTER).
 
-Messages wait in one bounded queue. When it is full the oldest preview is dropped first, then health, depth and slices,
-and the header's `dropped` counts them; `start`, `frame` and `end` are small and always sent. `seq` counts the messages
-of a topic that were really sent, so a gap at a subscriber is that subscriber's own loss, and it can ask for it.
+Messages wait in one bounded queue. When it is full the oldest picture is dropped first, then previews, health, depth
+and slices, and the header's `dropped` counts them; `start`, `frame` and `end` are small and always sent. `seq` counts
+the messages of a topic that were really sent, so a gap at a subscriber is that subscriber's own loss, and it can ask
+for it.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ log = logging.getLogger(__name__)
 
 Reply = Callable[[Message], None]
 Answer = Callable[[Mapping[str, Any], Reply], None]
-DROP_ORDER = ("preview", "health", "depth", "slices")
+DROP_ORDER = ("picture", "preview", "health", "depth", "slices")
 REMEMBERED = 65536  # slices whose frame number is known by sequence
 UNREAD_ANSWERS = 4  # with a body, of all askers together
 UNREAD_STACKS = 8  # of all subscribers together: those that stop at different times hold different ones
+UNREAD_PICTURES = 2  # likewise, and besides: no picture takes the place of slices
 _LARGE_BYTES = 1_000_000
 _PATIENCE_S, _LARGE_PATIENCE_S = 0.02, 0.1  # after a message, while its bytes are on their way to readers
 
@@ -68,6 +70,9 @@ class Stream(Protocol):
 
         `body` must not be changed afterwards: it is sent without a copy.
         """
+
+    def wanted(self, topic: str) -> bool:
+        """Whether somebody has subscribed to a topic."""
 
     def statistics(self) -> PublisherStatistics:
         """Counters, taken together."""
@@ -131,11 +136,13 @@ class Publisher:
         self._grace_s, self._patient_until_ns = 0.0, 0
         self._start: Message | None = None
         self._unread_stacks, self._unread_answers = InFlightLimit(UNREAD_STACKS), InFlightLimit(UNREAD_ANSWERS)
+        self._unread_pictures = InFlightLimit(UNREAD_PICTURES)
+        self._subscribed: frozenset[bytes] = frozenset()  # what topics of subscribers begin with
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._closed = False
         self._sockets = Sockets(keys, mode, self._clock)
         try:
-            self._pub = self._sockets.open(zmq.PUB, [private, slices], high_water_mark)
+            self._pub = self._sockets.open(zmq.XPUB, [private, slices], high_water_mark)
             asked_at = [private and f"{private}.ask", ask]
             self._router = self._sockets.open(zmq.ROUTER, asked_at, high_water_mark) if any(asked_at) else None
         except WireError:
@@ -173,6 +180,10 @@ class Publisher:
             if sum(not peer for peer, _ in self._waiting) > self._capacity:
                 self._drop_one()
         self._ring()
+
+    def wanted(self, topic: str) -> bool:
+        """Whether somebody has subscribed to a topic."""
+        return topic.encode().startswith(tuple(self._subscribed))
 
     def statistics(self) -> PublisherStatistics:
         """Counters, taken together."""
@@ -215,6 +226,7 @@ class Publisher:
     def _run(self) -> None:
         poller = select.poll()
         poller.register(self._wake, select.POLLIN)
+        poller.register(self._pub.FD, select.POLLIN)
         if self._router is not None:
             poller.register(self._router.FD, select.POLLIN)
         for descriptor in self._sockets.fds:
@@ -222,6 +234,7 @@ class Publisher:
         quiet_rounds = 0
         while True:
             self._sockets.let_in()
+            self._read_subscriptions()
             self._send_waiting()
             self._read_questions()
             if self._loop.stopping.is_set():
@@ -257,7 +270,8 @@ class Publisher:
         patience_s = _PATIENCE_S
         if body is not None and body.nbytes >= _LARGE_BYTES:
             patience_s = _LARGE_PATIENCE_S
-            if not self._unread_stacks.admit(body):
+            unread = self._unread_pictures if message.topic == "picture" else self._unread_stacks
+            if not unread.admit(body):
                 with self._lock:
                     self._dropped[message.topic] += 1
                 return
@@ -321,6 +335,18 @@ class Publisher:
             self._frame_of.pop(header["seq"] - REMEMBERED, None)
         elif message.topic == "start":
             self._start = Message("start", header)
+
+    def _read_subscriptions(self) -> None:
+        """ZeroMQ tells the first subscription to a topic and the end of the last one."""
+        while True:
+            try:
+                told = self._pub.recv(flags=zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            if told[:1] == b"\1":
+                self._subscribed |= {told[1:]}
+            elif told[:1] == b"\0":
+                self._subscribed -= {told[1:]}
 
     def _read_questions(self) -> None:
         if self._router is None:

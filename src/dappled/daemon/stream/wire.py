@@ -25,7 +25,8 @@ from dappled.findings import Finding
 from dappled.flight import Frame, Tag
 
 VERSION = 1
-TOPICS = ("start", "frame", "slices", "depth", "preview", "health", "end")
+TOPICS = ("start", "frame", "slices", "depth", "preview", "picture", "health", "end")
+USUAL = tuple(topic for topic in TOPICS if topic != "picture")  # what comes unasked: a picture is made for a subscriber
 CAN_BE_ASKED = ("start", "frame", "slices")
 QUESTION_KEYS = ("get", "frame", "seq", "flight")
 _FLIGHT_CHARACTERS = 200

@@ -40,7 +40,6 @@ function recording(given) {
   isRecording = Boolean(given);
   document.body.toggleAttribute("data-recording", isRecording);
   for (const id of ["tab-live", "clock-box"]) $(id).hidden = isRecording;
-  $("tab-full").hidden = !isRecording;
 }
 
 function showState({ health, findings, verdict, area = null, frames_left: framesLeft = null }) {

@@ -11,7 +11,7 @@ const $ = (id) => document.getElementById(id);
 export class Stage {
   constructor() {
     this.tab = "refocus";
-    this.frame = null;     // {tag, slices, thumb, depth}
+    this.frame = null;     // {tag, slices, thumb, depth, picture}
     this.live = new Live($("live"));
     this.layout = null;
     this.bitmap = null;
@@ -36,11 +36,10 @@ export class Stage {
 
   set(frame) {
     const same = this.frame && frame && this.frame.tag.frame === frame.tag.frame && this.frame.tag.flight === frame.tag.flight;
-    const ready = Boolean(frame?.thumb) === Boolean(this.frame?.thumb) && Boolean(frame?.depth) === Boolean(this.frame?.depth);
+    const ready = same && this.aspect && Boolean(frame.thumb) === Boolean(this.frame.thumb), tab = this.tab;
     this.frame = frame;
-    if (same && ready && this.aspect) return;
-    this.tabs();
-    this.load();
+    this.tabs();   // a depth or a picture that has come, or is no longer there
+    if (!ready || this.tab !== tab) this.load();
   }
 
   choose(name) {
@@ -59,8 +58,10 @@ export class Stage {
   }
 
   tabs() {
-    show($("tab-depth"), Boolean(this.frame?.depth));
-    if (this.tab === "depth" && !this.frame?.depth) this.tab = "refocus";
+    for (const [tab, part] of [["depth", "depth"], ["full", "picture"]]) {
+      show($(`tab-${tab}`), Boolean(this.frame?.[part]));
+      if (this.tab === tab && !this.frame?.[part]) this.tab = "refocus";
+    }
     for (const name of TABS) {
       const chosen = name === this.tab;
       $(`tab-${name}`).setAttribute("aria-selected", String(chosen));

@@ -1,0 +1,63 @@
+"""What is made of a frame now and then, for viewers: after decoding, in a process of its own."""
+
+from __future__ import annotations
+
+from dappled.clock import Clock
+from dappled.daemon.pipeline.capture import PendingShot, PendingShots
+from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess
+from dappled.daemon.pipeline.flight_writer import FlightWriter
+from dappled.flight import Tag
+from dappled.workers import OneThread, Worker
+
+
+class Occasional(OneThread):
+    """Takes at most one finished frame in `interval_s`, the newest, and waits until no frame is to be decoded.
+
+    `maker` is a decode process for viewers alone, as what they get takes longer than a frame may wait; several parts
+    may share it.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        maker: DecodeProcess,
+        writer: FlightWriter,
+        shots: PendingShots,
+        *,
+        interval_s: float,
+        clock: Clock,
+    ) -> None:
+        self._maker, self._writer, self._shots = maker, writer, shots
+        self._interval_s, self._clock = interval_s, clock
+        self._last_ns: int | None = None
+        self._worker: Worker[PendingShot] = Worker(name, self._work, capacity=1, policy="drop oldest", clock=clock)
+        self._loop = self._worker
+
+    def stop(self) -> None:
+        """Take no more frames and close the maker. A frame in hand is given up after half a second."""
+        self._worker.stop(0.5)
+        self._maker.close()
+
+    def offer(self, pending: PendingShot) -> None:
+        """Take a finished frame, if one is due and it was decoded."""
+        now_ns = self._clock.monotonic_ns()
+        due = self._last_ns is None or now_ns - self._last_ns >= round(self._interval_s * 1e9)
+        if due and pending.decoded is not None and self._wanted():
+            self._last_ns = now_ns
+            self._worker.put(pending)
+
+    def _wanted(self) -> bool:
+        """Whether somebody would see what is made."""
+        return True
+
+    def _work(self, pending: PendingShot) -> None:
+        frame, tag, decoded = pending.frame, pending.tag, pending.decoded
+        assert frame is not None  # a decoded shot has all three
+        assert tag is not None
+        assert decoded is not None
+        self._shots.wait_decoded()
+        self._make(self._writer.path(frame), tag, decoded)
+
+    def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:
+        """Make it of the frame's file. Raises DecodeProcessError."""
+        raise NotImplementedError
