@@ -31,6 +31,7 @@ from dappled.decode.joint.patch_model import (
     FrameModel,
     single,
     some_of,
+    summed,
     times,
     whitener_of,
 )
@@ -107,9 +108,8 @@ class _Hypothesis:
         scaled = STRENGTHS[:, None, None].astype(np.float64)
         shrunk = (weights[:, None] * scaled / (1 + scaled * strength)).reshape(len(STRENGTHS), -1)
         volume = (weights[:, None] * np.log1p(scaled * strength)).sum(axis=(1, 2))
-        projected = times(self.rows, low)
-        power = (projected.real**2 + projected.imag**2).reshape(shrunk.shape[1], -1)
-        return np.asarray(shrunk @ power - volume[:, None], dtype=np.float64)
+        power = np.square(times(self.rows, low).view(np.float32)).reshape(shrunk.shape[1], -1)
+        return np.asarray(summed(shrunk @ power) - volume[:, None], dtype=np.float64)
 
 
 def _each_of(rows: Doubles, beside: Terms) -> list[_Hypothesis]:

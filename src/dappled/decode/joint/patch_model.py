@@ -366,10 +366,23 @@ def whitener_of(covariance: Terms) -> Doubles:
 
 def nats_of(whitener: Doubles, white: NDArray[Any]) -> Floats:
     """(F, N) log likelihoods, but for a constant, of patches that the `whitener` (F, A, A) made `white` (F, A, N)."""
-    volume = 2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1)
+    return np.asarray(_volume(whitener)[:, None] - summed(_squares(white)))
+
+
+def _volume(whitener: Doubles) -> Floats:
+    """(F,)"""
+    return np.asarray(2 * np.log(np.abs(np.diagonal(whitener, axis1=1, axis2=2))).sum(axis=1))
+
+
+def _squares(white: NDArray[Any]) -> NDArray[Any]:
+    """(F, 2 N) sums of the squares of the real parts of (F, A, N), and of the imaginary ones, in turns."""
     parts = white.view(white.real.dtype)
-    power = np.einsum("fan,fan->fn", parts, parts).reshape(len(white), -1, 2).sum(axis=2)
-    return np.asarray(volume[:, None] - power)
+    return np.asarray(np.einsum("fan,fan->fn", parts, parts))
+
+
+def summed(parts: NDArray[Any]) -> NDArray[Any]:
+    """(…, N) what real and imaginary parts have together, of (…, 2 N) in turns."""
+    return np.asarray(parts[..., ::2] + parts[..., 1::2])
 
 
 def likelihoods(wholes: Iterable[Terms], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
@@ -380,9 +393,10 @@ def likelihoods(wholes: Iterable[Terms], spectra: Complexes, weights: Singles, w
 
     def one(number: int) -> None:
         exact = whitener_of(listed[number])
-        whitener = single(exact)
+        whitener, volume = single(exact), weights @ _volume(exact)
         for some in spans(spectra.shape[2], AT_A_TIME):
-            found[number, ..., some] = weights @ nats_of(exact, times(whitener, spectra[:, :, some]))
+            power = weights @ _squares(times(whitener, spectra[:, :, some])).astype(np.float64)
+            found[number, ..., some] = volume[..., None] - summed(power)
 
     each(one, range(len(listed)), workers)
     return found
@@ -422,9 +436,8 @@ def _most_likely(
 
 def moved_nats(frame: FrameModel, rests: Rests, spectra: Complexes) -> Floats:
     """(N,) by how many nats hardly any parallax is more probable than none in patches (F, A, N)."""
-    hardly, not_at_all = (
-        _at_rest_nats(frame, frame.ranges[number], rests, spectra) for number in (AT_REST, MOTIONLESS_RANGE)
-    )
+    ranges = [frame.ranges[number] for number in (AT_REST, MOTIONLESS_RANGE)]
+    hardly, not_at_all = _at_rest_nats(frame, ranges, rests, spectra)
     return hardly - not_at_all
 
 
@@ -433,32 +446,37 @@ def is_motionless(moved: Floats) -> bool:
     return float(np.median(moved)) < _MOVED_NATS
 
 
-def _at_rest_nats(frame: FrameModel, some: DisparityRange, rests: Rests, spectra: Complexes) -> Floats:
-    """(N,) log likelihoods of patches (F, A, N) whose disparities are in a range next to 0.
+def _at_rest_nats(
+    frame: FrameModel, ranges: Sequence[DisparityRange], rests: Rests, spectra: Complexes
+) -> list[Floats]:
+    """(N,) log likelihoods of patches (F, A, N) whose disparities are in each of these ranges next to 0.
 
     Each slice then holds what is common to all views, and detail that folds in, in an amount of its own at each
     frequency: a straight edge has far more in one direction than in others, and looks like parallax where one amount
     is for all.
     """
     common, own = frame.model.common(), rests.own
-    seen = some.seen
-    moved = (np.abs(seen - single(common) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
-    moved[:, 0] = own
     base, once = (rests.variances(number) for number in (0, 1))  # without detail beyond the band, and with it
-    varied = once - base + moved
-    found = np.zeros((len(_USUAL_AMOUNTS), spectra.shape[2]))
-    amounts = np.array((*_USUAL_AMOUNTS, *_MORE))[:, None, None]
-    for number, turn in enumerate(common):
-        size = base[:, number, None] + amounts * varied[:, number, None]
-        volume, shrunk = np.log(size).astype(np.float32), (1 / size).astype(np.float32)
-        for some_patches in spans(spectra.shape[2], _FEW_AT_A_TIME):
+    amounts = np.array((*_USUAL_AMOUNTS, *_MORE))[:, None, None, None]
+    sizes = []  # (amounts, F, A, 1) variances
+    for some in ranges:
+        seen = some.seen
+        moved = (np.abs(seen - single(common) * seen[..., :1]) ** 2).mean(axis=(1, 2)) * own[:, None]
+        moved[:, 0] = own
+        sizes.append(base[..., None] + amounts * (once - base + moved)[..., None])
+    terms = [(np.log(size).astype(np.float32), (-1 / size).astype(np.float32)) for size in sizes]
+    found = [np.zeros((len(_USUAL_AMOUNTS), spectra.shape[2])) for _ in ranges]
+    for some_patches in spans(spectra.shape[2], _FEW_AT_A_TIME):
+        for number, turn in enumerate(common):
             left = spectra[:, number, some_patches]
             if number:
                 left = left - np.complex64(turn) * spectra[:, 0, some_patches]
-            nats = shrunk * -(left.real**2 + left.imag**2)
-            nats -= volume
-            found[:, some_patches] += frame.weights @ _means_of_odds(nats)
-    return np.asarray(found.max(axis=0))
+            power = left.real**2 + left.imag**2
+            for (volume, shrunk), total in zip(terms, found, strict=True):
+                nats = shrunk[:, :, number] * power
+                nats -= volume[:, :, number]
+                total[:, some_patches] += frame.weights @ _means_of_odds(nats)
+    return [np.asarray(total.max(axis=0)) for total in found]
 
 
 def _means_of_odds(nats: Singles) -> Singles:
