@@ -18,8 +18,7 @@ from dappled.daemon.navigation.clocks import (
     from_timesync,
     stepped_since,
 )
-from dappled.daemon.navigation.excerpts import between, latest
-from dappled.daemon.navigation.samples import Epoch, Sample, prune
+from dappled.daemon.navigation.samples import Epoch, Sample, between, latest, prune
 from dappled.drivers.mavlink import MavlinkMessage
 from dappled.findings import FRAME, Code, finding
 

@@ -14,7 +14,6 @@ from typing import Any, Generic, TypeVar
 from dappled.daemon.navigation import samples as telemetry_samples
 from dappled.daemon.navigation.autopilot_time import ARRIVAL_WINDOW_NS, MOST_BOOT_NS, UNSTEADY_NS, AutopilotTime
 from dappled.daemon.navigation.clocks import BootClock, from_arrivals
-from dappled.daemon.navigation.excerpts import around_instant, beside, between, latest
 from dappled.daemon.navigation.ground_height import ground_sample
 from dappled.daemon.navigation.jumps import JumpFinder, ReceiverTrack
 from dappled.daemon.navigation.samples import (
@@ -30,7 +29,11 @@ from dappled.daemon.navigation.samples import (
     PositionDoubt,
     PositionSample,
     Sample,
+    around_instant,
+    beside,
+    between,
     keep,
+    latest,
     prune,
 )
 from dappled.decode.geometry import norm

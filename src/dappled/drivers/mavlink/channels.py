@@ -16,8 +16,8 @@ from operator import or_
 from typing import Literal, Protocol
 
 from dappled.clock import Clock
-from dappled.drivers.mavlink.peers import Peers, Shown, Source
-from dappled.drivers.mavlink.streams import ByteStream, OnePeer, TcpServer, over_tcp
+from dappled.drivers.mavlink.peers import OnePeer, Peers, Shown, Source
+from dappled.drivers.mavlink.streams import ByteStream, TcpServer, over_tcp
 from dappled.errors import DappledError
 
 __all__ = [

@@ -93,6 +93,29 @@ class Peers:
         peer.until_ns, peer.credit = now_ns + _HEARD_NS, min(peer.credit + size, CREDIT_BYTES)
 
 
+class OnePeer:
+    """The part of a `ByteChannel` where one alone can be at the other end, and nothing waits to be written."""
+
+    @property
+    def origin(self) -> int:
+        return 0
+
+    def ask_proof(self) -> None:
+        return
+
+    def shown(self, evidence: Shown) -> None:
+        return
+
+    def source(self) -> str:
+        return ""
+
+    def wants_write(self) -> bool:
+        return False
+
+    def flush(self) -> None:
+        return
+
+
 def _forget_gone(peers: dict[Source, Peer], now_ns: int) -> None:
     for source in [source for source, peer in peers.items() if peer.until_ns <= now_ns]:
         del peers[source]

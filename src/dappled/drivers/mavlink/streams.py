@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from dappled.drivers.mavlink.peers import CREDIT_BYTES, Shown
+from dappled.drivers.mavlink.peers import CREDIT_BYTES, OnePeer, Shown
 
 _CHUNK = 65536
 _CANDIDATES = 4
@@ -20,29 +20,6 @@ _GONE_S = 5
 _NO_CLIENT = (errno.EAGAIN, errno.EWOULDBLOCK, errno.ECONNABORTED, errno.EPROTO, errno.ENETDOWN, errno.ENETUNREACH,
               errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENONET)  # fmt: skip
 """Errors of `accept` that are the client's and not the listening socket's: see accept(2)."""
-
-
-class OnePeer:
-    """The part of a `ByteChannel` where one alone can be at the other end, and nothing waits to be written."""
-
-    @property
-    def origin(self) -> int:
-        return 0
-
-    def ask_proof(self) -> None:
-        return
-
-    def shown(self, evidence: Shown) -> None:
-        return
-
-    def source(self) -> str:
-        return ""
-
-    def wants_write(self) -> bool:
-        return False
-
-    def flush(self) -> None:
-        return
 
 
 class ByteStream(OnePeer):
