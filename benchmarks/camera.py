@@ -123,6 +123,7 @@ def file_move(repeats: int, place: Path) -> dict[str, Any]:
         SimulatedBody.start(BodyOptions(picture=str(source))) as body,
         camera_at(body, flight.folder.frames, delete_after_download=True) as camera,
     ):
+        _before(body)
         before = peak = _memory(camera)
         for shot in range(repeats):
             flight.ledger.add_shot(Shot(shot, Cause("benchmark", "shot"), clock.utc_ns(), clock.monotonic_ns()))
