@@ -19,7 +19,6 @@ from scipy import fft
 
 Grid = NDArray[np.float64]
 COLOURS_UM = (0.45, 0.55, 0.65)
-FINER = 4  # samples a pixel
 
 
 @dataclass(frozen=True)
@@ -63,6 +62,24 @@ class WaveCamera:
         orders = np.arange(-self.orders, self.orders + 1)
         return np.asarray(found[np.ix_(orders, orders)])
 
+    @cached_property
+    def pairs(self) -> list[tuple[int, int, NDArray[np.complex128]]]:
+        """(my, mx, t_k t*_{k − m}) of the orders m of the transmittance that are worth a wave."""
+        reach, made = self.drawn + 2, []
+        for m in np.ndindex(2 * reach + 1, 2 * reach + 1):
+            my, mx = (one - reach for one in m)
+            pairs = self.amplitudes * shifted(self.amplitudes, my, mx).conj()
+            if np.abs(pairs).max() >= 1e-4:
+                made.append((my, mx, pairs))
+        return made
+
+    @property
+    def clear(self) -> NDArray[np.complex128]:
+        """The same of a film that takes nothing."""
+        made = np.zeros_like(self.amplitudes)
+        made[self.orders, self.orders] = 1
+        return made
+
 
 def canon(period_px: int, p: int) -> WaveCamera:
     """A 450D with one of the thesis' masks on 4k film."""
@@ -88,6 +105,34 @@ class WaveShot:
     masked: bool = True
     camera: WaveCamera = REFERENCE
     seed: int = 5
+    finer: int = 4  # samples a pixel
+
+    def shadow(self) -> Grid:
+        """What the film makes of a white page, 1 in the mean."""
+        camera, total = self.camera, np.zeros(self.shape, dtype=complex)
+        y, x = (np.arange(side) - (side - 1) / 2 for side in self.shape)
+        for my, mx, pairs in camera.pairs:
+            lines = [
+                [kernels(camera, np.array([camera.per_um * m]), m, colour, self.f_number) for m in (my, mx)]
+                for colour in COLOURS_UM
+            ]
+            through = sum(complex((down.T @ pairs @ across)[0, 0]) for down, across in lines) / len(lines)
+            sides = zip((my, mx), (y, x), camera.pitch_um, strict=True)
+            total += through * np.outer(
+                *(
+                    np.exp(2j * np.pi * camera.per_um * m * at * pitch) * np.sinc(m * camera.per_um * pitch)
+                    for m, at, pitch in sides
+                )
+            )
+        return np.asarray(total.real)
+
+    def band(self, frame: Grid) -> Grid:
+        """What a slice around the mean holds: half of the carriers' distance to each side."""
+        half = 0.5 * self.camera.per_um
+        keep = [
+            np.abs(fft.fftfreq(side, one)) < half for side, one in zip(self.shape, self.camera.pitch_um, strict=True)
+        ]
+        return np.asarray(fft.ifft2(fft.fft2(frame) * np.outer(*keep)).real)
 
     def scene(self) -> Grid:
         """On the fine grid, without detail that pixels can't sample."""
@@ -97,7 +142,7 @@ class WaveShot:
         waves = fft.fft2(np.random.default_rng(self.seed).normal(size=self.shape)) * f**-self.exponent
         waves[0, 0] = 0
         waves[self.shape[0] // 2] = waves[:, self.shape[1] // 2] = 0
-        wide = np.zeros([FINER * side for side in self.shape], dtype=complex)
+        wide = np.zeros([self.finer * side for side in self.shape], dtype=complex)
         down, across = (np.round(fft.fftfreq(side, 1 / side)).astype(int) for side in self.shape)
         wide[np.ix_(down, across)] = waves
         made = fft.ifft2(wide).real
@@ -105,30 +150,23 @@ class WaveShot:
 
     def light(self) -> Grid:
         """The frame, free of noise, of mean transmittance 1."""
-        scene, total, camera = self.scene(), np.zeros(self.shape), self.camera
-        amplitudes = camera.amplitudes
-        if not self.masked:
-            amplitudes = np.zeros_like(amplitudes)
-            amplitudes[camera.orders, camera.orders] = 1
+        scene, camera = self.scene(), self.camera
         y, x = (
-            (np.arange(side) / FINER - (side / FINER - 1) / 2) * pitch
+            (np.arange(side) / self.finer - (side / self.finer - 1) / 2) * pitch
             for side, pitch in zip(scene.shape, camera.pitch_um, strict=True)
         )
-        fy, fx = (fft.fftfreq(side, pitch / FINER) for side, pitch in zip(scene.shape, camera.pitch_um, strict=True))
+        fy, fx = (
+            fft.fftfreq(side, pitch / self.finer) for side, pitch in zip(scene.shape, camera.pitch_um, strict=True)
+        )
         pixel = np.outer(*(np.sinc(f * pitch) for f, pitch in zip((fy, fx), camera.pitch_um, strict=True)))
-        reach = camera.drawn + 2  # orders of the transmittance that are worth a wave
-        for colour in COLOURS_UM:
-            seen = np.zeros(scene.shape, dtype=complex)
-            for m in np.ndindex(2 * reach + 1, 2 * reach + 1):
-                my, mx = (one - reach for one in m)
-                pairs = amplitudes * shifted(amplitudes, my, mx).conj()
-                if np.abs(pairs).max() < 1e-4:
-                    continue
+        seen = np.zeros(scene.shape, dtype=complex)
+        for my, mx, pairs in camera.pairs if self.masked else [(0, 0, camera.clear)]:
+            turn = np.outer(*(np.exp(2j * np.pi * camera.per_um * k * at) for k, at in ((my, y), (mx, x))))
+            waves = fft.fft2(scene * turn)
+            for colour in COLOURS_UM:
                 down, across = (kernels(camera, f, k, colour, self.f_number) for f, k in ((fy, my), (fx, mx)))
-                turn = np.outer(*(np.exp(2j * np.pi * camera.per_um * k * at) for k, at in ((my, y), (mx, x))))
-                seen += fft.fft2(scene * turn) * (down.T @ pairs @ across)
-            total += fft.ifft2(seen * pixel).real[::FINER, ::FINER]
-        return total / len(COLOURS_UM)
+                seen += waves * (down.T @ pairs @ across)
+        return np.asarray(fft.ifft2(seen * pixel).real[:: self.finer, :: self.finer] / len(COLOURS_UM))
 
     def noise(self) -> Grid:
         return np.random.default_rng(77).normal(size=self.shape) * 0.4 / self.snr
@@ -164,3 +202,27 @@ def contrast_left(found: NDArray[np.floating], truth: Grid, band: tuple[float, f
     f = np.hypot(fft.fftfreq(one.shape[0])[:, None], fft.fftfreq(one.shape[1])[None, :])
     inside = (f >= band[0]) & (f < band[1])
     return float((one * other.conj()).real[inside].sum() / (np.abs(other) ** 2)[inside].sum())
+
+
+def draw(count: int = 24, seed: int = 44) -> list[tuple[str, WaveShot]]:
+    """Exposures in focus by Latin hypercube, each camera equally often."""
+    from scipy.stats import qmc  # noqa: PLC0415  half a second, which each collection of tests would take
+
+    made = []
+    for number, row in enumerate(qmc.LatinHypercube(4, rng=np.random.default_rng(seed)).random(count)):
+        name = list(CAMERAS)[math.floor(row[0] * len(CAMERAS))]
+        f_number, snr = (
+            float(low * (high / low) ** at) for at, low, high in zip(row[1:3], (5.6, 20), (22, 300), strict=True)
+        )
+        wide = {"mask-4": 2, "mask-5": 2}.get(name, 1)  # periods twice as long
+        shot = WaveShot(
+            f_number,
+            1.1 + 0.9 * row[3],
+            snr,
+            (192 * wide, 192 * wide),
+            camera=CAMERAS[name],
+            seed=number,
+            finer=4 // wide,
+        )
+        made.append((name, shot))
+    return made

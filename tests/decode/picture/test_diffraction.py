@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from dappled.decode.picture.picture import picture_of
 from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of
 from dappled.decode.picture.shadow_fit import shadow_of
 from tests.decode.picture.full_rays import psnr
-from tests.decode.picture.full_waves import CAMERAS, WaveCamera, WaveShot, contrast_left
+from tests.decode.picture.full_waves import CAMERAS, WaveCamera, WaveShot, contrast_left, draw
 
 BANDS = {0.1: (0.05, 0.15), 0.2: (0.15, 0.25), 0.3: (0.25, 0.35), 0.4: (0.35, 0.45)}  # cycles/px
 
@@ -69,3 +70,16 @@ def test_the_plan_tells_the_contrast_that_waves_leave(camera: str, f_number: flo
     told = picture_contrast(optics_of(shot.camera), f_number, list(BANDS))
     found = [contrast_left(made, truth, band) for band in BANDS.values()]
     assert found == pytest.approx(told.left, abs=off)
+
+
+@pytest.mark.long
+def test_drawn_pictures_by_waves() -> None:
+    """In focus, of every camera as often, against the better of raw over the true shadow and the band of the mean."""
+    short = []
+    for name, shot in draw():
+        truth, frame = replace(shot, masked=False).light(), shot.light() + shot.noise()
+        made, _ = picture_in(shot, frame)
+        others = frame / np.maximum(shot.shadow(), 0.01), shot.band(frame)
+        short.append((psnr(made, truth) - max(psnr(one, truth) for one in others), name, shot))
+    assert Counter(name for _, name, _ in short) == dict.fromkeys(CAMERAS, len(short) / len(CAMERAS))
+    assert np.median([one for one, *_ in short]) > 0
