@@ -17,8 +17,9 @@ from dappled.decode import srgb
 from dappled.decode.array_types import Floats
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lightfield.aperture import SHAPES, Aperture, angular_frequencies, kappa, transfer
-from dappled.decode.optics import LAWS, Lattice, Order, Sensor
-from dappled.decode.optics.visibility import OrderStrength, order_strengths
+from dappled.decode.optics import LAWS, Lattice, MaskedOptics, Order, Sensor
+from dappled.decode.optics.shadow_orders import shadow_orders
+from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
 from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of
@@ -32,7 +33,6 @@ from dappled.findings import Code, Finding, Level, Subject, above_note, finding
 
 _TURNED, _SCALED = 0.03, 0.02  # radians, and of the period: how far a mask may lie from a law's prediction
 _TURNED_SINCE, _SCALED_SINCE = 0.02, 0.006  # since its calibration
-_WEAK = 2e-4  # of the mean: orders that are never stronger cast no shadow that is worth its error
 _DEEP = 0.03  # standard deviation of W: where as much is predicted at least, some must be found
 _UNCERTAIN = 0.02  # standard error of W
 _TOLD_SIGMA = 0.02  # of a predicted W: f-number and stop
@@ -270,23 +270,20 @@ def mosaic_of(
 
 
 def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[Order]:
-    """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them."""
-    predicted = _strengths(decoder, focal_length_mm, f_number)
-    return [one.order for one in predicted if one.most > _WEAK] or [one.order for one in predicted]
+    return shadow_orders(_optics(decoder, focal_length_mm), decoder.lattice_at(focal_length_mm), f_number)
 
 
-def _strengths(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[OrderStrength]:
-    lattice = decoder.lattice_at(focal_length_mm)
-    optics = decoder.optics
-    if decoder.calibration is not None:
-        optics = replace(optics, distance_mm=decoder.calibration.nearest(focal_length_mm).mask_distance_mm)
-    found = order_strengths(optics, lattice, f_number)
-    return [one for one in found if one.on_sensor]
+def _optics(decoder: MaskDecoder, focal_length_mm: float) -> MaskedOptics:
+    """With the mask where its calibration has it."""
+    if decoder.calibration is None:
+        return decoder.optics
+    return replace(decoder.optics, distance_mm=decoder.calibration.nearest(focal_length_mm).mask_distance_mm)
 
 
 def _least_depth(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> float:
     """The least standard deviation of W that is predicted."""
-    return math.sqrt(2 * sum(one.least**2 for one in _strengths(decoder, focal_length_mm, f_number)))
+    found = order_strengths(_optics(decoder, focal_length_mm), decoder.lattice_at(focal_length_mm), f_number)
+    return math.sqrt(2 * sum(one.least**2 for one in found if one.on_sensor))
 
 
 def _calibrated(frame: _Frame) -> list[Shadow]:
@@ -294,9 +291,10 @@ def _calibrated(frame: _Frame) -> list[Shadow]:
     (focal_length_mm, f_number), decoder, mosaic = frame.lens, frame.decoder, frame.mosaic
     if decoder.calibration is None or not f_number:
         return []
-    lattice, orders = frame.expected
+    lattice, seen = frame.expected
     known = decoder.calibration.nearest(focal_length_mm)
     magnitudes = dict(zip(decoder.optics.mask.half_orders(), known.transfer, strict=True))
+    orders = [order for order in seen if order in magnitudes]
     transfers = transfer(orders, [magnitudes[order] for order in orders], known.origin)
     cycles = kappa(
         decoder.optics.mask.frequency_per_mm * known.print_scale, known.mask_distance_mm, focal_length_mm, f_number

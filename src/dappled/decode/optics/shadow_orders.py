@@ -1,0 +1,59 @@
+"""Which orders a mask's shadow has, those among them that diffraction makes.
+
+A film's amplitude is the root of its transmittance, and has orders that this has not. On the way to the sensor they are
+shifted against each other, so that their products don't cancel there: c_m = Σ t_k t*_{k−m} e^{−2πi λ d (k − m/2)·m f²}.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy import fft
+
+from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order
+from dappled.decode.optics.visibility import film_transfer, order_strengths, pattern_amplitudes
+
+_WEAK = 2e-4  # of the mean: orders of the pattern that are never stronger cast no shadow that is worth its error
+_MADE = 1e-3  # of the mean: likewise of those that diffraction makes
+_HIGHEST = 32
+_BEYOND = 2  # orders beyond the pattern's that are looked at
+_WAVELENGTHS_MM = (450e-6, 550e-6, 650e-6)
+
+
+def shadow_orders(optics: MaskedOptics, lattice: Lattice, f_number: float | None) -> list[Order]:
+    """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them."""
+    drawn = [one for one in order_strengths(optics, lattice, f_number) if one.on_sensor]
+    orders = [one.order for one in drawn if one.most > _WEAK] or [one.order for one in drawn]
+    made = _made(optics.mask, optics.distance_mm)
+    for one in order_strengths(optics, lattice, f_number, [order for order in made if order not in orders]):
+        if one.on_sensor and made[one.order] * one.stop * one.pixels > _MADE:
+            orders.append(one.order)
+    return orders
+
+
+@lru_cache(maxsize=16)
+def _made(mask: Mask, distance_mm: float) -> dict[Order, float]:
+    """How strong each order of the half plane is behind a small stop, as a share of the mean; none of a mask whose
+    harmonics are so high that no sensor tells what lies beyond them."""
+    amplitudes = pattern_amplitudes(mask)
+    highest = max(abs(one) for order in amplitudes for one in order)
+    if highest > _HIGHEST:
+        return {}
+    reach, size = highest + _BEYOND, 2 * highest + 2 * _BEYOND
+    n = 16 * highest + 4 * _BEYOND
+    spectrum = np.zeros((n, n))
+    for order, amplitude in amplitudes.items():
+        spectrum[order] = amplitude * film_transfer(mask, np.array([order], dtype=np.float64))[0]
+    waves = fft.fft2(np.sqrt(np.maximum(fft.ifft2(spectrum).real * n * n, 0))).real / n**2
+    k = np.arange(-size, size + 1)
+    t = waves[np.ix_(k, k)]
+    found = {}
+    for my in range(reach + 1):
+        for mx in range(-reach, reach + 1):
+            if (my, mx) > (0, 0):
+                pairs = t * waves[np.ix_(k - my, k - mx)]
+                turns = np.add.outer((k - my / 2) * my, (k - mx / 2) * mx) * mask.frequency_per_mm**2
+                each = [(pairs * np.exp(-2j * np.pi * one * distance_mm * turns)).sum() for one in _WAVELENGTHS_MM]
+                found[my, mx] = float(abs(np.mean(each)) / (t * t).sum())
+    return found
