@@ -17,8 +17,8 @@ import pytest
 
 from dappled.drivers.camera import CameraError
 from dappled.drivers.child_process import (
-    CONSOLE_GOES,
     DECODER_GOES,
+    VIEWERS_GO,
     ChannelError,
     MessageSizeError,
     ProcessChannel,
@@ -126,7 +126,7 @@ def test_looking_goes_before_decoding_and_decoding_before_the_rest() -> None:
     """From the child's first moment: what it imports alone can be too much."""
     own = int(Path("/proc/self/oom_score_adj").read_text(encoding="ascii"))
     scores = [own]
-    for score in (DECODER_GOES, CONSOLE_GOES):
+    for score in (DECODER_GOES, VIEWERS_GO):
         process, channel = start_child("dappled.drivers.wired.ptp_source", "usb:", goes_first=score)
         scores.append(int(Path(f"/proc/{process.pid}/oom_score_adj").read_text(encoding="ascii")))
         end_child(process, 0.0)

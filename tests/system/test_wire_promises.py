@@ -17,6 +17,7 @@ from PIL import Image
 
 from dappled.cli import main
 from dappled.daemon.stream.subscriber import Subscriber
+from dappled.drivers.child_process import DECODER_GOES, VIEWERS_GO
 from dappled.mocks.simulation import free_port
 from tests.schemas import schema
 from tests.waiting import eventually
@@ -131,6 +132,17 @@ def test_depth_comes_where_it_is_switched_on(tmp_path: Path, sockets: Path) -> N
             daemon.kill()
 
 
+def memory_scores(parent: int, module: str) -> list[int]:
+    """Of a process' children that run a module, rising: those with more go first where memory is short."""
+    children = [
+        Path("/proc", child)
+        for task in Path(f"/proc/{parent}/task").iterdir()
+        for child in (task / "children").read_text().split()
+    ]
+    found = [one for one in children if module.encode() in (one / "cmdline").read_bytes()]
+    return sorted(int((one / "oom_score_adj").read_text()) for one in found)
+
+
 @pytest.mark.slow
 def test_a_picture_comes_to_those_who_subscribe_to_it(tmp_path: Path, sockets: Path) -> None:
     """As the schema says, in each pixel of the sensor, while slices go on."""
@@ -151,6 +163,7 @@ def test_a_picture_comes_to_those_who_subscribe_to_it(tmp_path: Path, sockets: P
                     with Image.open(io.BytesIO(message.body)) as picture:
                         assert picture.size == (message.header["width"], message.header["height"])
                         assert list(picture.size[::-1]) == message.header["frame_shape"]
+            assert memory_scores(daemon.pid, "decode_worker") == [DECODER_GOES, VIEWERS_GO]
     finally:
         daemon.terminate()
         daemon.communicate(timeout=120)

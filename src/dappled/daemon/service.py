@@ -62,6 +62,7 @@ from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher, Stream
 from dappled.daemon.survey_facts import LiveSurvey, distance_trigger
 from dappled.drivers.camera import Camera, WritesFiles
+from dappled.drivers.child_process import VIEWERS_GO
 from dappled.drivers.gnss.port import GnssPort, gnss_port
 from dappled.drivers.gnss.recorded import TelemetryNotebook
 from dappled.drivers.mavlink import MavlinkLinks, Transport
@@ -280,7 +281,7 @@ class Service:
         decoder = None if recipe is None else DecodeProcess(recipe, clock=clock)
         viewers: list[Occasional] = []
         if recipe is not None:
-            making = DecodeProcess(recipe, clock=clock)  # begins with what is first wanted of it
+            making = DecodeProcess(recipe, clock=clock, goes_first=VIEWERS_GO)  # begins with what is first wanted of it
             common = (making, writer, shots, publisher)
             if recipe.mask != profiles.LENSLET:
                 every_s = settings.publish.picture_interval_s

@@ -10,7 +10,7 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.drivers.child_process import (
-    CONSOLE_GOES,
+    VIEWERS_GO,
     ChannelError,
     ChannelMessage,
     ProcessChannel,
@@ -91,7 +91,7 @@ class SupervisedProcess(OneThread):
             *one.arguments,
             descriptors=one.descriptors,
             environment=one.environment,
-            goes_first=CONSOLE_GOES,
+            goes_first=VIEWERS_GO,
         )
         try:
             self._peer.begun(channel)

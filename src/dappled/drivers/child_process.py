@@ -43,7 +43,7 @@ _PR_SET_PDEATHSIG = 1
 _REAL_TIME_US = 1_000_000
 _RR_PRIORITY = 1
 NICENESS = -10
-DECODER_GOES, CONSOLE_GOES = 500, 800  # of 1000: looking before decoding, decoding before recording
+DECODER_GOES, VIEWERS_GO = 500, 800  # of 1000: looking before decoding, decoding before recording
 _DEAD_S = 2.0
 
 

@@ -148,7 +148,7 @@ class DecodeProcess:
     """Decodes in a worker process, one frame at a time; a worker that dies or hangs is replaced.
 
     `timeout_s` bounds one frame. Threads may share it: they take turns. A worker that keeps dying is started six times
-    a minute at most; frames in between are not decoded, and say why.
+    a minute at most; frames in between are not decoded, and say why. `goes_first` as for `start_child`.
     """
 
     def __init__(
@@ -159,7 +159,9 @@ class DecodeProcess:
         preview_px: int = 1024,
         budget: RestartBudget | None = None,
         clock: Clock | None = None,
+        goes_first: int = DECODER_GOES,
     ) -> None:
+        self._goes_first = goes_first
         self._recipe, self._timeout_s, self._preview_px = recipe, timeout_s, preview_px
         self._budget, self._clock = budget or RestartBudget(limit=6, window_s=60.0), clock or SystemClock()
         self._turn = threading.Lock()
@@ -288,7 +290,7 @@ class DecodeProcess:
                 f"the decoder keeps crashing: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock.monotonic_ns())
-        self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker", goes_first=DECODER_GOES)
+        self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker", goes_first=self._goes_first)
         self._channel.send({"do": "set up", "recipe": codec.plain(self._recipe), "preview_px": self._preview_px})
         return self._channel
 

@@ -337,12 +337,14 @@ class Publisher:
             self._start = Message("start", header)
 
     def _read_subscriptions(self) -> None:
-        """ZeroMQ tells the first subscription to a topic and the end of the last one."""
+        """ZeroMQ tells the first subscription to what topics begin with, and the end of the last one."""
         while True:
             try:
                 told = self._pub.recv(flags=zmq.NOBLOCK)
             except zmq.Again:
                 return
+            if not any(topic.encode().startswith(told[1:]) for topic in wire.TOPICS):
+                continue  # nothing that is sent: a stranger may make up any number of them
             if told[:1] == b"\1":
                 self._subscribed |= {told[1:]}
             elif told[:1] == b"\0":
