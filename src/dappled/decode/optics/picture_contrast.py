@@ -17,7 +17,7 @@ from scipy import fft
 
 from dappled.decode.array_types import Floats
 from dappled.decode.optics.carriers import MaskedOptics
-from dappled.decode.optics.visibility import film_transfer, pattern_amplitudes
+from dappled.decode.optics.visibility import amplitude_orders, pattern_amplitudes
 
 _WAVELENGTHS_MM = (450e-6, 550e-6, 650e-6)
 _DIRECTIONS = 4  # of the detail, over half a turn
@@ -38,13 +38,8 @@ class PictureContrast:
 def picture_contrast(optics: MaskedOptics, f_number: float, cycles_per_px: Sequence[float]) -> PictureContrast:
     """The contrast at these frequencies, along a row of pixels."""
     mask, distance_mm = optics.mask, optics.distance_mm
-    amplitudes = pattern_amplitudes(mask)
-    n = min(_SAMPLES * max(abs(one) for order in amplitudes for one in order), _MOST_SAMPLES)
-    spectrum = np.zeros((n, n))
-    for order, amplitude in amplitudes.items():
-        spectrum[order] = amplitude * film_transfer(mask, np.array([order], dtype=np.float64))[0]
-    light = np.maximum(fft.ifft2(spectrum).real * n * n, 0)
-    waves = fft.fft2(np.sqrt(light))
+    n = min(_SAMPLES * max(abs(one) for order in pattern_amplitudes(mask) for one in order), _MOST_SAMPLES)
+    waves = amplitude_orders(mask, n)
     k = fft.fftfreq(n, 1 / n) * mask.frequency_per_mm  # cycles/mm
     pitch_mm = math.hypot(*optics.sensor.row_mm), math.hypot(*optics.sensor.column_mm)
     pixels = np.outer(*(np.sinc(k * one) for one in pitch_mm))
@@ -54,7 +49,7 @@ def picture_contrast(optics: MaskedOptics, f_number: float, cycles_per_px: Seque
         total = np.zeros((n, n))
         for wavelength_mm in _WAVELENGTHS_MM:
             half = np.exp(1j * np.pi * wavelength_mm * distance_mm * np.add.outer(k * nu[0], k * nu[1]))
-            both = fft.ifft2(waves * half) * fft.ifft2(waves * half.conj())
+            both = fft.ifft2(waves * half, norm="forward") * fft.ifft2(waves * half.conj(), norm="forward")
             passed = np.maximum(1 - np.abs(nu) * wavelength_mm * f_number, 0)
             stop = np.outer(*(np.sinc(k * distance_mm / f_number * one) for one in passed))
             total += fft.ifft2(fft.fft2(both) * stop * pixels).real

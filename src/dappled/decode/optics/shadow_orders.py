@@ -9,10 +9,9 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
-from scipy import fft
 
 from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order
-from dappled.decode.optics.visibility import film_transfer, order_strengths, pattern_amplitudes
+from dappled.decode.optics.visibility import amplitude_orders, order_strengths, pattern_amplitudes
 
 _WEAK = 2e-4  # of the mean: orders of the pattern that are never stronger cast no shadow that is worth its error
 _MADE = 1e-3  # of the mean: likewise of those that diffraction makes
@@ -36,16 +35,11 @@ def shadow_orders(optics: MaskedOptics, lattice: Lattice, f_number: float | None
 def _made(mask: Mask, distance_mm: float) -> dict[Order, float]:
     """How strong each order of the half plane is behind a small stop, as a share of the mean; none of a mask whose
     harmonics are so high that no sensor tells what lies beyond them."""
-    amplitudes = pattern_amplitudes(mask)
-    highest = max(abs(one) for order in amplitudes for one in order)
+    highest = max(abs(one) for order in pattern_amplitudes(mask) for one in order)
     if highest > _HIGHEST:
         return {}
     reach, size = highest + _BEYOND, 2 * highest + 2 * _BEYOND
-    n = 16 * highest + 4 * _BEYOND
-    spectrum = np.zeros((n, n))
-    for order, amplitude in amplitudes.items():
-        spectrum[order] = amplitude * film_transfer(mask, np.array([order], dtype=np.float64))[0]
-    waves = fft.fft2(np.sqrt(np.maximum(fft.ifft2(spectrum).real * n * n, 0))).real / n**2
+    waves = amplitude_orders(mask, 16 * highest + 4 * _BEYOND)
     k = np.arange(-size, size + 1)
     t = waves[np.ix_(k, k)]
     found = {}

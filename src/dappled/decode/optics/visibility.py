@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
+from scipy import fft, special
 
 from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order
 
@@ -133,6 +133,16 @@ def _on_the_way(
     """(K,) what the film keeps of each order, and what diffraction leaves of it between mask and sensor."""
     numbers = _WAVELENGTHS_MM * mask_distance_mm * ((k * mask.frequency_per_mm) ** 2).sum(axis=1)[:, None]  # λ·d·f²
     return film_transfer(mask, k), np.asarray(np.sqrt((np.cos(np.pi * numbers) ** 2).mean(axis=1)))
+
+
+def amplitude_orders(mask: Mask, samples: int) -> NDArray[np.float64]:
+    """(n, n) the orders of the film's amplitude, the root of its transmittance, as `numpy.fft.fftfreq` numbers them;
+    `samples` n of a period. They are real: the pattern is symmetrical."""
+    light = np.zeros((samples, samples))
+    for order, amplitude in pattern_amplitudes(mask).items():
+        light[order] = amplitude * film_transfer(mask, np.array([order], dtype=np.float64))[0]
+    drawn = np.maximum(fft.ifft2(light, norm="forward").real, 0)
+    return np.asarray(fft.fft2(np.sqrt(drawn), norm="forward").real)
 
 
 def film_transfer(mask: Mask, k: NDArray[np.float64]) -> NDArray[np.float64]:

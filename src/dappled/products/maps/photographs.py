@@ -20,7 +20,7 @@ from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Finding, Level
+from dappled.findings import FRAME, Finding
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye, intrinsics, through
@@ -238,7 +238,7 @@ def of_picture(
     shape = made.picture.shadow.shape
     grid: Matrix = np.eye(2, 3)
     eye = station.eye(projection, made.sensor, lens, grid, shape)
-    doubts = tuple(replace(one, subject=FRAME) for one in made.findings if one.level > Level.NOTE)
+    doubts = tuple(replace(one, subject=FRAME) for one in made.doubts)
     return Photograph(
         station.name, station.tag.utc_ns, developing.linear(made, colour=colour), eye, *_sigmas(station.tag.pose), grid,
         doubts=doubts, lens=lens,
