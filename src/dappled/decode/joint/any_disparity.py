@@ -29,13 +29,12 @@ from dappled.decode.joint.patch_model import (
     DisparityRange,
     Doubles,
     FrameModel,
-    single,
     some_of,
     summed,
     times,
     whitener_of,
 )
-from dappled.decode.joint.slice_model import Terms
+from dappled.decode.joint.slice_model import Terms, single
 from dappled.decode.joint.small_eigh import eigh
 from dappled.workers import spans
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.joint.patches import Patches
-from dappled.decode.joint.slice_model import Fold, SliceModel, Terms, folded
+from dappled.decode.joint.slice_model import Fold, SliceModel, Terms, folded, single
 from dappled.decode.joint.view_pairs import paired
 from dappled.workers import each, spans
 
@@ -324,11 +324,6 @@ def likely_errors(
 
 def _double(values: NDArray[Any]) -> Doubles:
     return values.astype(np.result_type(values, np.float64))
-
-
-def single(values: Doubles) -> Terms:
-    """The values in single precision."""
-    return values.astype(np.complex64 if np.iscomplexobj(values) else np.float32)
 
 
 def some_of(spectra: Complexes, which: NDArray[np.bool_] | NDArray[np.intp]) -> Complexes:

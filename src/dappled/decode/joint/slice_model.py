@@ -118,11 +118,11 @@ class SliceModel:
 
     def alone(self) -> Terms:
         """(A, V·U) what the slices hold of detail that a view has alone, of unit spectrum, the views in pairs."""
-        return _single(self.transfers[:, None] * paired(self.aperture.cells(-self.angular)))
+        return single(self.transfers[:, None] * paired(self.aperture.cells(-self.angular)))
 
     def seen(self, frequencies: Floats, disparities: Floats) -> Terms:
         """(D, F, A) each band's own detail in the slices, of a scene of unit spectrum at each disparity."""
-        return _single(self.transfers * self._through(self.angular, frequencies, disparities))
+        return single(self.transfers * self._through(self.angular, frequencies, disparities))
 
     def _through(self, angular: Floats, frequencies: Floats, disparities: Floats) -> Floats:
         """(D, F, n) W(ω − D·g) of the stop, for ω (n, 2) and g (F, 2)."""
@@ -148,12 +148,13 @@ class SliceModel:
             turned = self.turns[source] * self.turns[to].conj()  # but for a sign, the same for all of them
             signs = np.where((turned * turned[0].conj()).real < 0, -1, 1)
             waves = self.transfers[source] * signs * through / np.sqrt(len(disparities))
-            each = _single(waves).transpose(1, 2, 0)
+            each = single(waves).transpose(1, 2, 0)
             found.append(Fold(to, out, each @ each.conj().transpose(0, 2, 1)))
         return found
 
 
-def _single(values: NDArray[Any]) -> Terms:
+def single(values: NDArray[Any]) -> Terms:
+    """The values in single precision."""
     return values.astype(np.complex64 if np.iscomplexobj(values) else np.float32)
 
 

@@ -28,12 +28,11 @@ from dappled.decode.joint.patch_model import (
     FrameModel,
     Rests,
     nats_of,
-    single,
     some_of,
     times,
 )
 from dappled.decode.joint.patches import Patches
-from dappled.decode.joint.slice_model import Terms
+from dappled.decode.joint.slice_model import Terms, single
 from dappled.decode.joint.small_eigh import eigh
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.

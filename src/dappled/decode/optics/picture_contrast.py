@@ -17,9 +17,8 @@ from scipy import fft
 
 from dappled.decode.array_types import Floats
 from dappled.decode.optics.carriers import MaskedOptics
-from dappled.decode.optics.visibility import amplitude_orders, pattern_amplitudes
+from dappled.decode.optics.visibility import COLOURS_MM, amplitude_orders, pattern_amplitudes
 
-_WAVELENGTHS_MM = (450e-6, 550e-6, 650e-6)
 _DIRECTIONS = 4  # of the detail, over half a turn
 _SAMPLES, _MOST_SAMPLES = 16, 1024  # of the mask's amplitude in a period of its highest harmonic, and in all
 _LEAST_W = 0.01  # as the picture has it
@@ -47,13 +46,13 @@ def picture_contrast(optics: MaskedOptics, f_number: float, cycles_per_px: Seque
     def through(nu: Floats) -> Floats:
         """(n, n) over a period: the light of detail of the frequency (2,), cycles/mm, but for the lens' own loss."""
         total = np.zeros((n, n))
-        for wavelength_mm in _WAVELENGTHS_MM:
+        for wavelength_mm in COLOURS_MM:
             half = np.exp(1j * np.pi * wavelength_mm * distance_mm * np.add.outer(k * nu[0], k * nu[1]))
             both = fft.ifft2(waves * half, norm="forward") * fft.ifft2(waves * half.conj(), norm="forward")
             passed = np.maximum(1 - np.abs(nu) * wavelength_mm * f_number, 0)
             stop = np.outer(*(np.sinc(k * distance_mm / f_number * one) for one in passed))
             total += fft.ifft2(fft.fft2(both) * stop * pixels).real
-        return np.asarray(total / len(_WAVELENGTHS_MM))
+        return np.asarray(total / len(COLOURS_MM))
 
     shadow = through(np.zeros(2))
     known = np.maximum(shadow, _LEAST_W * shadow.mean())

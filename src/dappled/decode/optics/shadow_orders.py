@@ -11,13 +11,12 @@ from functools import lru_cache
 import numpy as np
 
 from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order
-from dappled.decode.optics.visibility import amplitude_orders, order_strengths, pattern_amplitudes
+from dappled.decode.optics.visibility import COLOURS_MM, amplitude_orders, order_strengths, pattern_amplitudes
 
 _WEAK = 2e-4  # of the mean: orders of the pattern that are never stronger cast no shadow that is worth its error
 _MADE = 1e-3  # of the mean: likewise of those that diffraction makes
 _HIGHEST = 32
 _BEYOND = 2  # orders beyond the pattern's that are looked at
-_WAVELENGTHS_MM = (450e-6, 550e-6, 650e-6)
 
 
 def shadow_orders(optics: MaskedOptics, lattice: Lattice, f_number: float | None) -> list[Order]:
@@ -48,6 +47,6 @@ def _made(mask: Mask, distance_mm: float) -> dict[Order, float]:
             if (my, mx) > (0, 0):
                 pairs = t * waves[np.ix_(k - my, k - mx)]
                 turns = np.add.outer((k - my / 2) * my, (k - mx / 2) * mx) * mask.frequency_per_mm**2
-                each = [(pairs * np.exp(-2j * np.pi * one * distance_mm * turns)).sum() for one in _WAVELENGTHS_MM]
+                each = [(pairs * np.exp(-2j * np.pi * one * distance_mm * turns)).sum() for one in COLOURS_MM]
                 found[my, mx] = float(abs(np.mean(each)) / (t * t).sum())
     return found

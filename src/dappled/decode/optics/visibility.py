@@ -22,6 +22,7 @@ from dappled.decode.optics.carriers import Lattice, Mask, MaskedOptics, Order
 
 _ROUNDING = 0.12  # relative: an f-number given in third stops, and nulls where only their neighbourhood counts
 _WAVELENGTHS_MM = np.array([450e-6, 500e-6, 550e-6, 600e-6, 650e-6])  # of daylight, each with the same weight
+COLOURS_MM = (450e-6, 550e-6, 650e-6)  # of sums over all orders, which more would make dear
 _BLADES, _SIZES, _POINTS = (5, 6, 7, 8), 15, 24  # of the stops that are tried; points along a side
 _LITTLE_LOST = 2  # harmonics up to this one: no frame of one was refused for what film and diffraction take
 _ANY_F_NUMBER = (1.2, 64.0)  # where none is told
