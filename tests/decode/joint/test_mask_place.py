@@ -7,7 +7,7 @@ import pytest
 
 from dappled.decode.array_types import Complexes
 from dappled.decode.calibration.calibration import moved
-from dappled.decode.joint.mask_place import MaskPlace, carrier_changes, mask_place
+from dappled.decode.joint.mask_place import MaskPlace, PlaceSearch, carrier_changes
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from dappled.decode.optics import Lattice, Sensor
@@ -55,7 +55,7 @@ def _moved(slices: Complexes, periods: tuple[float, float], turn_rad: float, off
 
 def _place(slices: Complexes, kappa: float = 1.0) -> MaskPlace:
     carriers = np.array(ORDERS) @ LATTICE.matrix()
-    found = mask_place(
+    found = PlaceSearch(
         slices,
         SliceModel.of_half(ORDERS, MAGNITUDES, kappa * ANGULAR, carriers, Aperture(5, "filled")),
         samples_px=(SAMPLE_PX, SAMPLE_PX),
@@ -63,7 +63,7 @@ def _place(slices: Complexes, kappa: float = 1.0) -> MaskPlace:
         reach=5 * SAMPLE_PX,
         changes=CHANGES,
         steps_px=(SAMPLE_PX, SAMPLE_PX),
-    )
+    ).near()
     assert found is not None
     return found
 
@@ -134,7 +134,7 @@ def test_no_scene_moves_a_mask(seed: int) -> None:
 
 def test_small_slices_tell_nothing() -> None:
     carriers = np.array(ORDERS) @ LATTICE.matrix()
-    small = mask_place(
+    small = PlaceSearch(
         _slices(2)[:, :40, :40],
         SliceModel.of_half(ORDERS, MAGNITUDES, ANGULAR, carriers, Aperture(5)),
         samples_px=(SAMPLE_PX, SAMPLE_PX),
@@ -142,5 +142,5 @@ def test_small_slices_tell_nothing() -> None:
         reach=5 * SAMPLE_PX,
         changes=CHANGES,
         steps_px=(SAMPLE_PX, SAMPLE_PX),
-    )
+    ).near()
     assert small is None

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.joint.joint_views import PatchShares, joint_views
-from dappled.decode.joint.mask_place import MaskPlace, MaskWitness, mask_place, place_farther
+from dappled.decode.joint.mask_place import MaskWitness, PlaceSearch
 from dappled.decode.joint.patch_model import FARTHEST, SIDE
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import (
@@ -177,38 +177,14 @@ class TakenSlices:
         return white + chroma_noise(self.values, self.transfers * self.aperture.transform(self.angular))
 
 
-def place_of(
-    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, moved: bool, workers: int = 1
-) -> MaskPlace | None:
-    """Where the slices place the mask (see `mask_place`); None where the joint model is not for them."""
+def search_of(
+    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, workers: int = 1
+) -> PlaceSearch | None:
+    """What looks for the mask by slices; None where the joint model is not for them."""
     if _unfit(len(taken.carriers), (taken.values.shape[1], taken.values.shape[2]), taken.aperture.views):
         return None
-    return mask_place(
-        taken.values,
-        taken.model(),
-        samples_px=taken.samples,
-        noise=taken.noise(),
-        reach=taken.reach,
-        changes=changes,
-        steps_px=steps_px,
-        moved=moved,
-        workers=workers,
-    )
-
-
-def place_farther_of(
-    taken: TakenSlices, changes: Floats, steps_px: tuple[float, float], *, workers: int = 1
-) -> MaskPlace | None:
-    """About where the slices place a mask that is far off (see `place_farther`); of slices that `place_of` is for."""
-    return place_farther(
-        taken.values,
-        taken.model(),
-        samples_px=taken.samples,
-        noise=taken.noise(),
-        reach=taken.reach,
-        changes=changes,
-        steps_px=steps_px,
-        workers=workers,
+    return PlaceSearch(
+        taken.values, taken.model(), taken.samples, taken.noise(), taken.reach, changes, steps_px, workers
     )
 
 

@@ -134,7 +134,7 @@ class MaskPlace:
     def undone(
         self, slices: Complexes, orders: Sequence[Order], changes: Floats, steps_px: tuple[float, float]
     ) -> Complexes:
-        """Slices as a mask without turn and scale would make them; `changes` and `steps_px` as in `mask_place`."""
+        """Slices as a mask without turn and scale would make them; `changes` and `steps_px` as in `PlaceSearch`."""
         if not (self.turn_rad or self.off):
             return slices
         turned = math.sin(self.turn_rad) * changes[0] + math.cos(self.turn_rad) * changes[1]
@@ -156,80 +156,85 @@ def carrier_changes(lattice: Lattice, sensor: Sensor) -> Floats:
     return np.stack([turned, lattice.matrix()])
 
 
-def mask_place(
-    slices: Complexes,
-    model: SliceModel,
-    *,
-    samples_px: tuple[float, float],
-    noise: Floats,
-    reach: float,
-    changes: Floats,
-    steps_px: tuple[float, float],
-    moved: bool = False,
-    workers: int = 1,
-) -> MaskPlace | None:
-    """The mask's place by slices complex64 (K, h, w), the half plane of `model`, DC first; None for too small ones.
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaceSearch:
+    """Looks for a mask by `slices` complex64 (K, h, w), the half plane of `model`, DC first.
 
     `samples_px`, `noise` and `reach` as for `joint_views`. `changes` (2, 2, 2) are `carrier_changes`, `steps_px` is by
-    how many rows and columns of the sensor a sample steps. Slices of a mask that has `moved` were turned back to where
-    it was found: it lies beside that by what is most probable, however little.
+    how many rows and columns of the sensor a sample steps.
     """
-    shape = (slices.shape[1], slices.shape[2])
-    witness = MaskWitness.of(shape, model, samples_px=samples_px, reach=reach, workers=workers)
-    if witness is None:
-        return None
-    seen, patches = _Textured.of(witness, slices, noise, _MOST_PATCHES), witness.patches
-    frame, spectra = seen.frame, seen.spectra
-    away = seen.away(shape, steps_px, changes)
-    place: MaskPlace | None = None
-    likely = -np.inf
-    for some in (USUAL, AT_REST):  # at rest only where it matters: it costs half as much again
-        if some not in frame.ranges:
-            more = FrameModel.of(patches, model, samples_px, frame.noise, reach, ranges=(some,), workers=workers)
-            frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
-        kinds = [kind for kind in KINDS if kind.range == some]
-        rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
-        wholes = list(wholes_of(frame, rests, range(len(kinds))))
-        found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
-        if found.max() <= likely:
-            break
-        likely = float(found.max())
-        differences, terms = _terms(seen, wholes[int(found.argmax())], workers)
-        place = _Likelihood(differences, terms, away).place(moved=moved)
-        if some == USUAL and not place.far().moved:
-            kind = kinds[int(found.argmax())]
-            place = _with_contrast(place, slices, seen, kind, away=away, patches=patches, reach=reach)
-        if place.seen:
-            break
-    return place
 
+    slices: Complexes
+    model: SliceModel
+    samples_px: tuple[float, float]
+    noise: Floats
+    reach: float
+    changes: Floats
+    steps_px: tuple[float, float]
+    workers: int = 1
 
-def place_farther(
-    slices: Complexes,
-    model: SliceModel,
-    *,
-    samples_px: tuple[float, float],
-    noise: Floats,
-    reach: float,
-    changes: Floats,
-    steps_px: tuple[float, float],
-    workers: int = 1,
-) -> MaskPlace | None:
-    """About where the mask is, by fewer patches, around turns and changes of scale as far as hands and lenses go; None
-    where patches agree on no place."""
-    shape = (slices.shape[1], slices.shape[2])
-    witness = MaskWitness.of(shape, model, samples_px=samples_px, reach=reach, workers=workers)
-    best, most = None, _ABOUT_THERE
-    for turn_rad, off in _FARTHER if witness else ():
-        assert witness is not None
-        start = MaskPlace.at((0.0, 0.0), turn_rad, off)
-        seen = _Textured.of(witness, start.undone(slices, model.half, changes, steps_px), noise, _WITNESSES)
-        differences, terms = _terms(seen, witness.likeliest(seen, workers), workers)
-        likely = _Likelihood(differences, terms, seen.away(shape, steps_px, changes))
-        move = likely.anywhere()
-        if (nats := likely.nats(move)) > most:
-            best, most = likely.at(move, nats).beyond(start.periods, turn_rad, off), nats
-    return best
+    def near(self, *, moved: bool = False) -> MaskPlace | None:
+        """The mask's place, near the calibrated one; None for too small slices. Those of a mask that has `moved` were
+        turned back to where it was found: it lies beside that by what is most probable, however little."""
+        witness = self._witness()
+        if witness is None:
+            return None
+        seen, patches, workers = (
+            _Textured.of(witness, self.slices, self.noise, _MOST_PATCHES),
+            witness.patches,
+            self.workers,
+        )
+        frame, spectra, reach = seen.frame, seen.spectra, self.reach
+        away = self._away(seen)
+        place: MaskPlace | None = None
+        likely = -np.inf
+        for some in (USUAL, AT_REST):  # at rest only where it matters: it costs half as much again
+            if some not in frame.ranges:
+                more = FrameModel.of(
+                    patches, self.model, self.samples_px, frame.noise, reach, ranges=(some,), workers=workers
+                )
+                frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
+            kinds = [kind for kind in KINDS if kind.range == some]
+            rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
+            wholes = list(wholes_of(frame, rests, range(len(kinds))))
+            found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
+            if found.max() <= likely:
+                break
+            likely = float(found.max())
+            differences, terms = _terms(seen, wholes[int(found.argmax())], workers)
+            place = _Likelihood(differences, terms, away).place(moved=moved)
+            if some == USUAL and not place.far().moved:
+                kind = kinds[int(found.argmax())]
+                place = _with_contrast(place, self.slices, seen, kind, away=away, patches=patches, reach=reach)
+            if place.seen:
+                break
+        return place
+
+    def farther(self) -> MaskPlace | None:
+        """About where the mask is, by fewer patches, around turns and changes of scale as far as hands and lenses go;
+        None where patches agree on no place."""
+        witness = self._witness()
+        best, most = None, _ABOUT_THERE
+        for turn_rad, off in _FARTHER if witness else ():
+            assert witness is not None
+            start = MaskPlace.at((0.0, 0.0), turn_rad, off)
+            turned_back = start.undone(self.slices, self.model.half, self.changes, self.steps_px)
+            seen = _Textured.of(witness, turned_back, self.noise, _WITNESSES)
+            differences, terms = _terms(seen, witness.likeliest(seen, self.workers), self.workers)
+            likely = _Likelihood(differences, terms, self._away(seen))
+            move = likely.anywhere()
+            if (nats := likely.nats(move)) > most:
+                best, most = likely.at(move, nats).beyond(start.periods, turn_rad, off), nats
+        return best
+
+    def _witness(self) -> MaskWitness | None:
+        shape = (self.slices.shape[1], self.slices.shape[2])
+        return MaskWitness.of(shape, self.model, samples_px=self.samples_px, reach=self.reach, workers=self.workers)
+
+    def _away(self, seen: _Textured) -> Floats:
+        """(2, N, 2) by how many periods a turn of one radian, and a scale twice as large, move the mask at patches."""
+        middles = seen.corners + SIDE / 2 - np.array(self.slices.shape[1:]) / 2
+        return np.asarray((middles * np.array(self.steps_px)) @ self.changes.swapaxes(1, 2))
 
 
 def _with_contrast(
@@ -268,7 +273,7 @@ class MaskWitness:
         reach: float,
         workers: int = 1,
     ) -> MaskWitness | None:
-        """For slices (h, w) of this shape, as `mask_place`; None for too small ones."""
+        """For slices (h, w) of this shape, as `PlaceSearch`; None for too small ones."""
         patches = Patches(shape, SIDE)
         if np.count_nonzero(~patches.at_edges) < _FEWEST:
             return None
@@ -331,12 +336,6 @@ class _Textured:
         flat = patches.spectra(np.ones((1, 1, SIDE, SIDE), dtype=np.complex64))[:, 0, 0]
         corners = np.array(patches.corners)[best] - SIDE
         return cls(best, corners, frame, spectrum, own, float(np.sqrt(np.mean(means**2))), spectra, means / root, flat)
-
-    def away(self, shape: tuple[int, int], steps_px: tuple[float, float], changes: Floats) -> Floats:
-        """(2, N, 2) by how many periods a turn of one radian, and a scale twice as large, move the mask at each patch
-        of slices (h, w)."""
-        middles = self.corners + SIDE / 2 - np.array(shape) / 2
-        return np.asarray((middles * np.array(steps_px)) @ changes.swapaxes(1, 2))
 
 
 def _terms(seen: _Textured, whole: Complexes, workers: int) -> tuple[NDArray[np.int64], NDArray[np.complex128]]:

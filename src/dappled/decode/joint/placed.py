@@ -11,8 +11,8 @@ import math
 from dataclasses import dataclass, replace
 
 from dappled.decode.array_types import Floats
-from dappled.decode.joint.frame_views import TakenSlices, place_farther_of, place_of
-from dappled.decode.joint.mask_place import MaskPlace
+from dappled.decode.joint.frame_views import TakenSlices, search_of
+from dappled.decode.joint.mask_place import MaskPlace, PlaceSearch
 from dappled.decode.lightfield.aperture import ShownContrast, UsedAperture
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
@@ -25,7 +25,7 @@ def placed(
     taken: TakenSlices, changes: Floats, *, distance_known: bool, workers: int = 1
 ) -> tuple[TakenSlices, UsedAperture, MaskPlace | None]:
     """The slices as a mask in its place would make them, the stop and contrast that they show, and the mask's place;
-    None where the joint model is not for them. `changes` as in `mask_place`."""
+    None where the joint model is not for them. `changes` as in `PlaceSearch`."""
     search = _Search(taken, changes, distance_known, workers)
     by_means = MaskPlace.at(taken.shift(distance_known=distance_known))  # else the stop is fitted to moved phases
     found = search.settled(by_means)
@@ -33,7 +33,8 @@ def placed(
         return found.at, found.width, found.place
     at = search.moved(taken, by_means)
     width = at.width(distance_known=distance_known)
-    start = place_farther_of(taken.through(width).used(), changes, taken.samples_px, workers=workers)
+    by = search.by(taken, width)
+    start = None if by is None else by.farther()
     farther = None if start is None else search.settled(start)
     if farther is not None and farther.place is not None and farther.place.seen:
         return farther.at, farther.width, farther.place
@@ -62,9 +63,13 @@ class _Search:
         back = by.undone(at.values, at.orders, self.changes, at.samples_px)
         return replace(at.moved(by.periods), values=back, rotation_rad=at.rotation_rad + by.turn_rad)
 
+    def by(self, at: TakenSlices, width: UsedAperture) -> PlaceSearch | None:
+        """What looks for the mask through a stop."""
+        return search_of(at.through(width).used(), self.changes, at.samples_px, workers=self.workers)
+
     def place(self, at: TakenSlices, width: UsedAperture, *, moved: bool) -> MaskPlace | None:
-        through = at.through(width).used()
-        return place_of(through, self.changes, at.samples_px, moved=moved, workers=self.workers)
+        by = self.by(at, width)
+        return None if by is None else by.near(moved=moved)
 
     def settled(self, start: MaskPlace) -> _Found:
         """From a place on, again from what was found until it stands."""
