@@ -17,7 +17,7 @@ from dappled.clock import TimeOfDayClock
 from dappled.config.settings import PoseSettings
 from dappled.decode.geometry import Vector3
 from dappled.errors import CallError, DappledError, counted
-from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.findings import Code, Finding, Subject, above_note, finding
 from dappled.shown import few
 
 if not words_only:
@@ -150,7 +150,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
             "copies": copied,
             "without_copy": without_copy,
             "geoid": geoid.name if geoid else None,
-            "doubts": codec.plain([one for one in found if one.level > Level.NOTE]),
+            "doubts": codec.plain(above_note(found)),
             "marks": _marks_json(marked) if marked else None,
         }
         words = f"{counted(written.placed, 'frame')} placed, {counted(len(written.files), 'file')} written"

@@ -16,8 +16,10 @@ from dappled.flight import Tag
 
 
 class LiveDepth(Occasional):
-    """Publishes a frame's depth as topic `depth`. `nearest` gets the nearest distance and its standard error in m,
-    where they are known."""
+    """Estimates a frame's depth. `nearest` gets the nearest distance and its standard error in m, where they are
+    known."""
+
+    topic = "depth"
 
     def __init__(
         self,
@@ -31,8 +33,8 @@ class LiveDepth(Occasional):
         clock: Clock,
         nearest: Callable[[tuple[float, float]], None] | None = None,
     ) -> None:
-        super().__init__("depth", maker, writer, shots, interval_s=interval_s, clock=clock)
-        self._publisher, self._method, self._nearest = publisher, method, nearest
+        super().__init__(maker, writer, shots, publisher, interval_s=interval_s, clock=clock)
+        self._method, self._nearest = method, nearest
 
     def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:
         found = self._maker.depth(path, tag.focal_length_mm, tag.f_number, self._method)
@@ -44,6 +46,6 @@ class LiveDepth(Occasional):
             "arrays": found.arrays,
             "doubts": codec.plain(found.doubts),
         }
-        self._publisher.publish("depth", header, found.body)
+        self._publisher.publish(self.topic, header, found.body)
         if found.nearest_m is not None and self._nearest is not None:
             self._nearest(found.nearest_m)

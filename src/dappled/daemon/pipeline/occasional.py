@@ -2,35 +2,44 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
 from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess
 from dappled.daemon.pipeline.flight_writer import FlightWriter
+from dappled.daemon.stream.publisher import Stream
 from dappled.flight import Tag
 from dappled.workers import OneThread, Worker
 
 
-class Occasional(OneThread):
-    """Takes at most one finished frame in `interval_s`, the newest, and waits until no frame is to be decoded.
+class Occasional(OneThread, ABC):
+    """Publishes as `topic` what it makes of at most one finished frame in `interval_s`, the newest, when no frame is to
+    be decoded.
 
     `maker` is a decode process for viewers alone, as what they get takes longer than a frame may wait; several parts
     may share it.
     """
 
+    topic: ClassVar[str]
+
     def __init__(
         self,
-        name: str,
         maker: DecodeProcess,
         writer: FlightWriter,
         shots: PendingShots,
+        publisher: Stream,
         *,
         interval_s: float,
         clock: Clock,
     ) -> None:
-        self._maker, self._writer, self._shots = maker, writer, shots
+        self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
         self._interval_s, self._clock = interval_s, clock
         self._last_ns: int | None = None
-        self._worker: Worker[PendingShot] = Worker(name, self._work, capacity=1, policy="drop oldest", clock=clock)
+        self._worker: Worker[PendingShot] = Worker(
+            self.topic, self._work, capacity=1, policy="drop oldest", clock=clock
+        )
         self._loop = self._worker
 
     def stop(self) -> None:
@@ -58,6 +67,6 @@ class Occasional(OneThread):
         self._shots.wait_decoded()
         self._make(self._writer.path(frame), tag, decoded)
 
+    @abstractmethod
     def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:
-        """Make it of the frame's file. Raises DecodeProcessError."""
-        raise NotImplementedError
+        """Make it of the frame's file, and publish it. Raises DecodeProcessError."""

@@ -288,10 +288,7 @@ class Judge:
         if circle is None:
             return None, "the picture has more noise than fine detail"
         known = self._sharpest.setdefault(lens, deque(maxlen=_MOST))
-        reference = float(np.quantile(list(known), _SHARPEST)) if len(known) >= _LEAST else None
-        beyond = 0.0 if reference is None else math.sqrt(max(0.0, circle**2 - reference**2))
-        if beyond <= seen.bounds.defocus_usable_px:  # what is out of focus must not become the measure
-            known.append(circle)
+        reference, beyond = _beyond(known, circle, seen.bounds.defocus_usable_px)
         if reference is None:  # what is sharp by itself needs no other frame
             few = f"its circle is {circle:.1f} view pixels, with fewer than {_LEAST} frames in focus to compare with"
             return (circle, "") if circle <= seen.bounds.defocus_usable_px else (None, few)
@@ -307,11 +304,8 @@ class Judge:
         if circle is None:
             return None
         known = self._pictures.setdefault(lens, deque(maxlen=_MOST))
-        few = len(known) < _LEAST
-        beyond = 0.0 if few else math.sqrt(max(0.0, circle**2 - float(np.quantile(list(known), _SHARPEST)) ** 2))
-        if beyond <= seen.bounds.picture_usable_px:
-            known.append(circle)
-        return None if few else beyond
+        reference, beyond = _beyond(known, circle, seen.bounds.picture_usable_px)
+        return None if reference is None else beyond
 
     def _blur(self, tag: Tag, rates: Vector3 | None, seen: PictureFacts) -> tuple[tuple[float, float] | None, str]:
         """How far ground moved over the sensor during the exposure, (down, right) in mm; or None, and why."""
@@ -355,6 +349,16 @@ def _moved(before: LensSettings, now: LensSettings) -> str:
     words = ("the focal length changed from {0:g} to {1:g} mm", "the f-number changed from {0:g} to {1:g}")
     pairs = zip(words, before, now, strict=True)
     return ", ".join(word.format(a, b) for word, a, b in pairs if a and b and abs(b / a - 1) > _SAME)
+
+
+def _beyond(known: deque[float], circle: float, usable: float) -> tuple[float | None, float]:
+    """The circle of the sharpest quarter of those `known`, None of too few; and by how much a circle is beyond it, 0
+    then. One that is usable is known from now on: what is out of focus must not become the measure."""
+    reference = float(np.quantile(list(known), _SHARPEST)) if len(known) >= _LEAST else None
+    beyond = 0.0 if reference is None else math.sqrt(max(0.0, circle**2 - reference**2))
+    if beyond <= usable:
+        known.append(circle)
+    return reference, beyond
 
 
 def _pixels(blur_mm: tuple[float, float], pitch_mm: tuple[float, float] | None) -> float | None:

@@ -30,7 +30,7 @@ from dappled.drivers.wired import matching
 from dappled.drivers.wired.matching import PLAUSIBLE_S, DatedFile, FiredShot, Matching
 from dappled.drivers.wired.sources import FileGroup, FileSource, FoundFile, groups
 from dappled.errors import CallError, DappledError, counted
-from dappled.findings import FRAME, Code, Finding, Level, Subject, finding, text
+from dappled.findings import FRAME, Code, Finding, Subject, above_note, finding, text
 from dappled.flight import FlightsLock, Frame, ImageIndex, Ledger, LedgerReader, Recorder, ShotRow, layout, seals
 from dappled.flight.index import IndexEntry
 from dappled.flight.records import DOUBT, NOTICED
@@ -70,7 +70,7 @@ class Proposal:
     @property
     def doubts(self) -> list[Finding]:
         """What a person should look at."""
-        return [one for one in self.findings if one.level > Level.NOTE]
+        return above_note(self.findings)
 
 
 @dataclass(frozen=True, slots=True)

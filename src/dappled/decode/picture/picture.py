@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Singles
-from dappled.decode.picture.blocks import EMPTY, MosaicPlane, PatternPlace, local_mean
+from dappled.decode.picture.blocks import EMPTY, MosaicPlane, local_mean
 from dappled.decode.picture.focus import Sharp, mixed
 from dappled.decode.picture.noise import noise_of
 from dappled.decode.picture.shadow import Shadow
@@ -38,32 +38,24 @@ class UnmaskedPicture:
     valid: NDArray[np.bool_] | None
 
 
-def over_shadow(mosaic: MosaicPlane, place: PatternPlace, known: Singles, period: float) -> Singles:
-    """A place's samples over the shadow `known` there. A clipped one is as bright as what is around it tells, and no
-    darker than itself."""
-    values = mosaic.plane[place.cut]
-    made = np.asarray(values / known)
-    if mosaic.valid is None or (good := mosaic.valid[place.cut]).all():
-        return made
-    weights = known * good
-    around = local_mean(values * weights, period, place.step, known * weights)
-    return np.asarray(np.where(good, made, np.maximum(made, around)), dtype=np.float32)
-
-
 def picture_of(mosaic: MosaicPlane, shadow: Shadow, period: float) -> UnmaskedPicture:
-    """The picture of a mosaic behind a known shadow."""
+    """The picture of a mosaic behind a known shadow. A clipped pixel is as bright as what is around it tells, and no
+    darker than itself."""
     shape = mosaic.shape
     plane, sigma = np.zeros(shape, dtype=np.float32), np.zeros(shape, dtype=np.float32)
     trusted = np.zeros(shape, dtype=bool)
     dark = samples = 0
     sharp, shadows = [], []
     for place in mosaic.places():
-        values, known = mosaic.plane[place.cut], shadow.at(place)
-        made = over_shadow(mosaic, place, known, period)
+        known, values = shadow.at(place), mosaic.plane[place.cut]
+        made = values / known
         sound = known >= DARK
         dark, samples = dark + int(np.count_nonzero(~sound)), samples + sound.size
-        if mosaic.valid is not None:
-            sound &= mosaic.valid[place.cut]
+        if mosaic.valid is not None and not (good := mosaic.valid[place.cut]).all():
+            weights = known * good
+            around = local_mean(values * weights, period, place.step, known * weights)
+            made = np.asarray(np.where(good, made, np.maximum(made, around)), dtype=np.float32)
+            sound &= good
         base, slope = (np.float32(one) for one in noise_of(made, known))
         trusted[place.cut] = sound
         # The shadow's error is far below the detail that a block holds at its carriers: no noise to be filtered.
