@@ -242,6 +242,17 @@ class Bodies:
         return body
 
 
+def stops_reading(context: zmq.Context[zmq.Socket[bytes]], endpoint: str, *topics: bytes) -> zmq.Socket[bytes]:
+    """A subscriber that keeps as little as ZeroMQ allows, and is never read from."""
+    deaf = context.socket(zmq.SUB)
+    deaf.setsockopt(zmq.RCVHWM, 1)
+    deaf.setsockopt(zmq.RCVBUF, 4096)
+    for topic in topics:
+        deaf.subscribe(topic)
+    deaf.connect(endpoint)
+    return deaf
+
+
 def heard(one: Publisher, deaf: zmq.Socket[bytes], beside: Subscriber) -> None:
     """Publish until the subscription of `deaf` has come. Who reads beside it reads all of that: with a full queue it
     would lose what is published next."""
@@ -260,11 +271,7 @@ def test_a_reader_of_slices_that_stops_keeps_four(endpoint: str, before: int) ->
     one = Publisher(endpoint, "", high_water_mark=mark)
     one.start("f", no_answer)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    deaf = context.socket(zmq.SUB)
-    deaf.setsockopt(zmq.RCVHWM, 1)
-    deaf.setsockopt(zmq.RCVBUF, 4096)
-    deaf.subscribe(b"slices")
-    deaf.connect(endpoint)
+    deaf = stops_reading(context, endpoint, b"slices")
     with Subscriber(endpoint) as subscriber:
         connected(one, subscriber)
         heard(one, deaf, subscriber)
@@ -284,12 +291,7 @@ def test_pictures_that_nobody_reads_take_no_place_of_slices(endpoint: str) -> No
     bodies, one = Bodies(), Publisher(endpoint, "", high_water_mark=PublishSettings().high_water_mark)
     one.start("f", no_answer)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    deaf = context.socket(zmq.SUB)
-    deaf.setsockopt(zmq.RCVHWM, 1)
-    deaf.setsockopt(zmq.RCVBUF, 4096)
-    deaf.subscribe(b"slices")
-    deaf.subscribe(b"picture")
-    deaf.connect(endpoint)
+    deaf = stops_reading(context, endpoint, b"slices", b"picture")
     with Subscriber(endpoint) as subscriber:
         connected(one, subscriber)
         heard(one, deaf, subscriber)
@@ -312,7 +314,7 @@ def test_readers_that_stop_at_different_times_keep_eight_of_all_together(endpoin
     one = Publisher(endpoint, "", high_water_mark=PublishSettings().high_water_mark)
     one.start("f", no_answer)
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
-    readers = [context.socket(zmq.SUB) for _ in range(4)]
+    readers: list[zmq.Socket[bytes]] = []
     with Subscriber(endpoint) as subscriber:
         connected(one, subscriber)
         number = 0
@@ -325,12 +327,9 @@ def test_readers_that_stop_at_different_times_keep_eight_of_all_together(endpoin
             while receive(subscriber, "frame").header["frame"] != number:
                 pass
 
-        for deaf in readers:
-            deaf.setsockopt(zmq.RCVHWM, 1)
-            deaf.setsockopt(zmq.RCVBUF, 4096)
-            deaf.subscribe(b"slices")
-            deaf.connect(endpoint)
-            heard(one, deaf, subscriber)
+        for _ in range(4):
+            readers.append(stops_reading(context, endpoint, b"slices"))  # one that nobody holds is closed
+            heard(one, readers[-1], subscriber)
             for _ in range(6):
                 publish()
         assert one.statistics().dropped["slices"] > 0
