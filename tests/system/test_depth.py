@@ -92,7 +92,7 @@ def shown(scene: str, seed: int, snr: float) -> Shown:
         for metres in targets:
             (folder / f"{metres:g}.dng").write_bytes(target(camera, seed, metres).expose(0.0, 1).file)
         recipe = Recipe(CAMERA, MASK, calibration=str(folder / "c.toml"))
-        ranging, *_ = targets_from_frames(recipe, [folder / f"{m:g}.dng" for m in targets], targets)
+        ranging = targets_from_frames(recipe, [folder / f"{m:g}.dng" for m in targets], targets).ranging
         found = OpenedLightField(with_ranging(frame.light_field.field, ranging))
     return _beside_truth(found, exposure.truth, camera)
 

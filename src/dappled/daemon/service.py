@@ -37,7 +37,14 @@ from dappled.daemon.flight_control import DecodingParameter, FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
+from dappled.daemon.health.record import (
+    DecodingState,
+    KeepingState,
+    ServiceState,
+    ServiceTime,
+    ShootingState,
+    VehicleState,
+)
 from dappled.daemon.health.standing import StandingEvents, StandingFindings
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
@@ -497,7 +504,7 @@ class Service:
             *(task.failing for task in self._tasks),
             self._turns.stood_still(self._clock.monotonic_ns()),
         )
-        return health.record(
+        now = ServiceState(
             self._settings.now,
             ServiceTime(utc_ns, self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known),
             ShootingState(
@@ -522,7 +529,7 @@ class Service:
                 self.parts.publisher.statistics(),
                 self.parts.writer.frame_bytes,
             ),
-            decoding=DecodingState(
+            DecodingState(
                 self.parts.decoder is not None,
                 self.parts.pipeline.decode_failures,
                 self.parts.events.misfit,
@@ -530,8 +537,8 @@ class Service:
             ),
             dead_threads=[name for part in (*self.parts.vital, *viewers) for name in part.dead_threads()],
             found=[one for one in found if one is not None],
-            standing=self._standing,
         )
+        return health.record(now, self._standing)
 
     # what others may look at, and ask for
 

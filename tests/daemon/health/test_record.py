@@ -15,7 +15,14 @@ import pytest
 from dappled import codec
 from dappled.config.settings import DecodeSettings, MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
+from dappled.daemon.health.record import (
+    DecodingState,
+    KeepingState,
+    ServiceState,
+    ServiceTime,
+    ShootingState,
+    VehicleState,
+)
 from dappled.daemon.navigation import BootClock, Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.overlap import FrameOverlap
@@ -70,7 +77,7 @@ def record(
     links = [link, *more.pop("links", ())]
     times = ServiceTime(1_800_000_000 * S, 101 * S, more.pop("began", 90 * S), more.pop("utc_known", True))
     with disk:
-        return health.record(
+        now = ServiceState(
             settings,
             times,
             ShootingState(shots, ShutterStatistics(2, 0, 0, 2, 0, 2, None), **of_shots),
@@ -78,10 +85,11 @@ def record(
                 links, telemetry, more.pop("clock", CLOCK), more.pop("vehicle", HERE), more.pop("battery", None)
             ),
             KeepingState(folder, [stage.statistics()], stream, more.pop("frame_bytes", None)),
-            decoding=more.pop("decoding", DecodingState(True)),
-            dead_threads=more.pop("dead", ()),
-            **more,
+            more.pop("decoding", DecodingState(True)),
+            more.pop("dead", ()),
+            more.pop("found", ()),
         )
+        return health.record(now, **more)
 
 
 def test_well(tmp_path: Path) -> None:

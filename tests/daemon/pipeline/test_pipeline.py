@@ -19,7 +19,14 @@ from PIL import Image
 from dappled import codec, findings
 from dappled.config.settings import DecodeSettings, MaskSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.health.record import DecodingState, KeepingState, ServiceTime, ShootingState, VehicleState
+from dappled.daemon.health.record import (
+    DecodingState,
+    KeepingState,
+    ServiceState,
+    ServiceTime,
+    ShootingState,
+    VehicleState,
+)
 from dappled.daemon.health.standing import in_record
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline import capture
@@ -473,15 +480,15 @@ DOUBT = finding(Code.CARRIERS_ELSEWHERE, FRAME)
 
 def judged(one: Rig) -> list[str]:
     """The check of decoding, as a person sees it."""
-    record = health.record(
+    now = ServiceState(
         Settings(mask=MaskSettings("mask-1"), decode=DecodeSettings(calibration="c.toml")),
         ServiceTime(1, 1, 0),
         ShootingState(one.pending, one.shutter.statistics()),
         VehicleState((), Telemetry().statistics()),
         KeepingState(one.flight.folder.path, one.pipeline.statistics(), PublisherStatistics({}, {}, 0, 0, 0)),
-        decoding=DecodingState(True, one.pipeline.decode_failures),
+        DecodingState(True, one.pipeline.decode_failures),
     )
-    return [str(told(one)) for one in in_record(record) if one.code.startswith(("decode.", "carriers."))]
+    return [str(told(one)) for one in in_record(health.record(now)) if one.code.startswith(("decode.", "carriers."))]
 
 
 def test_a_doubt_about_a_calibrated_flight_is_in_ledger_wire_and_go_no_go(tmp_path: Path) -> None:

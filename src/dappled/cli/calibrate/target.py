@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,16 @@ if not words_only:
 _FAR_SIGMAS = 4.0  # 1 in 10⁴ of normal errors is beyond it
 
 
+@dataclass(frozen=True, slots=True)
+class TargetFit:
+    """A ranging, what each target showed, what puts it in doubt, and the last frame's views."""
+
+    ranging: Ranging
+    targets: list[Target]
+    doubts: list[Finding]
+    stack: ViewStack
+
+
 def calibrated(
     recipe: Recipe,
     frames: list[Path],
@@ -39,10 +50,11 @@ def calibrated(
     """Fit the ranging, and write it with the calibration that the frames were decoded with."""
     if to.suffix != ".toml":
         raise DappledError(f"{to}: the name of a calibration with distances must end in .toml")
-    found, targets, doubts, stack = from_frames(recipe, frames, metres, focal_length_mm, output)
+    seen = from_frames(recipe, frames, metres, focal_length_mm, output)
+    found = seen.ranging
     written = _write(recipe, to, found)
     lines = []
-    for path, target in zip(frames, targets, strict=True):
+    for path, target in zip(frames, seen.targets, strict=True):
         clear = target.shift_px - found.offset_px
         says = f"{found.gain_px_m / clear:.3g} m" if clear > 0 else "beyond infinity"
         shift = f"{target.shift_px:.3f} ± {target.sigma_px:.3f} px over the aperture; by the fit {says}"
@@ -50,12 +62,12 @@ def calibrated(
     gain = f"{found.gain_px_m:.4g} ± {found.gain_sigma_share * found.gain_px_m:.2g} px·m"
     offset = f"{found.offset_px:+.4g} ± {found.offset_sigma_px:.2g} px"
     lines.append(f"shift = {gain} / distance {offset}, from {found.source}")
-    focus = found.focus(stack)
+    focus = found.focus(seen.stack)
     if focus is not None:
         lines.append("in focus at {:.4g} ± {:.1g} m".format(*focus))
     lines.append(f"written to {', '.join(map(str, written))}")
-    values = {"targets": codec.plain(targets), **codec.plain(found), "focus_m": focus, "doubts": codec.plain(doubts)}
-    return Report(values, lines, findings=doubts)
+    values = {"targets": codec.plain(seen.targets), **codec.plain(found), "focus_m": focus}
+    return Report(values | {"doubts": codec.plain(seen.doubts)}, lines, findings=seen.doubts)
 
 
 def from_frames(
@@ -64,12 +76,8 @@ def from_frames(
     metres: Sequence[float],
     focal_length_mm: float | None = None,
     output: Output | None = None,
-) -> tuple[Ranging, list[Target], list[Finding], ViewStack]:
-    """The ranging that frames of targets show, what each target showed, what puts it in doubt, and the last
-    frame's views.
-
-    Raises DappledError.
-    """
+) -> TargetFit:
+    """The ranging that frames of targets show. Raises DappledError."""
     if len(frames) != len(metres):
         both = f"{counted(len(frames), 'frame')} and {counted(len(metres), 'distance')}"
         raise DappledError(f"{both}: give --target one distance per frame")
@@ -93,7 +101,7 @@ def from_frames(
         if len(several) > 1:
             raise DappledError(f"the targets were taken at several {name} ({_listed(several)}): take them all at one")
     found = fit_targets(targets, f_number=stops.pop(), focal_length_mm=lengths.pop(), lens=lens)
-    return found, targets, doubts + misfits(found, frames, targets), field.stack
+    return TargetFit(found, targets, doubts + misfits(found, frames, targets), field.stack)
 
 
 def misfits(found: Ranging, frames: Sequence[Path], targets: Sequence[Target]) -> list[Finding]:

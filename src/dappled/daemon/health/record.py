@@ -144,23 +144,27 @@ class KeepingState:
     frame_bytes: float | None = None
 
 
-def record(
-    settings: Settings,
-    time: ServiceTime,
-    shooting: ShootingState,
-    vehicle: VehicleState,
-    keeping: KeepingState,
-    *,
-    decoding: DecodingState,
-    dead_threads: Sequence[str] = (),
-    found: Sequence[Finding] = (),
-    standing: StandingFindings | None = None,
-) -> dict[str, Any]:
-    """The header of a `health` message. Its `findings` are the one list of the service, worst first, then newest.
+@dataclass(frozen=True, slots=True)
+class ServiceState:
+    """All that a health record is made of. `dead_threads` have ended without being asked to; `found` are the findings
+    of other parts."""
 
-    `dead_threads` have ended without being asked to. `found` are the findings of other parts; `standing` knows since
-    when each stands.
+    settings: Settings
+    time: ServiceTime
+    shooting: ShootingState
+    vehicle: VehicleState
+    keeping: KeepingState
+    decoding: DecodingState
+    dead_threads: Sequence[str] = ()
+    found: Sequence[Finding] = ()
+
+
+def record(of: ServiceState, standing: StandingFindings | None = None) -> dict[str, Any]:
+    """The header of a `health` message. Its `findings` are the one list of the service, worst first, then newest;
+    `standing` knows since when each stands.
     """
+    settings, time, shooting, vehicle = of.settings, of.time, of.shooting, of.vehicle
+    keeping, decoding = of.keeping, of.decoding
     link, silences = _link(settings, vehicle, time)
     disk, shortages = _disk(settings.record, keeping.folder)
     facts = {
@@ -185,10 +189,10 @@ def record(
     missing, series, body = shooting.shots.without_camera(), shooting.series, shooting.body
     deaf = vehicle.fresh and settings.pose.on_gimbal and vehicle.pose is not None and not vehicle.pose.gimbal_attitude
     now = [
-        *(finding(Code.THREAD_ENDED, Subject("thread", name)) for name in dead_threads),
+        *(finding(Code.THREAD_ENDED, Subject("thread", name)) for name in of.dead_threads),
         *([] if missing is None else [missing]),
         *silences,
-        *found,
+        *of.found,
         *([] if series is None or series.trouble is None else [series.trouble]),
         *([] if body is None else body.findings()),
         *([finding(Code.GIMBAL_UNHEARD, Subject("vehicle"))] if deaf else []),
