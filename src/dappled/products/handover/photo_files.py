@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import struct
 from collections.abc import Sequence
 from contextlib import suppress
@@ -14,7 +15,7 @@ import numpy as np
 import tifffile
 from PIL import Image
 
-from dappled import __version__, durable
+from dappled import durable
 from dappled.config import profiles
 from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
@@ -24,21 +25,20 @@ from dappled.flight import Frame, Tag
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
 from dappled.products.geotags.geotags import Placed
+from dappled.products.handover.exif_settings import EXIF_IFD, UNDEFINED, ExifSettings, short_entry
 from dappled.products.maps import cog
 from dappled.products.maps.photographs import Photograph, Station
 
 SUFFIXES = {"tiff": ".tif", "jpeg": ".jpg"}
 _QUALITY = 95
-_EXIF_IFD = 0x8769
-_SHORT, _LONG, _RATIONAL, _UNDEFINED = 3, 4, 5, 7
+_LONG = 4
 _XMP_TAG = 700
 _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\0"
-_FILM_MM = 36.0
 _FIRST_OF_JPEG: list[Entry] = [
-    (0x011A, _RATIONAL, 1, struct.pack("<II", 72, 1)),
-    (0x011B, _RATIONAL, 1, struct.pack("<II", 72, 1)),
-    (0x0128, _SHORT, 1, struct.pack("<H", 2)),
-    (0x0213, _SHORT, 1, struct.pack("<H", 1)),
+    ratio_entry(0x011A, 72, 1),
+    ratio_entry(0x011B, 72, 1),
+    short_entry(0x0128, 2),
+    short_entry(0x0213, 1),
 ]
 
 
@@ -72,7 +72,7 @@ def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, 
         software=False,
         extratags=[(_XMP_TAG, 1, len(xmp), xmp, True)],
     )
-    tiff = exif_gps.with_directory(buffer.getvalue(), _EXIF_IFD, inner, first)
+    tiff = exif_gps.with_directory(buffer.getvalue(), EXIF_IFD, inner, first)
     return {"tiff": exif_gps.tagged(tiff, _place(station, utc_ns)), "jpeg": jpeg(one, station, utc_ns, gain)}
 
 
@@ -80,7 +80,7 @@ def jpeg(one: Photograph, station: Station, utc_ns: int | None, gain: float) -> 
     """The picture times `gain`, in sRGB's curve, as JPEG with EXIF and XMP."""
     first, inner = _settings(one, station.tag, utc_ns)
     buffer = io.BytesIO()
-    settings = exif_gps.with_directory(exif_gps.EMPTY, _EXIF_IFD, inner, [*first, *_FIRST_OF_JPEG])
+    settings = exif_gps.with_directory(exif_gps.EMPTY, EXIF_IFD, inner, [*first, *_FIRST_OF_JPEG])
     eight = Image.fromarray(np.round(_srgb(one.image * gain) * 255).astype(np.uint8))
     eight.save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=b"Exif\0\0" + settings)
     made = exif_gps.tagged(buffer.getvalue(), _place(station, utc_ns))
@@ -110,46 +110,21 @@ def _srgb(image: Singles) -> Floats:
 
 
 def _settings(one: Photograph, tag: Tag, utc_ns: int | None) -> tuple[list[Entry], list[Entry]]:
-    """Entries of the first directory and of EXIF 2.31's, little endian; unknown ones are left out."""
-    first = [
-        text_entry(0x010F, "dappled"),
-        text_entry(0x0110, tag.camera),
-        text_entry(0x0131, f"dappled {__version__}"),
-    ]
+    """Entries of the first directory and of EXIF's."""
     rows, columns = one.eye.shape
-    inner: list[Entry] = [
-        (0x9000, _UNDEFINED, 4, b"0231"),
-        (0x9101, _UNDEFINED, 4, bytes((1, 2, 3, 0))),
-        (0xA000, _UNDEFINED, 4, b"0100"),
-        (0xA001, _SHORT, 1, struct.pack("<H", 1)),  # sRGB
-        (0xA002, _LONG, 1, struct.pack("<I", columns)),
-        (0xA003, _LONG, 1, struct.pack("<I", rows)),
-    ]
+    taken = fraction = ""
     if utc_ns is not None:
         taken = datetime.fromtimestamp(utc_ns // 10**9, UTC).strftime("%Y:%m:%d %H:%M:%S")
         fraction = f"{utc_ns % 10**9 // 1000:06d}"
-        first.append(text_entry(0x0132, taken))
-        inner += [
-            text_entry(0x9003, taken),
-            text_entry(0x9004, taken),
-            text_entry(0x9011, "+00:00"),
-            text_entry(0x9291, fraction),
-        ]
-    if tag.exposure_s:
-        inner.append(ratio_entry(0x829A, round(tag.exposure_s * 1e6), 10**6))
-    if tag.f_number:
-        inner.append(ratio_entry(0x829D, round(tag.f_number * 100), 100))
-    if tag.iso:
-        inner.append((0x8827, _SHORT, 1, struct.pack("<H", min(65535, round(tag.iso)))))
-    if tag.focal_length_mm:
-        per_mm = [float(np.linalg.norm(one.eye.matrix[:2, axis])) / tag.focal_length_mm for axis in (0, 1)]
-        inner += [
-            ratio_entry(0x920A, round(tag.focal_length_mm * 1000), 1000),
-            ratio_entry(
-                0xA20E, round(per_mm[0] * 10 * 10**4), 10**4
-            ),  # pixels of this picture in a centimetre of the chip
-            ratio_entry(0xA20F, round(per_mm[1] * 10 * 10**4), 10**4),
-            (0xA210, _SHORT, 1, struct.pack("<H", 3)),
-            (0xA405, _SHORT, 1, struct.pack("<H", round(_FILM_MM * tag.focal_length_mm * per_mm[0] / columns))),
-        ]
-    return first, inner
+    length_mm = tag.focal_length_mm
+    across, down = (float(np.linalg.norm(one.eye.matrix[:2, axis])) / (length_mm or math.inf) for axis in (0, 1))
+    lens = tag.f_number, tag.iso, length_mm, (across, down), columns
+    first, inner = ExifSettings("dappled", tag.camera, taken, fraction, tag.exposure_s, *lens).entries()
+    inner += [
+        (0x9101, UNDEFINED, 4, bytes((1, 2, 3, 0))),
+        (0xA000, UNDEFINED, 4, b"0100"),
+        short_entry(0xA001, 1),  # sRGB
+        (0xA002, _LONG, 1, struct.pack("<I", columns)),
+        (0xA003, _LONG, 1, struct.pack("<I", rows)),
+    ]
+    return first, inner + ([text_entry(0x9011, "+00:00")] if taken else [])

@@ -17,18 +17,17 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from dappled import __version__, durable
+from dappled import durable
 from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.products.geotags import exif_gps
-from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
+from dappled.products.geotags.exif_gps import Entry, text_entry
+from dappled.products.handover.exif_settings import EXIF_IFD, ExifSettings, short_entry
 from dappled.products.handover.reflectance import ReflectancePicture
 
 SUFFIXES = (".dng", ".tif", ".tiff", ".jpg", ".jpeg", ".png")
-_EXIF_IFD, _GPS_IFD = 0x8769, 0x8825
-_SHORT, _LONG, _UNDEFINED = 3, 4, 7
+_GPS_IFD = 0x8825
 _QUALITY = 95
-_FILM_MM = 36.0
 
 
 def encoded(
@@ -40,8 +39,8 @@ def encoded(
     first, inner = _settings(made)
     if kind == ".dng":
         if made.raw.cfa is None:
-            first.append((0x0106, _SHORT, 1, struct.pack("<H", developing.LINEAR_RAW)))
-        data = exif_gps.with_directory(developing.dng(made), _EXIF_IFD, inner, first)
+            first.append(short_entry(0x0106, developing.LINEAR_RAW))
+        data = exif_gps.with_directory(developing.dng(made), EXIF_IFD, inner, first)
         return data if where is None else exif_gps.tagged(data, where)
     if reflected is not None:
         first.append(text_entry(0x010E, reflected.description))
@@ -50,9 +49,9 @@ def encoded(
     if kind in (".tif", ".tiff"):
         colours = "rgb" if shown.ndim == 3 else "minisblack"
         tifffile.imwrite(buffer, shown, byteorder="<", photometric=colours, metadata=None, software=False)
-        data = exif_gps.with_directory(buffer.getvalue(), _EXIF_IFD, inner, first)
+        data = exif_gps.with_directory(buffer.getvalue(), EXIF_IFD, inner, first)
     else:
-        exif = b"Exif\0\0" + exif_gps.with_directory(exif_gps.EMPTY, _EXIF_IFD, inner, first)
+        exif = b"Exif\0\0" + exif_gps.with_directory(exif_gps.EMPTY, EXIF_IFD, inner, first)
         if kind == ".png":
             # Pillow writes no 16-bit colours: 8 bits are what a PNG is looked at with.
             eight = shown if shown.ndim == 2 else _eight(shown)
@@ -77,34 +76,15 @@ def _eight(shown: NDArray[np.uint16]) -> NDArray[np.uint8]:
 
 
 def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:
-    """Entries of the first directory and of EXIF's, little endian; unknown ones are left out."""
+    """Entries of the first directory and of EXIF's."""
     raw = made.raw
-    first = [text_entry(0x0131, f"dappled {__version__}"), (0x0112, _SHORT, 1, struct.pack("<H", 1))]
-    for tag, words in ((0x010F, raw.camera_make), (0x0110, raw.camera_model)):
-        first += [text_entry(tag, words)] if words else []
-    inner: list[Entry] = [(0x9000, _UNDEFINED, 4, b"0231")]
-    if raw.taken:
-        whole, _, fraction = raw.taken.partition(".")
-        taken = whole.replace("-", ":").replace("T", " ")
-        first.append(text_entry(0x0132, taken))
-        inner += [text_entry(0x9003, taken), text_entry(0x9004, taken)]
-        inner += [text_entry(0x9291, fraction)] if fraction else []
-    if raw.exposure_s:
-        inner.append(ratio_entry(0x829A, round(raw.exposure_s * 1e6), 10**6))
-    if made.f_number:
-        inner.append(ratio_entry(0x829D, round(made.f_number * 100), 100))
-    if raw.iso:
-        inner.append((0x8827, _SHORT, 1, struct.pack("<H", min(65535, round(raw.iso)))))
+    whole, _, fraction = (raw.taken or "").partition(".")
     down, across = (1 / math.hypot(*step) for step in (made.sensor.row_mm, made.sensor.column_mm))
-    inner += [
-        ratio_entry(0x920A, round(made.focal_length_mm * 1000), 1000),
-        ratio_entry(0xA20E, round(across * 10 * 10**4), 10**4),  # pixels in a centimetre of the chip
-        ratio_entry(0xA20F, round(down * 10 * 10**4), 10**4),
-        (0xA210, _SHORT, 1, struct.pack("<H", 3)),
-    ]
-    film = _FILM_MM * made.focal_length_mm * across / made.sensor.shape[1]
-    inner.append((0xA405, _SHORT, 1, struct.pack("<H", min(65535, round(film)))))
-    return first, inner
+    taken = whole.replace("-", ":").replace("T", " ")
+    lens = made.f_number, raw.iso, made.focal_length_mm, (across, down), made.sensor.shape[1]
+    settings = ExifSettings(raw.camera_make, raw.camera_model, taken, fraction, raw.exposure_s, *lens)
+    first, inner = settings.entries()
+    return [*first, short_entry(0x0112, 1)], inner
 
 
 def place_in(path: Path) -> exif_gps.Place | None:
