@@ -10,6 +10,8 @@ import errno
 import hashlib
 import mmap
 import os
+import secrets
+import shutil
 import stat
 import struct
 from collections.abc import Callable, Iterator
@@ -72,6 +74,47 @@ def make_folder(path: Path) -> None:
     if not path.is_dir():
         raise NotADirectoryError(20, os.strerror(20), str(path))
     sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """The name to write under, with the ending of `path`. A folder can't replace one that isn't empty, so an old one is
+    moved aside first. Raises OSError; then `path` is as it was."""
+    part = path.with_name(f".{path.stem}.{secrets.token_hex(4)}.part{path.suffix}")
+    old = part.with_name(f"{part.name}.old.part")
+    try:
+        yield part
+        _sync_all(part)
+        if path.is_dir():
+            path.rename(old)
+        try:
+            part.replace(path)
+        except OSError:
+            if old.exists():
+                old.rename(path)
+            raise
+        sync_folder(path.parent)
+    finally:
+        _remove(part)
+    _remove(old)
+
+
+def _sync_all(path: Path) -> None:
+    """fsync a file, or a folder with its content."""
+    if path.is_file():
+        with descriptor(path, os.O_RDWR) as fd:  # Windows flushes no file that is open for reading
+            os.fsync(fd)
+        return
+    for inner in path.iterdir():
+        _sync_all(inner)
+    sync_folder(path)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def write_file(path: Path, data: bytes, mode: int = 0o644) -> None:

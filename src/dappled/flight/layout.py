@@ -144,17 +144,15 @@ def create(root: Path, utc_ns: int | None, facts: Mapping[str, Any] | None = Non
     else:
         start = datetime.fromtimestamp(utc_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
     folder = FlightFolder(root / f"{start}-{secrets.token_hex(4)}")
-    made = FlightFolder(durable.temporary(folder.path))
     try:
         durable.make_folder(root)
-        made.path.mkdir(0o750)  # positions and pictures are not for every user of the machine
-        durable.make_folder(made.frames)
-        write_facts(made, facts or {})
-        made.path.rename(folder.path)
-        durable.sync_folder(root)
+        with durable.replacing(folder.path) as part:
+            part.mkdir(0o750)  # positions and pictures are not for every user of the machine
+            made = FlightFolder(part)
+            durable.make_folder(made.frames)
+            write_facts(made, facts or {})
     except OSError as error:
-        for path in (made.path, folder.path):
-            shutil.rmtree(path, ignore_errors=True)
+        shutil.rmtree(folder.path, ignore_errors=True)
         raise disk_error("make the flight folder", folder.path, error) from error
     return folder
 

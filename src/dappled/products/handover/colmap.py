@@ -19,7 +19,6 @@ from dappled.decode.geometry import field_of_view
 from dappled.errors import DappledError
 from dappled.products.handover import view_cameras, view_files
 from dappled.products.handover.view_cameras import FrameCameras, LocalAxes, ViewCamera
-from dappled.products.whole_files import replacing
 
 _RIG_COLUMNS = (
     "# RIG_ID, NUM_SENSORS, REF_SENSOR_TYPE, REF_SENSOR_ID, "
@@ -59,7 +58,7 @@ def write_model(folder: Path, frames: Sequence[FrameCameras]) -> list[Path]:
     if theirs:
         raise DappledError(f"{final} holds {theirs[0]}, which no batch wrote: move the folder, and run it again")
     durable.make_folder(final.parent)
-    with replacing(final) as part:
+    with durable.replacing(final) as part:
         part.mkdir()
         for name, text in texts.items():
             durable.write_file(part / name, text.encode())

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 import secrets
 import shutil
@@ -211,27 +210,20 @@ class NodeOdm:
 
     def _fetch(self, task: str, path: Path) -> None:
         """Put all results of a task under `path`, whole or not at all. Raises NodeOdmError and OSError."""
-        part = durable.temporary(path)
         durable.make_folder(path.parent)
-        try:
-            with self._opened(f"/task/{urllib.parse.quote(task)}/download/all.zip", None) as answer:
+        where = f"/task/{urllib.parse.quote(task)}/download/all.zip"
+        with durable.replacing(path) as part:
+            with self._opened(where, None) as answer, part.open("wb") as file:
+                while piece := self._piece(answer):
+                    if shutil.disk_usage(part.parent).free < _LEFT_BYTES:  # results may have no end
+                        raise NodeOdmError(f"{part.parent} has less than 1 GB free left: free some space")
+                    file.write(piece)
+                size = file.tell()
                 wanted = answer.headers.get("content-length")
-                with part.open("wb") as file:
-                    while piece := self._piece(answer):
-                        if shutil.disk_usage(part.parent).free < _LEFT_BYTES:  # results may have no end
-                            raise NodeOdmError(f"{part.parent} has less than 1 GB free left: free some space")
-                        file.write(piece)
-                    file.flush()
-                    os.fsync(file.fileno())
-                    size = file.tell()
             if wanted is not None and wanted.isdigit() and int(wanted) != size:
                 raise NoAnswerError(f"{self._url} ended the transfer after {size} of {wanted} bytes")
             if not zipfile.is_zipfile(part):  # a refusal, too, comes with status 200
                 raise NodeOdmError(f"{self._url} sent no results for task {task}: {_refusal(part)}")
-            part.rename(path)
-            durable.sync_folder(path.parent)
-        finally:
-            part.unlink(missing_ok=True)
 
     def _piece(self, answer: Any) -> bytes:
         try:

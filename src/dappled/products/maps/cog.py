@@ -16,7 +16,6 @@ from dappled.decode import srgb
 from dappled.decode.array_types import Singles
 from dappled.products.extras import need
 from dappled.products.maps.map_grid import MapError, MapGrid
-from dappled.products.whole_files import replacing
 
 TILE = 512
 _LEVELS = 65535  # of linear values: a twentieth of what 8 bits in sRGB's curve tell apart in the dark
@@ -97,7 +96,7 @@ def write_pieces(
                 for number, name in enumerate(names, 1):
                     target.set_band_description(number, name)
                 target.update_tags(**tags)
-            with replacing(path) as part:
+            with durable.replacing(path) as part:
                 shutil.copy(
                     plain, part, driver="COG", compress="deflate", level=_DEFLATE, predictor="yes", blocksize=TILE,
                     overview_resampling="average", num_threads=1,

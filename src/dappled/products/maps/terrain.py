@@ -23,7 +23,6 @@ from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.hyperstereo import Surface
 from dappled.products.maps.map_grid import MapGrid
-from dappled.products.whole_files import replacing
 
 VERTICAL = "EPSG:5773"  # EGM96 height: what autopilots call mean sea level
 CELL = 2.0  # of a map's cells: heights are coarser than pictures
@@ -115,7 +114,7 @@ def write_points(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     if terrain.difference_m is not None:
         extra["difference"] = terrain.difference_m[known], "m above the given terrain"
     durable.make_folder(path.parent)
-    with replacing(path) as part:
+    with durable.replacing(path) as part:
         las_files.write(part, points, extra, crs=compound(made.projection), utc_ns=made.photographs[0].utc_ns)
     return path
 
