@@ -22,6 +22,7 @@ from dappled.daemon.replay.vehicle_choice import VehicleError, vehicle_of
 from dappled.daemon.replay.verifier import Expected, ReplayVerifier, ResultWriter
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser
+from dappled.drivers.mavlink.own_logs import own_log
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.replay import RecordedShot
 from dappled.drivers.utc_choice import Date, UtcBounds
@@ -442,26 +443,12 @@ def packets(
     path: Path, report: Callable[[Finding], object] = lambda _: None, bounds: UtcBounds | None = None
 ) -> Iterator[tuple[int, int, MavlinkMessage]]:
     """The messages of a .tlog or of an autopilot's own log. Raises FlightError and AutopilotLogError."""
-    decoder = PacketParser()
-    for number, stamp_us, raw in _logged(path, report, bounds):
+    decoder, reader = PacketParser(), own_log(path)
+    logged = log_reading.read_telemetry(path, report) if reader is None else reader.packets(path, report, bounds)
+    for number, stamp_us, raw in logged:
         message = decoder(raw)
         if message is not None:  # a packet with a wrong checksum was never acted on either
             yield number, stamp_us, message
-
-
-def _logged(
-    path: Path, report: Callable[[Finding], object], bounds: UtcBounds | None
-) -> Iterator[tuple[int, int, bytes]]:
-    kind = own_log(path)
-    if kind is None:
-        return log_reading.read_telemetry(path, report)
-    if kind == "ulog":
-        from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
-
-        return ulog.packets(path, report, bounds)
-    from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
-
-    return dataflash.packets(path, report, bounds)
 
 
 def _first_position_utc_ns(path: Path, bounds: UtcBounds, system: int | None) -> int:
@@ -471,19 +458,3 @@ def _first_position_utc_ns(path: Path, bounds: UtcBounds, system: int | None) ->
     if utc_ns is None:
         raise DappledError(f"{path} holds no position: give --start, the time of the first frame")
     return utc_ns
-
-
-_OWN_LOGS = {b"\xa3\x95\x80\x80": "dataflash", b"ULog\x01\x12\x35": "ulog"}
-
-
-def own_log(path: Path) -> str | None:
-    """Whose own log a file is, by its first bytes: "dataflash" of ArduPilot, "ulog" of PX4; None for a .tlog.
-
-    Raises DappledError where it can't be read.
-    """
-    try:
-        with open(path, "rb", opener=durable.plain_file) as file:
-            begins = file.read(7)
-    except OSError as error:
-        raise DappledError(f"{path} can't be read: {error.strerror}") from error
-    return next((name for magic, name in _OWN_LOGS.items() if begins.startswith(magic)), None)

@@ -25,10 +25,10 @@ from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings
 from dappled.daemon.navigation import recorded_vehicles
 from dappled.daemon.replay.in_order import paired_in_order
-from dappled.daemon.replay.replay import own_log
 from dappled.drivers.mavlink import PacketParser, mavlink
 from dappled.drivers.mavlink.framing import message_of
 from dappled.drivers.mavlink.log_packets import BootMap, LoggedTrigger, TriggerLog
+from dappled.drivers.mavlink.own_logs import own_log
 from dappled.drivers.utc_choice import LOGS_FROM_NS, UtcBounds
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Subject, finding, text
@@ -251,16 +251,10 @@ def reconcile(flight: Path, logs: Sequence[Path]) -> ThreeBooks:
 
 
 def _read(path: Path, cam_idx: int, bounds: UtcBounds) -> TriggerLog:
-    kind = own_log(path)
-    if kind == "ulog":
-        from dappled.drivers.mavlink import ulog  # noqa: PLC0415  loaded for these logs only
-
-        return ulog.triggers(path, bounds)
-    if kind == "dataflash":
-        from dappled.drivers.mavlink import dataflash  # noqa: PLC0415  its reader takes a tenth of a second to load
-
-        return dataflash.triggers(path, cam_idx, bounds)
-    raise DappledError(f"{path} is no log of an autopilot: give ArduPilot's .bin or PX4's .ulg")
+    reader = own_log(path)
+    if reader is None:
+        raise DappledError(f"{path} is no log of an autopilot: give ArduPilot's .bin or PX4's .ulg")
+    return reader.triggers(path, cam_idx, bounds)
 
 
 def _heard(telemetry: Path, systems: set[int], mine: MavlinkSettings, *, outside: bool) -> _Heard:

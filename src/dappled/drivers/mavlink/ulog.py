@@ -66,9 +66,10 @@ def packets(
     yield from log_packets.packets(messages, clock)
 
 
-def triggers(path: Path, bounds: UtcBounds | None = None) -> TriggerLog:
-    """The camera's triggers: camera_trigger, of which some may be contacts of a feedback pin, or without it
-    camera_capture. Where nothing but contacts is logged, each of them is a trigger. Raises AutopilotLogError."""
+def triggers(path: Path, _cam_idx: int = 0, bounds: UtcBounds | None = None) -> TriggerLog:
+    """The camera's triggers (PX4 has one camera): camera_trigger, of which some may be contacts of a feedback pin, or
+    without it camera_capture. Where nothing but contacts is logged, each of them is a trigger. Raises
+    AutopilotLogError."""
     with log_packets.sound(path, "PX4"):
         log = _Topics.read(path, [_PLACES, _TRIGGERS, _CAPTURES])
         clock, _, _ = _clock(path, log, bounds)
