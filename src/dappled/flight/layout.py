@@ -17,12 +17,13 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import tomli_w
 
 from dappled import codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_toml, read_log
+from dappled.closing import Closing
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight.errors import FlightError, disk_error, disk_errors
 
@@ -279,7 +280,7 @@ class LockHeldError(FlightError):
         self.records = records
 
 
-class FlightsLock:
+class FlightsLock(Closing):
     """The lock (flock) of the one process that writes in a flights folder: the daemon, or work on its closed flights.
 
     Held from creation to `close`, or until the process ends in any way.
@@ -316,12 +317,6 @@ class FlightsLock:
         except FlightError:
             os.close(self._fd)
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         os.close(self._fd)

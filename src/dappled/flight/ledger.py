@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sqlite3
 import threading
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -17,6 +17,7 @@ from typing import Any, Self, TypeVar, cast
 
 from dappled import codec, findings
 from dappled.clock import Clock
+from dappled.closing import Closing
 from dappled.codec import CodecError, canonical
 from dappled.decode.geometry import Pose
 from dappled.findings import FRAME, Code, Finding, finding
@@ -57,7 +58,7 @@ def advance(index: int, old: ShotState, new: ShotState) -> ShotState:
     return new
 
 
-class Database(ABC):
+class Database(Closing):
     """One SQLite connection behind a lock, so that threads may share it. `_sentence` words SQLite's errors."""
 
     def __init__(self, path: Path, uri: str) -> None:
@@ -76,12 +77,6 @@ class Database(ABC):
         except BaseException:
             self._db.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the connection; the last one to close folds the WAL into the file."""

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Self
 
 from dappled import durable
+from dappled.closing import Closing
 from dappled.flight.errors import FlightError, disk_error
 
 _CLOEXEC, _HERE, _NONBLOCK = (getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"))
@@ -46,7 +47,7 @@ class FileIdentity:
         return cls.of(os.fstat(fd))
 
 
-class Tree:
+class Tree(Closing):
     """A folder, open, and the folders below it that were opened or made. Names are relative to it, with "/" between."""
 
     def __init__(self, path: Path) -> None:
@@ -55,12 +56,6 @@ class Tree:
         self._folders: dict[str, int] = {}
         with self._saying("open", ""):
             self._folders[""] = os.open(path, _FOLDER)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         for fd in self._folders.values():

@@ -12,8 +12,9 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
+from dappled.closing import Closing
 from dappled.shown import guard_output
 
 ATTEMPTS = 3  # a job that kills this many workers is given up
@@ -42,7 +43,7 @@ def worth(asked: int, jobs: int) -> int:
     return max(1, min(asked, jobs // _WORTH))
 
 
-class Crew:
+class Crew(Closing):
     """So many processes with one thread each, for one piece of work after the other. Use as a context manager.
 
     Processes are started when there are jobs for them. `make`, which is sent to each of them once, must not raise. One
@@ -55,10 +56,7 @@ class Crew:
         self._job_s, self._now_s = job_s, now_s
         self._crew: list[_Worker] = []
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         for worker in self._crew:
             _dismiss(worker)
 

@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 from dappled import codec
 from dappled.clock import Clock
+from dappled.closing import Closing
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.raw.darkroom import FILES, Recipe
@@ -34,7 +35,7 @@ class Run:
     names: Names
 
 
-class RunWriter:
+class RunWriter(Closing):
     """Writes one run's results into a closed flight's ledger."""
 
     def __init__(self, flight: Path, run: Run, clock: Clock, key: SealKey | None = None) -> None:
@@ -69,10 +70,7 @@ class RunWriter:
             self._ledger.set_fact(_fact(run.name), {**kept_as, "utc_ns": clock.utc_ns()})
             self._opened = stack.pop_all()
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         self._opened.close()
 
     def decoded(self, result: Result) -> None:

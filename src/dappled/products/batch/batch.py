@@ -17,10 +17,10 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
-from typing import Self
 
 from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
+from dappled.closing import Closing
 from dappled.drivers.raw.darkroom import Darkroom, Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError, sentence
@@ -353,7 +353,7 @@ def _settle_memory() -> None:
     mallopt(_MMAP_THRESHOLD, 1 << 25)
 
 
-class Manifest:
+class Manifest(Closing):
     """The manifest of an output folder, locked by one batch at a time. Use as a context manager."""
 
     def __init__(self, output: Path) -> None:
@@ -374,10 +374,7 @@ class Manifest:
         for done in self._read():
             self._note(done)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
         os.close(self._fd)
 
     def add(self, done: Done) -> None:
