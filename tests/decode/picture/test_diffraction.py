@@ -16,7 +16,7 @@ from dappled.decode.optics.shadow_orders import shadow_orders
 from dappled.decode.picture.blocks import MosaicPlane
 from dappled.decode.picture.picture import picture_of
 from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of
-from dappled.decode.picture.shadow_fit import shadow_of
+from dappled.decode.picture.shadow_fit import ExpectedShadow, shadow_of
 from tests.decode.picture.full_rays import psnr
 from tests.decode.picture.full_waves import CAMERAS, WaveCamera, WaveShot, contrast_left, draw
 
@@ -37,7 +37,7 @@ def picture_in(shot: WaveShot, frame: NDArray[np.floating]) -> tuple[NDArray[np.
     lattice = optics.lattice(50.0)
     orders = shadow_orders(optics, lattice, shot.f_number)
     mosaic = MosaicPlane(frame.astype(np.float32), np.zeros((1, 1), dtype=np.intp))
-    shadow = shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02)
+    shadow = shadow_of(mosaic, ExpectedShadow(lattice, orders, 0.03, 0.02))
     return picture_of(mosaic, shadow, period_of(lattice)).plane, shadow
 
 

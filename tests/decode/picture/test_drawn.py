@@ -9,12 +9,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from dappled.decode.optics.carriers import Lattice, MaskedOptics, Order, Sensor
+from dappled.decode.optics.carriers import Lattice, MaskedOptics, Sensor
 from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import MosaicPlane
 from dappled.decode.picture.picture import picture_of
 from dappled.decode.picture.shadow import Shadow, ShadowEvidence, ShadowFrom, period_of
-from dappled.decode.picture.shadow_fit import shadow_of, told_by
+from dappled.decode.picture.shadow_fit import ExpectedShadow, shadow_of, told_by
 from tests.decode.picture.drawn import COUNT, FILMS, SHAPE, V_MM, Drawn, draw
 from tests.decode.ray_trials import mask_of
 
@@ -33,24 +33,24 @@ class Judged:
     sure_noise: float
 
 
-def _masked(shot: Drawn) -> tuple[MosaicPlane, Lattice, list[Order]]:
+def _masked(shot: Drawn) -> tuple[MosaicPlane, ExpectedShadow]:
     """The frame, the true lattice, and the orders that may be seen."""
     sensor = Sensor(SHAPE, (shot.pitch_mm[0], 0.0), (0.0, shot.pitch_mm[1]))
     optics = MaskedOptics(sensor, mask_of(shot.film), "geometric", shot.distance_mm)
     lattice = optics.lattice(V_MM)
     there = [one for one in order_strengths(optics, lattice, shot.f_number) if one.on_sensor]
     orders = [one.order for one in there if one.most > _SEEN] or [one.order for one in there]
-    return MosaicPlane(shot.frame(), shot.pattern), lattice, orders
+    return MosaicPlane(shot.frame(), shot.pattern), ExpectedShadow(lattice, orders, 0.03, 0.02)
 
 
 def shadow_in(shot: Drawn, beside: Sequence[ShadowEvidence] = ()) -> tuple[MosaicPlane, Shadow, Lattice]:
     """The frame, the shadow that is found in it, and in others beside it, and the true lattice."""
-    mosaic, lattice, orders = _masked(shot)
-    return mosaic, shadow_of(mosaic, lattice, orders, turned=0.03, scaled=0.02, beside=beside), lattice
+    mosaic, expected = _masked(shot)
+    return mosaic, shadow_of(mosaic, expected, beside=beside), expected.lattice
 
 
 def _told(shots: Sequence[Drawn]) -> list[ShadowEvidence]:
-    found = [told_by(*_masked(shot), turned=0.03, scaled=0.02) for shot in shots]
+    found = [told_by(*_masked(shot)) for shot in shots]
     return [one.evidence for one in found if one.seen]
 
 

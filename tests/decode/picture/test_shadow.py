@@ -12,7 +12,7 @@ from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import UnmaskedPicture, interpolated, picture_of
 from dappled.decode.picture.shadow import Shadow, ShadowFrom, period_of
-from dappled.decode.picture.shadow_fit import shadow_of
+from dappled.decode.picture.shadow_fit import ExpectedShadow, shadow_of
 from tests.decode.picture.full_rays import Shot, psnr
 
 MASK = Mask(15.5, 2)
@@ -25,7 +25,7 @@ def _lattice(shot: Shot) -> Lattice:
 
 
 def _shadow(shot: Shot, mosaic: MosaicPlane, *others: Shadow) -> Shadow:
-    return shadow_of(mosaic, _lattice(shot), MASK.half_orders(), turned=0.03, scaled=0.02, others=others)
+    return shadow_of(mosaic, ExpectedShadow(_lattice(shot), MASK.half_orders(), 0.03, 0.02), others)
 
 
 def _picture(shot: Shot, mosaic: MosaicPlane | None = None) -> UnmaskedPicture:

@@ -50,42 +50,36 @@ _LEAST = 1e-3  # of the frame's mean: darker local means tell nothing of the sha
 _UNPULLED = 0.2  # where a few blocks make the whole fit, their scatter tells next to nothing
 
 
+@dataclass(frozen=True, slots=True)
+class ExpectedShadow:
+    """Where carriers are expected, and which: orders of the half plane, without the mean. The search for the lattice
+    allows for a turn (radians) and for a print's scale (a share of the period) to either side."""
+
+    lattice: Lattice
+    orders: Sequence[Order]
+    turned: float = 0.0
+    scaled: float = 0.0
+
+
 def shadow_of(
     mosaic: MosaicPlane,
-    lattice: Lattice,
-    orders: Sequence[Order],
-    *,
-    turned: float = 0.0,
-    scaled: float = 0.0,
+    expected: ExpectedShadow,
     others: Sequence[Shadow] = (),
     beside: Sequence[ShadowEvidence] = (),
 ) -> Shadow:
     """The shadow that explains a frame best: its own, one of `others` (a white frame's, a calibration's), or none.
     What frames `beside` it tell, of the same mask, lens, stop and orders, is averaged with its own, those left out
-    whose shadow is another.
-
-    `lattice` is where the carriers are expected, `orders` those of the half plane without the mean. The search for the
-    lattice allows for a turn (radians) and for a print's scale to either side. What a shadow explains is counted on
-    blocks that it was not fitted to.
+    whose shadow is another. What a shadow explains is counted on blocks that it was not fitted to.
     """
     if beside:
-        lattice = lattice_of_bins(
-            mosaic.shape, np.median([lattice_bins(mosaic.shape, one.lattice) for one in beside], axis=0)
-        )
-    return told_by(mosaic, lattice, orders, turned=turned, scaled=scaled, others=others).shadow(others, beside)
+        bins = np.median([lattice_bins(mosaic.shape, one.lattice) for one in beside], axis=0)
+        expected = replace(expected, lattice=lattice_of_bins(mosaic.shape, bins))
+    return told_by(mosaic, expected, others).shadow(others, beside)
 
 
-def told_by(
-    mosaic: MosaicPlane,
-    lattice: Lattice,
-    orders: Sequence[Order],
-    *,
-    turned: float = 0.0,
-    scaled: float = 0.0,
-    others: Sequence[Shadow] = (),
-) -> OwnShadow:
+def told_by(mosaic: MosaicPlane, expected: ExpectedShadow, others: Sequence[Shadow] = ()) -> OwnShadow:
     """What one frame tells of its shadow, and of `others`, see `shadow_of`."""
-    equations, means = _equations_of(mosaic, lattice, orders, turned=turned, scaled=scaled)
+    equations, means = _equations_of(mosaic, expected)
     at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
     gains = []
     for one in others:
@@ -95,16 +89,14 @@ def told_by(
     return OwnShadow(equations.evidence(), tuple(gains))
 
 
-def _equations_of(
-    mosaic: MosaicPlane, lattice: Lattice, orders: Sequence[Order], *, turned: float, scaled: float
-) -> tuple[_Equations, _Means]:
+def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow) -> tuple[_Equations, _Means]:
     """The equations of a frame's own shadow, at its own lattice; and the local means that they are of."""
-    half = tuple(order for order in orders if order != (0, 0))
+    lattice, half = expected.lattice, tuple(order for order in expected.orders if order != (0, 0))
     mosaic = _unclipped(mosaic, period_of(lattice))
     means = _Means.of(mosaic, period_of(lattice))
     found = lattice
-    if turned or scaled:
-        found = searched(means.quotient(), lattice, half, turned=turned, scaled=scaled)
+    if expected.turned or expected.scaled:
+        found = searched(means.quotient(), lattice, half, turned=expected.turned, scaled=expected.scaled)
     equations = _Equations.of(means, found, half)
     for _ in range(_STEPS):
         if (finer := equations.lattice()) is None:

@@ -17,13 +17,13 @@ from dappled.decode import srgb
 from dappled.decode.array_types import Floats
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lightfield.aperture import SHAPES, Aperture, angular_frequencies, kappa, transfer
-from dappled.decode.optics import LAWS, Lattice, MaskedOptics, Order, Sensor
+from dappled.decode.optics import LAWS, MaskedOptics, Order, Sensor
 from dappled.decode.optics.shadow_orders import shadow_orders
 from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import EMPTY, MosaicPlane
 from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
 from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of
-from dappled.decode.picture.shadow_fit import shadow_of, told_by
+from dappled.decode.picture.shadow_fit import ExpectedShadow, shadow_of, told_by
 from dappled.decode.spectrum import plane as planes
 from dappled.drivers.raw import reading
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
@@ -114,14 +114,10 @@ class _Frame:
         return self.raw.camera_model, self.mosaic.shape, self.lens, self.decoder.optics.law
 
     @property
-    def expected(self) -> tuple[Lattice, list[Order]]:
-        """Where carriers are predicted, and which."""
-        return self.decoder.lattice_at(self.lens[0]), _orders(self.decoder, *self.lens)
-
-    @property
-    def reach(self) -> tuple[float, float]:
-        """How far the lattice is searched: a turn in radians, and a share of the period."""
-        return (_TURNED, _SCALED) if self.decoder.calibration is None else (_TURNED_SINCE, _SCALED_SINCE)
+    def expected(self) -> ExpectedShadow:
+        """The shadow that is predicted, and how far its lattice is searched."""
+        reach = (_TURNED, _SCALED) if self.decoder.calibration is None else (_TURNED_SINCE, _SCALED_SINCE)
+        return ExpectedShadow(self.decoder.lattice_at(self.lens[0]), _orders(self.decoder, *self.lens), *reach)
 
 
 class PictureMaker:
@@ -161,8 +157,7 @@ class PictureMaker:
         """What a frame tells of its shadow; None where it shows none. Raises DappledError."""
         frame = self._frame(one)
         with naming(one.path):
-            turned, scaled = frame.reach
-            own = told_by(frame.mosaic, *frame.expected, turned=turned, scaled=scaled, others=self._known(frame))
+            own = told_by(frame.mosaic, frame.expected, self._known(frame))
         return ToldShadow(one.path, frame.alike, own) if own.seen else None
 
     def _frame(self, one: LensFrame) -> _Frame:
@@ -183,18 +178,16 @@ class PictureMaker:
 
     def _shadow(self, frame: _Frame, told: Sequence[ToldShadow]) -> Shadow:
         decoder, known = frame.decoder, self._known(frame)
-        turned, scaled = frame.reach
         beside = [one.own.evidence for one in told if one.path != frame.path]
         if own := next((one.own for one in told if one.path == frame.path), None):
             made = own.shadow(known, beside)
         else:
-            made = shadow_of(frame.mosaic, *frame.expected, turned=turned, scaled=scaled, others=known, beside=beside)
+            made = shadow_of(frame.mosaic, frame.expected, known, beside)
         if made.source == ShadowFrom.NONE and self._recipe.try_laws and decoder.calibration is None:
             for law in LAWS:
                 there = replace(decoder, optics=decoder.optics.by(law))
                 if law != decoder.optics.law and there.predict(frame.lens[0])[1:]:
-                    expected = replace(frame, decoder=there).expected
-                    tried = shadow_of(frame.mosaic, *expected, turned=turned, scaled=scaled)
+                    tried = shadow_of(frame.mosaic, replace(frame, decoder=there).expected)
                     made = tried if tried.source != ShadowFrom.NONE else made
         return made
 
@@ -206,7 +199,7 @@ class PictureMaker:
         if self._white is None:
             with naming(self._recipe.white):
                 mosaic, _ = self._mosaic(self._darkroom.read(self._recipe.white))
-                found = shadow_of(mosaic, *frame.expected, turned=_TURNED, scaled=_SCALED)
+                found = shadow_of(mosaic, replace(frame.expected, turned=_TURNED, scaled=_SCALED))
                 self._white = replace(found, source=ShadowFrom.WHITE)
         return self._white
 
@@ -291,10 +284,10 @@ def _calibrated(frame: _Frame) -> list[Shadow]:
     (focal_length_mm, f_number), decoder, mosaic = frame.lens, frame.decoder, frame.mosaic
     if decoder.calibration is None or not f_number:
         return []
-    lattice, seen = frame.expected
+    expected = frame.expected
     known = decoder.calibration.nearest(focal_length_mm)
     magnitudes = dict(zip(decoder.optics.mask.half_orders(), known.transfer, strict=True))
-    orders = [order for order in seen if order in magnitudes]
+    orders = [order for order in expected.orders if order in magnitudes]
     transfers = transfer(orders, [magnitudes[order] for order in orders], known.origin)
     cycles = kappa(
         decoder.optics.mask.frequency_per_mm * known.print_scale, known.mask_distance_mm, focal_length_mm, f_number
@@ -305,7 +298,7 @@ def _calibrated(frame: _Frame) -> list[Shadow]:
         through = transfers * Aperture(decoder.optics.mask.views_per_axis, shape).transform(angular)
         each = np.repeat(through[None, :, None], mosaic.colours, axis=0)
         sigma = np.full(mosaic.colours, _TOLD_SIGMA)
-        made.append(Shadow(mosaic.shape, lattice, tuple(orders), each, 0, ShadowFrom.CALIBRATION, sigma))
+        made.append(Shadow(mosaic.shape, expected.lattice, tuple(orders), each, 0, ShadowFrom.CALIBRATION, sigma))
     return made
 
 
