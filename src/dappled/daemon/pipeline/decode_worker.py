@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,13 +31,15 @@ from dappled.decode.lightfield.light_field import fingerprint, slice_mosaic
 from dappled.decode.picture.shadow import shadow_at
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import ChannelMessage, end_with_parent
-from dappled.drivers.raw import developing
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.picture_maker import PictureMaker, mosaic_of
+from dappled.drivers.raw.frame_mosaic import mosaic_of
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError, sentence
 from dappled.findings import FRAME, Code, Finding, finding
 from dappled.shown import guard_output
+
+if TYPE_CHECKING:
+    from dappled.drivers.raw.picture_maker import PictureMaker
 
 log = logging.getLogger(__name__)
 VIEWERS_NICENESS = 14
@@ -56,7 +58,8 @@ class DecodeWorker:
     def __init__(self) -> None:
         self._darkroom: Darkroom | None = None
         self._decided: Darkroom | None = None
-        self._pictures: PictureMaker | None = None
+        self._recipe: Recipe | None = None
+        self._pictures: PictureMaker | None = None  # made with what it needs, when the first picture is asked for
         self._preview_px = 1024
         self._looks = False
         self._laws = LawLooks()
@@ -69,21 +72,20 @@ class DecodeWorker:
             recipe = codec.read(Recipe, body["recipe"])
             plain = replace(recipe, try_laws=False, keep_law=False)
             self._darkroom = Darkroom(replace(plain, decided=None))
-            self._pictures = PictureMaker(recipe, PICTURE_PX)
+            self._recipe, self._pictures = recipe, None
             self._looks = recipe.try_laws and recipe.decided is None
             self._decided = None if recipe.decided is None else Darkroom(plain)
             self._preview_px = body["preview_px"]
             return {}, ()
         assert self._darkroom is not None  # "set up" comes first
-        assert self._pictures is not None
         try:
-            return self._made(self._darkroom, self._pictures, body)
+            return self._made(self._darkroom, body)
         except MemoryError:
             return {"error": "there is not enough memory for it"}, ()
         except Exception as error:  # noqa: BLE001  # no frame may end the worker: the next one may be good
             return {"error": sentence(error)}, ()
 
-    def _made(self, darkroom: Darkroom, pictures: PictureMaker, asked: Mapping[str, Any]) -> WorkerReply:
+    def _made(self, darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         match asked["do"]:
             case "warm up":
                 darkroom.check()
@@ -91,8 +93,27 @@ class DecodeWorker:
             case "depth":
                 return _depth(self._decided or darkroom, asked)
             case "picture":
-                return _full_picture(pictures, asked)
+                return self._full_picture(asked)
         return self._decode(darkroom, asked)
+
+    def _full_picture(self, asked: Mapping[str, Any]) -> WorkerReply:
+        """The picture of one frame at the sensor's own resolution, JPEG."""
+        from dappled.drivers.raw import developing, picture_maker  # noqa: PLC0415  most workers never need them
+
+        _give_way()
+        assert self._recipe is not None
+        self._pictures = maker = self._pictures or picture_maker.PictureMaker(self._recipe, PICTURE_PX)
+        lens = {"focal_length_mm": asked["focal_length_mm"], "f_number": asked["f_number"]}
+        made = maker.picture(asked["path"], **lens)
+        height, width = made.picture.plane.shape
+        facts = {
+            "size": [width, height],
+            "corner": list(made.corner),
+            "frame_shape": list(made.sensor.shape),
+            "shadow_from": made.picture.shadow.source.value,
+            "doubts": codec.plain(made.doubts),
+        }
+        return facts, (Blob.of(developing.jpeg(made), "picture").fd,)
 
     def _decode(self, configured: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         path, index = asked["path"], asked["index"]
@@ -308,22 +329,6 @@ def _depth(darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         "doubts": codec.plain(done.doubts),
     }
     return facts, (Blob.of(np.stack(both).tobytes(), "depth").fd,)
-
-
-def _full_picture(maker: PictureMaker, asked: Mapping[str, Any]) -> WorkerReply:
-    """The picture of one frame at the sensor's own resolution, JPEG."""
-    _give_way()
-    lens = {"focal_length_mm": asked["focal_length_mm"], "f_number": asked["f_number"]}
-    made = maker.picture(asked["path"], **lens)
-    height, width = made.picture.plane.shape
-    facts = {
-        "size": [width, height],
-        "corner": list(made.corner),
-        "frame_shape": list(made.sensor.shape),
-        "shadow_from": made.picture.shadow.source.value,
-        "doubts": codec.plain(made.doubts),
-    }
-    return facts, (Blob.of(developing.jpeg(made), "picture").fd,)
 
 
 def _give_way() -> None:
