@@ -211,8 +211,16 @@ function showFrame(event) {
 }
 
 function lookAtNewest() {
-  const newest = [...frames].filter(([, one]) => one.thumb).at(-1) ?? [...frames].at(-1);
-  if (newest && newest[0] !== chosen && (chosen === null || $("follow").checked)) choose(newest[0]);
+  const newest = newestWith("thumb") ?? [...frames.values()].at(-1);
+  if (newest && (chosen === null || $("follow").checked)) choose(newest.tag.frame);
+}
+
+const newestWith = (part) => [...frames.values()].findLast((one) => one[part]);
+
+// Unfollowed, the page stays with the frame that is seen.
+function follow() {
+  if ($("follow").checked) lookAtNewest();
+  else if (stage.shown) choose(stage.shown.tag.frame);
 }
 
 function showThumb(index, frame) {
@@ -242,7 +250,7 @@ function choose(index) {
   showFacts(frame);
   if (isRecording) showRecorded(frame);
   else document.querySelector("#instruments .histogram")?.replaceWith(histogramCell());
-  stage.set(frame);
+  stage.set(frame, $("follow").checked ? { picture: newestWith("picture"), depth: newestWith("depth") } : {});
 }
 
 // Of a recording: the histogram above the picture, and the frame's own place below the map.
@@ -443,7 +451,7 @@ async function stop(pressed) {
   tick();
 }
 
-$("follow").addEventListener("change", lookAtNewest);
+$("follow").addEventListener("change", follow);
 $("map-in").addEventListener("click", () => map.zoom(1.5));
 $("map-out").addEventListener("click", () => map.zoom(1 / 1.5));
 $("map-fit").addEventListener("click", () => { map.following = true; map.redraw(); });

@@ -5,6 +5,7 @@ import { ask, place } from "./pictures.js";
 import { Refocus, sharpest } from "./refocus.js";
 
 const TABS = ["refocus", "views", "slices", "spectrum", "full", "live", "depth"];
+const NOW_AND_THEN = { full: "picture", depth: "depth" };   // tabs of what few frames have in flight, and its name in a frame
 const EARLY_MS = 250;   // views that were made before come sooner, and no other picture flashes before them
 const $ = (id) => document.getElementById(id);
 
@@ -12,6 +13,7 @@ export class Stage {
   constructor() {
     this.tab = "refocus";
     this.frame = null;     // {tag, slices, thumb, depth, picture}
+    this.newest = {};      // where the newest frame is followed: the newest that has a picture, and that has a depth
     this.live = new Live($("live"));
     this.layout = null;
     this.bitmap = null;
@@ -34,12 +36,23 @@ export class Stage {
     this.tabs();
   }
 
-  set(frame) {
-    const same = this.frame && frame && this.frame.tag.frame === frame.tag.frame && this.frame.tag.flight === frame.tag.flight;
-    const ready = same && this.aspect && Boolean(frame.thumb) === Boolean(this.frame.thumb), tab = this.tab;
-    this.frame = frame;
+  set(frame, newest) {
+    const { tab, shown } = this;
+    Object.assign(this, { frame, newest });
     this.tabs();   // a depth or a picture that has come, or is no longer there
+    const now = this.shown, same = shown && now && shown.tag.frame === now.tag.frame && shown.tag.flight === now.tag.flight;
+    const ready = same && this.aspect && Boolean(shown.thumb) === Boolean(now.thumb);
     if (!ready || this.tab !== tab) this.load();
+  }
+
+  // The frame that the tab shows.
+  get shown() {
+    return this.of(this.tab);
+  }
+
+  of(tab) {
+    const part = NOW_AND_THEN[tab];
+    return !part || this.frame?.[part] ? this.frame : this.newest[part] ?? null;
   }
 
   choose(name) {
@@ -58,9 +71,9 @@ export class Stage {
   }
 
   tabs() {
-    for (const [tab, part] of [["depth", "depth"], ["full", "picture"]]) {
-      show($(`tab-${tab}`), Boolean(this.frame?.[part]));
-      if (this.tab === tab && !this.frame?.[part]) this.tab = "refocus";
+    for (const tab of Object.keys(NOW_AND_THEN)) {
+      show($(`tab-${tab}`), Boolean(this.of(tab)));
+      if (this.tab === tab && !this.of(tab)) this.tab = "refocus";
     }
     for (const name of TABS) {
       const chosen = name === this.tab;
@@ -77,13 +90,14 @@ export class Stage {
   }
 
   async load() {
-    const turn = ++this.turn, { frame, tab } = this;
+    const turn = ++this.turn, { shown: frame, tab } = this;
     if (tab === "live") { this.watch(); return; }
     if ($("live").hasAttribute("data-on")) this.leave();
     $("frame-box").toggleAttribute("data-full", false);
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
-    $("which").textContent = `frame ${index} …`;   // loading: the frame before is still shown
+    const name = `frame ${index}${frame === this.frame ? "" : ", the newest that has one"}`;
+    $("which").textContent = `${name} …`;   // loading: the frame before is still shown
     $("empty").textContent = `Waiting for the picture of frame ${index}.`;
     try {
       if (tab === "refocus") await this.loadViews(base, turn);
@@ -92,7 +106,7 @@ export class Stage {
     } catch (error) {
       if (turn === this.turn) await this.fall(base, turn, error.message);
     }
-    if (turn === this.turn) $("which").textContent = `frame ${index}`;
+    if (turn === this.turn) $("which").textContent = name;
   }
 
   watch() {
@@ -226,7 +240,7 @@ export class Stage {
     await place(picture, blob);
     if (!wanted()) return false;
     picture.dataset.kind = kind;
-    picture.alt = `${kind} of frame ${this.frame.tag.frame}`;
+    picture.alt = `${kind} of frame ${this.shown.tag.frame}`;
     show(picture, true);
     show($("gl"), false);
     show($("empty"), false);
