@@ -135,7 +135,11 @@ def refine(spectrum: Spectrum, lattice: Lattice, orders: Sequence[Order], worker
 
 
 def _ramp(product: NDArray[np.complex64], blocks: int = 8) -> tuple[NDArray[np.float64], float]:
-    """Phase slope (y, x) in cycles a sample of a product of slices, and a weight; from the phases of block means."""
+    """Phase slope (y, x) in cycles a sample of a product of slices, and a weight; from the phases of block means under
+    a Hann window: the frame's ends ring, opposite ones with opposite phases, and turned a white frame's lattice of
+    694 × 922 px into one 5e-6 too small."""
+    down, across = (np.hanning(side + 2)[1:-1].astype(np.float32) for side in product.shape)
+    product = product * down[:, None] * across
     rows = np.array_split(np.arange(product.shape[0]), min(blocks, product.shape[0]))
     columns = np.array_split(np.arange(product.shape[1]), min(blocks, product.shape[1]))
     means = np.array([[product[np.ix_(r, c)].sum() for c in columns] for r in rows])
