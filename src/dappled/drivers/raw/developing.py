@@ -36,13 +36,13 @@ def developed(made: MadePicture) -> NDArray[np.uint16]:
     """uint16 (H, W) or (H, W, 3) in sRGB's curve."""
     if _bayer(made) is not None:
         return _by_libraw(made, _CURVE)
-    return np.asarray(np.round(srgb.encoded(np.clip(_everywhere(made), 0, 1)) * 65535), dtype=np.uint16)
+    return srgb.sixteen(_everywhere(made))
 
 
 def jpeg(made: MadePicture) -> bytes:
     """A JPEG in sRGB, to look at."""
     file = io.BytesIO()
-    Image.fromarray((developed(made) >> 8).astype(np.uint8)).save(file, "JPEG", quality=_QUALITY)
+    Image.fromarray(srgb.eight(developed(made))).save(file, "JPEG", quality=_QUALITY)
     return file.getvalue()
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from dappled import durable
+from dappled.decode import srgb
 from dappled.decode.geometry import field_of_view
 from dappled.decode.lightfield import LightField
 from dappled.products.exports import light_files
@@ -62,7 +63,9 @@ def write_parts(folder: Path, one: Photograph, field: LightField, station: Stati
     record = view_cameras.of_photograph(one, [view_files.PICTURE], station, float("inf"), utc_ns)
     picture = folder / view_files.picture(view_files.PICTURE, record.name)
     durable.make_folder(picture.parent)
-    durable.write_file(picture, photo_files.jpeg(one, station, utc_ns, cog.gain_of([one.image])))
+    durable.write_file(
+        picture, photo_files.jpeg(one, station, utc_ns, srgb.sixteen(one.image * cog.gain_of([one.image])))
+    )
     slices = folder / "slices" / f"{record.name}.npz"
     durable.make_folder(slices.parent)
     shape = field.slices.shape[1:]

@@ -13,12 +13,12 @@ from statistics import StatisticsError, median
 
 import numpy as np
 import tifffile
+from numpy.typing import NDArray
 from PIL import Image
 
 from dappled import durable
 from dappled.config import profiles
 from dappled.decode import srgb
-from dappled.decode.array_types import Floats, Singles
 from dappled.decode.optics.lenses import ground_sample_m
 from dappled.errors import DappledError
 from dappled.flight import Frame, Tag
@@ -59,13 +59,13 @@ def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, 
     `utc_ns` is mid-exposure, corrected; None where UTC was never known.
     """
     gain = cog.gain_of([one.image])
-    shown = _srgb(one.image * gain)
+    shown = srgb.sixteen(one.image * gain)
     xmp = sidecars.text(station.tag, station.camera, utc_ns).encode()
     first, inner = _settings(one, station.tag, utc_ns)
     buffer = io.BytesIO()
     tifffile.imwrite(
         buffer,
-        np.round(shown * 65535).astype(np.uint16),
+        shown,
         byteorder="<",
         photometric="rgb" if shown.ndim == 3 else "minisblack",
         metadata=None,
@@ -73,16 +73,17 @@ def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, 
         extratags=[(_XMP_TAG, 1, len(xmp), xmp, True)],
     )
     tiff = exif_gps.with_directory(buffer.getvalue(), EXIF_IFD, inner, first)
-    return {"tiff": exif_gps.tagged(tiff, _place(station, utc_ns)), "jpeg": jpeg(one, station, utc_ns, gain)}
+    return {"tiff": exif_gps.tagged(tiff, _place(station, utc_ns)), "jpeg": jpeg(one, station, utc_ns, shown)}
 
 
-def jpeg(one: Photograph, station: Station, utc_ns: int | None, gain: float) -> bytes:
-    """The picture times `gain`, in sRGB's curve, as JPEG with EXIF and XMP."""
+def jpeg(one: Photograph, station: Station, utc_ns: int | None, shown: NDArray[np.uint16]) -> bytes:
+    """The picture as it is `shown`, in sRGB's curve, as JPEG with EXIF and XMP."""
     first, inner = _settings(one, station.tag, utc_ns)
     buffer = io.BytesIO()
     settings = exif_gps.with_directory(exif_gps.EMPTY, EXIF_IFD, inner, [*first, *_FIRST_OF_JPEG])
-    eight = Image.fromarray(np.round(_srgb(one.image * gain) * 255).astype(np.uint8))
-    eight.save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=b"Exif\0\0" + settings)
+    Image.fromarray(srgb.eight(shown)).save(
+        buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=b"Exif\0\0" + settings
+    )
     made = exif_gps.tagged(buffer.getvalue(), _place(station, utc_ns))
     packet = _XMP_HEAD + sidecars.text(station.tag, station.camera, utc_ns).encode()
     return made[:2] + struct.pack(">BBH", 0xFF, 0xE1, len(packet) + 2) + packet + made[2:]
@@ -101,12 +102,6 @@ def write_lists(folder: Path, placed: Sequence[Placed]) -> None:
     """Write geo.txt beside the pictures of each kind, which names them. Raises OSError."""
     for form, suffix in SUFFIXES.items():
         durable.write_file(folder / form / "geo.txt", geotags.odm(placed, suffix).encode())
-
-
-def _srgb(image: Singles) -> Floats:
-    """Linear values in sRGB's curve (IEC 61966-2-1), within 0 and 1; unknown ones are black."""
-    linear = np.clip(np.nan_to_num(image.astype(np.float64)), 0.0, 1.0)
-    return np.asarray(srgb.encoded(linear))
 
 
 def _settings(one: Photograph, tag: Tag, utc_ns: int | None) -> tuple[list[Entry], list[Entry]]:

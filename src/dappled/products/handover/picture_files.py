@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from numpy.typing import NDArray
 from PIL import Image
 
 from dappled import durable
+from dappled.decode import srgb
 from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.products.geotags import exif_gps
@@ -54,10 +54,10 @@ def encoded(
         exif = b"Exif\0\0" + exif_gps.with_directory(exif_gps.EMPTY, EXIF_IFD, inner, first)
         if kind == ".png":
             # Pillow writes no 16-bit colours: 8 bits are what a PNG is looked at with.
-            eight = shown if shown.ndim == 2 else _eight(shown)
+            eight = shown if shown.ndim == 2 else srgb.eight(shown)
             Image.fromarray(eight).save(buffer, "PNG", exif=exif, compress_level=1)
         else:
-            Image.fromarray(_eight(shown)).save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=exif)
+            Image.fromarray(srgb.eight(shown)).save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=exif)
         data = buffer.getvalue()
     return data if where is None else exif_gps.tagged(data, where)
 
@@ -69,10 +69,6 @@ def sigma_file(made: MadePicture) -> bytes:
     sigma = np.where(picture.trusted, picture.sigma, np.float32(np.nan))
     tifffile.imwrite(buffer, sigma, byteorder="<", photometric="minisblack", metadata=None, software=False)
     return buffer.getvalue()
-
-
-def _eight(shown: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    return np.asarray(shown * np.float32(255 / 65535) + np.float32(0.5), dtype=np.uint8)
 
 
 def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:

@@ -12,6 +12,7 @@ import numpy as np
 from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
+from dappled.decode import srgb
 from dappled.errors import DappledError
 from dappled.products.handover import photo_files, view_cameras
 from dappled.products.handover.view_cameras import FrameCameras
@@ -43,7 +44,7 @@ def write_frame(
         view = replace(one, image=image, eye=eye)
         path = folder / picture(name, record.name)
         durable.make_folder(path.parent)
-        durable.write_file(path, photo_files.jpeg(view, station, utc_ns, gain))
+        durable.write_file(path, photo_files.jpeg(view, station, utc_ns, srgb.sixteen(view.image * gain)))
         written.append(path)
     return [*written, write_record(folder, record)]
 
