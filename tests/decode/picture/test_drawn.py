@@ -143,6 +143,20 @@ def test_four_other_scenes_behind_the_same_mask_tell_a_shadow_that_one_scene_hid
     assert judged(shot, beside).short_db > most_short_db
 
 
+def test_a_frame_whose_shadow_others_know_tells_as_much_as_one_that_is_searched() -> None:
+    shot = draw()[50]
+    beside = _told([replace(shot, seed=1000 + at) for at in range(2)])
+    mosaic, shadow, _ = shadow_in(shot, beside)
+    searched = told_by(*_masked(shot)).shadow((), beside)
+    assert (shadow.source, shadow.alike) == (searched.source, searched.alike) == (ShadowFrom.FLIGHT, 2)
+    off, off_searched = (
+        np.concatenate([(each.at(one) - shot.lights[2][one.cut]).ravel() for one in mosaic.places()]).std()
+        for each in (shadow, searched)
+    )
+    assert off < 1.1 * off_searched
+    assert shadow.sigma == pytest.approx(searched.sigma, rel=0.1)
+
+
 @pytest.mark.slow
 def test_a_frame_that_was_taken_at_another_stop_keeps_a_shadow_of_its_own() -> None:
     shot = draw()[50]

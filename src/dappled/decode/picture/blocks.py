@@ -130,14 +130,11 @@ def wave_sums(
     """(…, blocks down, blocks across, K): sums of values (…, h, w) · e^{−2πi f·x} over blocks that begin at `edges`."""
     down = np.exp(-2j * np.pi * np.outer(rows, frequencies[:, 0])).astype(np.complex64)
     across = np.exp(-2j * np.pi * np.outer(columns, frequencies[:, 1]))
-    parts = np.concatenate([across.real, across.imag], axis=1).astype(np.float32)
+    parts = across.astype(np.complex64).view(np.float32)  # of each wave, real and imaginary
     starts, ends = edges[1], [*edges[1][1:], len(columns)]
-    count = len(frequencies)
-    made = np.empty((*values.shape[:-2], len(edges[0]), len(starts), count), dtype=np.complex64)
-    whole = np.empty((*values.shape[:-1], count), dtype=np.complex64)
+    made = np.empty((*values.shape[:-2], len(edges[0]), len(starts), len(frequencies)), dtype=np.complex64)
     for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
-        lines = values[..., start:end] @ parts[start:end]
-        whole.real, whole.imag = lines[..., :count], lines[..., count:]
+        whole = (values[..., start:end] @ parts[start:end]).view(np.complex64)
         whole *= down
         made[..., index, :] = np.add.reduceat(whole, edges[0], axis=-2)
     return made

@@ -26,7 +26,7 @@ Coefficients = NDArray[np.complex128]
 
 _SURE = 4.0  # log likelihood by which held-out blocks must prefer the more complicated one
 _COMMON = 0.5  # of a frame's standard error: what the next one's scene doesn't cure
-_UNLIKE = 6.0  # times the mean square of their errors: what differs by more is not one shadow
+UNLIKE = 6.0  # times the mean square of their errors: what differs by more is not one shadow
 
 
 class ShadowFrom(StrEnum):
@@ -222,7 +222,7 @@ class OwnShadow:
         best, gain = own or _no_shadow(evidence), evidence.held
         if own is None and beside:
             evidence = beside[0]
-        same = [one for one in beside if one.unlike(evidence) < _UNLIKE]
+        same = [one for one in beside if one.unlike(evidence) < UNLIKE]
         others_tell = [one for one in same if one is not evidence]
         if others_tell:
             best = evidence.with_those(others_tell).shadow(ShadowFrom.FLIGHT) or best

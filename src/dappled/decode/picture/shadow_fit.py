@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from dappled.decode.optics import Lattice, Order
 from dappled.decode.picture.blocks import MosaicPlane, PatternPlace, block_sums, kept_by_mean, local_mean, wave_sums
 from dappled.decode.picture.lattice_search import searched
 from dappled.decode.picture.shadow import (
+    UNLIKE,
     Coefficients,
     Fit,
     OwnShadow,
@@ -72,6 +73,8 @@ def shadow_of(
     whose shadow is another. What a shadow explains is counted on blocks that it was not fitted to.
     """
     if beside:
+        if (own := _as_beside(mosaic, beside, others)) is not None:
+            return own.shadow(others, beside)
         bins = np.median([lattice_bins(mosaic.shape, one.lattice) for one in beside], axis=0)
         expected = replace(expected, lattice=lattice_of_bins(mosaic.shape, bins))
     return told_by(mosaic, expected, others).shadow(others, beside)
@@ -79,12 +82,31 @@ def shadow_of(
 
 def told_by(mosaic: MosaicPlane, expected: ExpectedShadow, others: Sequence[Shadow] = ()) -> OwnShadow:
     """What one frame tells of its shadow, and of `others`, see `shadow_of`."""
-    equations, means = _equations_of(mosaic, expected)
+    return _told(*_equations_of(mosaic, expected), others)
+
+
+def _as_beside(mosaic: MosaicPlane, beside: Sequence[ShadowEvidence], others: Sequence[Shadow]) -> OwnShadow | None:
+    """What a frame tells where frames beside it have told its lattice and its shadow about; None where its shadow is
+    another, and is to be searched for."""
+    every = beside[0].with_those([one for one in beside[1:] if one.unlike(beside[0]) < UNLIKE])
+    if (known := every.shadow(ShadowFrom.FLIGHT)) is None:
+        return None
+    mosaic = _unclipped(mosaic, period_of(known.lattice))
+    means = _Means.of(mosaic, period_of(known.lattice), known)
+    equations = _Equations.of(means, known.lattice, known.orders)
+    if (finer := equations.lattice()) is not None:
+        equations = equations.at_finer(finer, means)
+    made = _told(equations, means, others)
+    return made if made.seen and made.evidence.unlike(every) < UNLIKE else None
+
+
+def _told(equations: _Equations, means: _Means, others: Sequence[Shadow]) -> OwnShadow:
     at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
     gains = []
     for one in others:
         if (where := (one.lattice, one.orders)) not in at:
-            at[where] = _Equations.of(means, *where)
+            near = one.orders == equations.orders and equations.at_rest(one.lattice)
+            at[where] = equations.moved(one.lattice) if near else _Equations.of(means, *where)
         gains.append(at[where].explained(one, equations.weights) - equations.unexplained)
     return OwnShadow(equations.evidence(), tuple(gains))
 
@@ -116,7 +138,7 @@ def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow) -> tuple[_Equat
     if known or equations.at != found:
         equations = _Equations.of(means, equations.at, half, found)
     if mosaic.valid is None and equations.at != found and (finer := equations.lattice()) is not None:
-        equations = _Equations.of(means, finer, half, found)
+        equations = equations.at_finer(finer, means)
     return equations, means
 
 
@@ -167,17 +189,38 @@ class _Means:
         return made[start[0] : start[0] + _SEARCH_SIDE, start[1] : start[1] + _SEARCH_SIDE]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """The mean, `orders` and their opposites: `every` (n, 2); and each two of them: their differences but for the sign
+    `apart` (m, 2), which of these each is by `index` (n, n), and where it is `turned`."""
+
+    every: NDArray[np.intp]
+    apart: NDArray[np.intp]
+    index: NDArray[np.intp]
+    turned: NDArray[np.bool_]
+
+
+@lru_cache(maxsize=8)
+def _pairs(orders: tuple[Order, ...]) -> _Pairs:
+    every = np.array([(0, 0), *orders, *((-ky, -kx) for ky, kx in orders)], dtype=np.intp)
+    apart = every[:, None] - every[None, :]
+    turned = (apart[..., 0] < 0) | ((apart[..., 0] == 0) & (apart[..., 1] < 0))
+    unique, index = np.unique(np.where(turned[..., None], -apart, apart).reshape(-1, 2), axis=0, return_inverse=True)
+    return _Pairs(every, unique, index.reshape(turned.shape), turned)
+
+
 @dataclass(frozen=True, eq=False)
 class _Equations:
-    """Normal equations of the coefficients, block by block: `gram` (colours, blocks, n, n) and `right` (colours,
-    blocks, n) of the mean, `orders` and their opposites. `energy` and `count` are of each block's frame − L."""
+    """Normal equations of the coefficients, block by block: `sums` (colours, blocks, differences) of L² over waves of
+    the differences of orders, which make the matrix, and `right` (colours, blocks, n) of the mean, `orders` and their
+    opposites. `energy` and `count` are of each block's frame − L."""
 
     shape: tuple[int, int]
     at: Lattice
     like: Lattice  # but for a turn and a scale, about as it is
     orders: tuple[Order, ...]
     centres: Floats
-    gram: NDArray[np.complex64]
+    sums: NDArray[np.complex64]
     right: NDArray[np.complex64]
     energy: Floats
     count: Floats
@@ -185,20 +228,24 @@ class _Equations:
     sound: float  # share of the samples that aren't left out
 
     @classmethod
-    def of(cls, means: _Means, lattice: Lattice, orders: tuple[Order, ...], like: Lattice | None = None) -> _Equations:
+    def of(
+        cls,
+        means: _Means,
+        lattice: Lattice,
+        orders: tuple[Order, ...],
+        like: Lattice | None = None,
+        sums: NDArray[np.complex64] | None = None,
+    ) -> _Equations:
+        """Those of a frame; `sums` that are known already aren't taken again."""
         mosaic, floor = means.mosaic, means.floor()
-        every = np.array([(0, 0), *orders, *((-ky, -kx) for ky, kx in orders)], dtype=np.intp)
-        apart = every[:, None] - every[None, :]
-        sign = np.where((apart[..., 0] > 0) | ((apart[..., 0] == 0) & (apart[..., 1] >= 0)), 1, -1)
-        unique, index = np.unique((apart * sign[..., None]).reshape(-1, 2), axis=0, return_inverse=True)
-        index = index.reshape(len(every), len(every))
+        pairs = _pairs(orders)
         side = max(_BLOCK_PX, math.ceil(_BLOCK_PERIODS * means.period))
         steps = mosaic.pattern.shape
         across = [math.ceil(side / step) * step for step in steps]
         blocks = [max(1, whole // one) for whole, one in zip(mosaic.shape, across, strict=True)]
         shape = (mosaic.colours, blocks[0] * blocks[1])
-        n, half = len(every), len(orders) + 1
-        gram = np.zeros((*shape, len(unique)), dtype=np.complex64)
+        n, half = len(pairs.every), len(orders) + 1
+        every = np.zeros((*shape, len(pairs.apart)), dtype=np.complex64) if sums is None else sums
         right = np.zeros((*shape, n), dtype=np.complex64)
         energy, count = np.zeros(shape), np.zeros(shape)
         matrix = lattice.matrix()
@@ -212,15 +259,14 @@ class _Equations:
             edges = tuple(
                 np.arange(number) * (one // step) for number, one, step in zip(blocks, across, steps, strict=True)
             )
-            waves = wave_sums(weight * high, rows, columns, every[:half] @ matrix, (edges[0], edges[1]))
+            waves = wave_sums(weight * high, rows, columns, pairs.every[:half] @ matrix, (edges[0], edges[1]))
             right[place.colour, :, :half] += waves.reshape(shape[1], -1)
-            sums = wave_sums(weight * mean, rows, columns, unique @ matrix, (edges[0], edges[1]))
-            gram[place.colour] += sums.reshape(shape[1], -1)
+            if sums is None:
+                waves = wave_sums(weight * mean, rows, columns, pairs.apart @ matrix, (edges[0], edges[1]))
+                every[place.colour] += waves.reshape(shape[1], -1)
             for values, into in ((high * high, energy), (keep, count)):
                 into[place.colour] += block_sums(values, edges[0], edges[1]).ravel()
         right[..., half:] = right[..., 1:half].conj()
-        whole = np.ascontiguousarray(gram[..., index])
-        np.conjugate(whole, out=whole, where=sign < 0)
         middles = []
         for number, one, full in zip(blocks, across, mosaic.shape, strict=True):
             ends = np.append(np.arange(number) * one, full)  # the last is longer
@@ -229,20 +275,36 @@ class _Equations:
         odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
         centres = np.column_stack([y.ravel(), x.ravel()])
         sound = float(np.mean([1 if good is None else good.mean() for _, _, good in means.means]))
-        return cls(mosaic.shape, lattice, like or lattice, orders, centres, whole, right, energy, count, odd, sound)
+        return cls(mosaic.shape, lattice, like or lattice, orders, centres, every, right, energy, count, odd, sound)
 
     def moved(self, lattice: Lattice) -> _Equations:
         """About the same at a lattice so near that waves turn little within a block."""
-        every = np.array([(0, 0), *self.orders, *((-ky, -kx) for ky, kx in self.orders)], dtype=np.float64)
-        off = self.centres @ (every @ (lattice.matrix() - self.at.matrix())).T
-        turns = np.exp(-2j * np.pi * off).astype(np.complex64)
-        gram = self.gram * turns[:, :, None] * turns[:, None, :].conj()
-        return replace(self, at=lattice, gram=gram, right=self.right * turns)
+        pairs, move = _pairs(self.orders), lattice.matrix() - self.at.matrix()
+        of_sums, of_right = (
+            np.exp(-2j * np.pi * (self.centres @ (some @ move).T)).astype(np.complex64)
+            for some in (pairs.apart, pairs.every)
+        )
+        return replace(self, at=lattice, sums=self.sums * of_sums, right=self.right * of_right)
 
-    @cached_property
-    def _gram_parts(self) -> Floats:
-        """`gram` (colours, blocks, 2 n n), real and imaginary."""
-        return self.gram.reshape(*self.gram.shape[:2], -1).astype(np.complex128).view(np.float64)
+    def at_finer(self, lattice: Lattice, means: _Means) -> _Equations:
+        """Those of the frame's means at a lattice next to this one: L², which is even, hardly turns."""
+        sums = self.moved(lattice).sums if means.mosaic.valid is None else None
+        return _Equations.of(means, lattice, self.orders, self.like, sums)
+
+    def _image(self, colour: int, c: Coefficients, degree: int) -> Coefficients:
+        """(blocks, n) each block's matrix times its coefficients, of c (n, terms)."""
+        pairs, made = _pairs(self.orders), np.zeros(self.right.shape[1:], dtype=np.complex128)
+        ahead, behind = np.zeros((2, *c.shape[1:], len(pairs.apart), len(c)), dtype=np.complex64)
+        rows = np.broadcast_to(np.arange(len(c))[:, None], pairs.index.shape)
+        for into, chosen in ((ahead, ~pairs.turned), (behind, pairs.turned)):
+            into[:, pairs.index[chosen], rows[chosen]] = np.broadcast_to(c.T[:, None], (c.shape[1], *chosen.shape))[
+                :, chosen
+            ]
+        own = self.sums[colour]
+        other = own.conj()
+        for term, first, second in zip(self._terms(degree).T, ahead, behind, strict=True):
+            made += term[:, None] * (own @ first + other @ second)
+        return made
 
     @cached_property
     def weights(self) -> Floats:
@@ -251,11 +313,16 @@ class _Equations:
         for colour in range(len(self.right)):
             plain = np.where(self.count[colour] > 0, 1.0, 0.0)
             c = self._solved(colour, plain, 0)
-            left = self.energy[colour] - self._gains(colour, self._local(c, 0))
+            left = self.energy[colour] - self._gains(colour, c, 0)
             spread = np.maximum(left, 0) / np.maximum(self.count[colour], 1)
             usual = float(np.median(spread[self.count[colour] > 0])) if plain.any() else 1.0
             made.append(plain / np.maximum(spread + 0.05 * usual, 1e-12))
         return np.array(made)
+
+    @property
+    def _lights(self) -> Floats:
+        """(colours, blocks) the sums of L²."""
+        return np.asarray(self.sums[..., _pairs(self.orders).index[0, 0]].real)
 
     def _terms(self, degree: int) -> Floats:
         return terms_at(self.centres, self.shape, degree)
@@ -264,11 +331,10 @@ class _Equations:
         """(blocks, n) the coefficients at each block, of c (n, terms)."""
         return np.asarray(self._terms(degree) @ c.T)
 
-    def _gains(self, colour: int, c: Coefficients) -> Floats:
-        """(blocks,) how much of a block's energy coefficients (blocks, n) explain."""
-        first = 2 * (c.conj() * self.right[colour]).sum(axis=1).real
-        image = np.matmul(self.gram[colour], c[:, :, None].astype(np.complex64))[:, :, 0]
-        return np.asarray(first - (c.conj() * image).sum(axis=1).real)
+    def _gains(self, colour: int, c: Coefficients, degree: int) -> Floats:
+        """(blocks,) how much of a block's energy coefficients (n, terms) explain."""
+        local = self._local(c, degree).conj()
+        return np.asarray((local * (2 * self.right[colour] - self._image(colour, c, degree))).sum(axis=1).real)
 
     def _solved(self, colour: int, weights: Floats, degree: int) -> Coefficients:
         """Coefficients (n, terms)."""
@@ -281,8 +347,11 @@ class _Equations:
         count = terms.shape[1]
         first, second = np.triu_indices(count)
         pairs = weights[:, None] * terms[:, first] * terms[:, second]
-        gram = np.empty((count, count, n, n), dtype=np.complex128)
-        gram[first, second] = (pairs.T @ self._gram_parts[colour]).view(np.complex128).reshape(-1, n, n)
+        gram, known = np.empty((count, count, n, n), dtype=np.complex128), _pairs(self.orders)
+        parts = self.sums[colour].view(np.float32).astype(np.float64)
+        every = (pairs.T @ parts).view(np.complex128)[:, known.index]
+        np.conjugate(every, out=every, where=known.turned)
+        gram[first, second] = every
         gram[second, first] = gram[first, second]
         whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count)
         right = (self.right[colour].T @ (weights[:, None] * terms)).reshape(n * count).astype(np.complex128)
@@ -297,7 +366,7 @@ class _Equations:
                 if not fold.any() or fold.all():
                     continue
                 c = self._solved(colour, np.where(fold, 0.0, weights), degree)
-                total += float((weights * self._gains(colour, self._local(c, degree)))[fold].sum()) / 2
+                total += float((weights * self._gains(colour, c, degree))[fold].sum()) / 2
         return total
 
     @cached_property
@@ -310,17 +379,20 @@ class _Equations:
         (Those of several shadows compare where blocks weigh the same.)"""
         total, n = 0.0, self.right.shape[2]
         for colour, weights in enumerate(self.weights if weights_of_blocks is None else weights_of_blocks):
-            local = np.zeros((len(weights), n), dtype=np.complex128)
+            degree = 0 if other is None else other.degree
+            c = np.zeros((n, len(terms_at(self.centres[:1], self.shape, degree)[0])), dtype=np.complex128)
+            c[0, 0] = 1
             if other is not None:
-                c = other.coefficients[min(colour, len(other.coefficients) - 1)]
-                local = terms_at(self.centres, self.shape, other.degree) @ np.concatenate([0 * c[:1], c, c.conj()]).T
-            local[:, 0] = 1
-            image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
-            found = (local.conj() * (self.right[colour] + self.gram[colour][:, :, 0])).sum(axis=1).real
+                own = other.coefficients[min(colour, len(other.coefficients) - 1)]
+                c[1:] = np.concatenate([own, own.conj()])
+            local, image = self._local(c, degree), self._image(colour, c, degree)
+            base = np.zeros_like(c[:, :1])
+            base[0] = 1
+            found = (local.conj() * (self.right[colour] + self._image(colour, base, 0))).sum(axis=1).real
             whole = (local.conj() * image).sum(axis=1).real
-            local *= (weights @ found) / max(float(weights @ whole), 1e-30)
-            local[:, 0] -= 1
-            total += float((weights * self._gains(colour, local)).sum()) / 2
+            c *= (weights @ found) / max(float(weights @ whole), 1e-30)
+            c[0, 0] -= 1
+            total += float((weights * self._gains(colour, c, degree)).sum()) / 2
         return total
 
     def evidence(self, degrees: Sequence[int] = _DEGREES) -> ShadowEvidence:
@@ -330,7 +402,7 @@ class _Equations:
 
     def _unpulled(self, colour: int, weights: Floats, terms: Floats) -> Floats:
         """(blocks,) 1 − how far a block draws the fit towards itself, by which its residual is too small."""
-        sure = weights * self.gram[colour][:, 0, 0].real
+        sure = weights * self._lights[colour]
         whole = np.einsum("bi,b,bj->ij", terms, sure, terms)
         whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole)), 1e-30)
         pull = sure * np.einsum("bi,ij,bj->b", terms, np.linalg.inv(whole), terms)
@@ -345,8 +417,7 @@ class _Equations:
             whole, right = self._normal(colour, weights, degree)
             inverse = np.linalg.inv(whole)
             c = (inverse @ right).reshape(-1, terms.shape[1])
-            local = self._local(c, degree)
-            image = np.matmul(self.gram[colour], local[:, :, None].astype(np.complex64))[:, :, 0]
+            image = self._image(colour, c, degree)
             scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
             errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
             errors /= self._unpulled(colour, weights, terms)[:, None, None]
@@ -359,9 +430,13 @@ class _Equations:
         """The lattice that the phases of the blocks agree on best, by one Gauss–Newton step; None where it is so near
         that nothing changes."""
         step, _ = self._lattice_step
-        if float(np.abs(step).max()) < _STILL_BINS:
-            return None
-        return lattice_of_bins(self.shape, lattice_bins(self.shape, self.at) + step)
+        finer = lattice_of_bins(self.shape, lattice_bins(self.shape, self.at) + step)
+        return None if self.at_rest(finer) else finer
+
+    def at_rest(self, lattice: Lattice) -> bool:
+        """Whether a lattice is so near that nothing changes."""
+        off = lattice_bins(self.shape, lattice) - lattice_bins(self.shape, self.at)
+        return float(np.abs(off).max()) < _STILL_BINS
 
     @cached_property
     def _lattice_step(self) -> tuple[Floats, Floats]:
@@ -375,7 +450,7 @@ class _Equations:
         for colour, weights in enumerate(self.weights):
             c = self._solved(colour, weights, 0)[1 : count + 1, 0]
             turned = weights[:, None] * (c.conj() * self.right[colour][:, 1 : count + 1]).imag
-            sure = (weights * self.gram[colour][:, 0, 0].real)[:, None] * np.abs(c) ** 2
+            sure = (weights * self._lights[colour])[:, None] * np.abs(c) ** 2
             parts.append(sure)
             normal[:4, :4] += np.einsum("bki,bk,bkj->ij", levers, sure, levers)
             normal[:4, 4:] += np.einsum("bki,bk->ik", levers, sure)
