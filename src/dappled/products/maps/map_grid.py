@@ -32,6 +32,7 @@ _TILE = 1024
 _COARSER = 1.5  # times the picture's sample: a map's cell that is larger is a mean of pixels
 _STEPS = 64  # pixels: OpenCV works on a power of two of them at once
 _CUBIC = 2  # pixels beside the one that is looked up
+_SPREAD = 64  # cells that are interpolated at once: most weights of many nodes are 0
 _MARGIN = 8  # cells: the rim's points are joined by straight lines
 
 
@@ -91,7 +92,7 @@ class MapGrid:
         node_x, node_y = np.meshgrid(at_x, at_y)
         nodes = projection.to_map(node_y, node_x)
         aside, down = between(x, at_x), between(y, at_y)
-        east, north = (np.asarray(down @ node @ aside.T, np.float64) for node in nodes)
+        east, north = (_spread(node, down, aside, np.empty(self.shape)) for node in nodes)
         return east, north
 
 
@@ -143,16 +144,23 @@ def unwrapped(longitude_deg: Floats, near_deg: float) -> Floats:
 
 def sample(image: Singles, at: Floats) -> Singles:
     """float32 (rows, columns, c): an image (h, w, c) at pixels (rows, columns, 2); NaN where those are NaN."""
+    seen, outside = _looked_up(image, at)
+    seen[outside] = np.nan
+    return seen
+
+
+def _looked_up(image: Singles, at: Floats) -> tuple[Singles, NDArray[np.bool_]]:
+    """An image (h, w, c) at pixels (rows, columns, 2): float32 (rows, columns, c), and where it means nothing, as those
+    are NaN."""
     cv2 = need("cv2")
     outside = ~np.isfinite(at[..., 0])
     if outside.all():
-        return np.full((*outside.shape, image.shape[2]), np.nan, dtype=np.float32)
+        return np.zeros((*outside.shape, image.shape[2]), dtype=np.float32), outside
     x, y = (at[..., axis].astype(np.float32) for axis in (0, 1))
-    x[outside] = y[outside] = 0
+    for one in (x, y):
+        np.copyto(one, np.float32(0), where=outside)
     values = cv2.remap(image, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE).reshape(*outside.shape, -1)
-    seen = np.asarray(values, np.float32)
-    seen[outside] = np.nan
-    return seen
+    return np.asarray(values, np.float32), outside
 
 
 def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> Floats:
@@ -170,7 +178,7 @@ def seen_at(eye: Eye, grid: MapGrid, ground: Ground, projection: Projection) -> 
         inside &= (at[..., axis] >= -0.5) & (at[..., axis] <= side - 0.5)
     outside = ~inside
     for axis in (0, 1):
-        at[..., axis][outside] = np.nan
+        np.copyto(at[..., axis], np.nan, where=outside)
     return at
 
 
@@ -190,7 +198,22 @@ def _on_flat(eye: Eye, grid: MapGrid, ground: Flat, projection: Projection) -> F
     if bent:
         at = eye.imaged(at.reshape(-1, 2)).reshape(at.shape)
     aside, down = (between(axis, node) for axis, node in zip(axes, nodes, strict=True))
-    return np.moveaxis(np.matmul(down @ np.moveaxis(at, -1, 0), aside.T), 0, -1)
+    made = np.empty((2, len(down), len(aside)))
+    for axis in (0, 1):
+        _spread(at[..., axis], down, aside, made[axis])
+    return np.moveaxis(made, 0, -1)
+
+
+def _spread(nodes: Floats, down: Floats, aside: Floats, made: Floats) -> Floats:
+    """Fill `made` (rows, columns) with what lies between nodes (n, m), by weights (rows, n) and (columns, m) that are 0
+    but for two neighbours."""
+    tall = down @ nodes
+    for start in range(0, len(aside), _SPREAD):
+        weights = aside[start : start + _SPREAD]
+        used = np.flatnonzero(weights.any(axis=0))
+        near = slice(used[0], used[-1] + 1)
+        np.matmul(tall[:, near], weights[:, near].T, out=made[:, start : start + _SPREAD])
+    return made
 
 
 def smoothed(image: Singles, eye: Eye, grid: MapGrid, ground: Ground, at: Floats | None = None) -> Singles:
@@ -281,7 +304,7 @@ def pieces(
             rows = slice(top, min(top + _TILE, grid.shape[0]))
             columns = slice(left, min(left + _TILE, grid.shape[1]))
             shape = rows.stop - rows.start, columns.stop - columns.start
-            total = np.zeros((colours, *shape), dtype=np.float32)
+            total = np.zeros((*shape, colours), dtype=np.float32)
             weight = np.zeros(shape, dtype=np.float32)
             for one, box in zip(photographs, boxes, strict=True):
                 near = (
@@ -294,17 +317,23 @@ def pieces(
                 layers = one.layers(focus_m)
                 for image, eye in layers:
                     at = seen_at(eye, grid.part(*near), ground, projection)
-                    seen = sample(smoothed(image, eye, grid, ground, at), at)
+                    seen, outside = _looked_up(smoothed(image, eye, grid, ground, at), at)
                     say = _say(at, eye.shape) / np.float32(len(layers))
-                    unseen = ~np.isfinite(seen[..., 0])
-                    say[unseen] = 0
-                    seen[unseen] = 0
-                    for number in range(colours):  # one after the other: NumPy is slow along an axis of three
-                        total[number][inner] += seen[..., min(number, seen.shape[2] - 1)] * say
+                    if not np.isfinite(seen).all():
+                        outside |= ~np.isfinite(seen[..., 0])
+                        seen[outside] = 0
+                    np.copyto(say, np.float32(0), where=outside)
+                    seen = np.multiply(seen, _of_each(say, colours), out=seen if seen.shape[2] == colours else None)
+                    total[inner] += seen
                     weight[inner] += say
             with np.errstate(invalid="ignore"):
-                total /= weight  # NaN where none looks
-            yield rows, columns, np.ascontiguousarray(np.moveaxis(total, 0, -1))
+                total /= _of_each(weight, colours)  # NaN where none looks
+            yield rows, columns, total
+
+
+def _of_each(values: Singles, colours: int) -> Singles:
+    """(rows, columns, colours) of values (rows, columns): NumPy is slow at repeating them along an axis of three."""
+    return np.asarray(need("cv2").merge([values] * colours)).reshape(*values.shape, colours)
 
 
 def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Singles:
