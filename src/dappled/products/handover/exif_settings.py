@@ -1,9 +1,16 @@
-"""EXIF's entries of how a picture was taken."""
+"""EXIF's entries of how a picture was taken, and TIFF and JPEG to put them into."""
 
 from __future__ import annotations
 
+import io
 import struct
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import tifffile
+from numpy.typing import NDArray
+from PIL import Image
 
 from dappled import __version__
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
@@ -56,3 +63,17 @@ class ExifSettings:
 def short_entry(tag: int, value: int) -> Entry:
     """A number of 16 bits in a little-endian file, or the largest one."""
     return tag, _SHORT, 1, struct.pack("<H", min(65535, value))
+
+
+def tiff(values: NDArray[Any], *more: tuple[int, int, int, bytes, bool]) -> bytes:
+    """A little-endian TIFF of (h, w) or (h, w, 3) values, with `more` entries, as tifffile takes them."""
+    buffer, colours = io.BytesIO(), "rgb" if values.ndim == 3 else "minisblack"
+    tifffile.imwrite(buffer, values, byteorder="<", photometric=colours, metadata=None, software=False, extratags=more)
+    return buffer.getvalue()
+
+
+def jpeg(values: NDArray[np.uint8], exif: bytes) -> bytes:
+    """A JPEG of (h, w) or (h, w, 3) values, as good as the first copy should be, with this EXIF."""
+    buffer = io.BytesIO()
+    Image.fromarray(values).save(buffer, "JPEG", quality=95, subsampling=0, exif=exif)
+    return buffer.getvalue()

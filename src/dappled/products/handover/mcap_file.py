@@ -6,6 +6,7 @@ For Foxglove and ROS. The definitions of all messages are in the file, so reader
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -69,14 +70,7 @@ def write_parts(folder: Path, one: Photograph, field: LightField, station: Stati
     slices = folder / "slices" / f"{record.name}.npz"
     durable.make_folder(slices.parent)
     shape = field.slices.shape[1:]
-    bare = LightField(
-        field.slices,
-        field.carriers,
-        np.zeros((0, 0, *shape), np.float32),
-        np.zeros((0, 0, 2)),
-        field.grid,
-        field.attributes,
-    )
+    bare = replace(field, views=np.zeros((0, 0, *shape), np.float32), view_offsets=np.zeros((0, 0, 2)), view_sigma=None)
     light_files.save(slices, bare, overwrite=True)
     return [picture, slices, view_files.write_record(folder, record)]
 

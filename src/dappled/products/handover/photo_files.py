@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 import struct
 from collections.abc import Sequence
@@ -12,9 +11,7 @@ from pathlib import Path
 from statistics import StatisticsError, median
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
-from PIL import Image
 
 from dappled import durable
 from dappled.config import profiles
@@ -25,12 +22,12 @@ from dappled.flight import Frame, Tag
 from dappled.products.geotags import exif_gps, geotags, sidecars
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
 from dappled.products.geotags.geotags import Placed
+from dappled.products.handover import exif_settings
 from dappled.products.handover.exif_settings import EXIF_IFD, UNDEFINED, ExifSettings, short_entry
 from dappled.products.maps import cog
 from dappled.products.maps.photographs import Photograph, Station
 
 SUFFIXES = {"tiff": ".tif", "jpeg": ".jpg"}
-_QUALITY = 95
 _LONG = 4
 _XMP_TAG = 700
 _XMP_HEAD = b"http://ns.adobe.com/xap/1.0/\0"
@@ -62,29 +59,17 @@ def encoded(one: Photograph, station: Station, utc_ns: int | None) -> dict[str, 
     shown = srgb.sixteen(one.image * gain)
     xmp = sidecars.text(station.tag, station.camera, utc_ns).encode()
     first, inner = _settings(one, station.tag, utc_ns)
-    buffer = io.BytesIO()
-    tifffile.imwrite(
-        buffer,
-        shown,
-        byteorder="<",
-        photometric="rgb" if shown.ndim == 3 else "minisblack",
-        metadata=None,
-        software=False,
-        extratags=[(_XMP_TAG, 1, len(xmp), xmp, True)],
-    )
-    tiff = exif_gps.with_directory(buffer.getvalue(), EXIF_IFD, inner, first)
+    plain = exif_settings.tiff(shown, (_XMP_TAG, 1, len(xmp), xmp, True))
+    tiff = exif_gps.with_directory(plain, EXIF_IFD, inner, first)
     return {"tiff": exif_gps.tagged(tiff, _place(station, utc_ns)), "jpeg": jpeg(one, station, utc_ns, shown)}
 
 
 def jpeg(one: Photograph, station: Station, utc_ns: int | None, shown: NDArray[np.uint16]) -> bytes:
     """The picture as it is `shown`, in sRGB's curve, as JPEG with EXIF and XMP."""
     first, inner = _settings(one, station.tag, utc_ns)
-    buffer = io.BytesIO()
     settings = exif_gps.with_directory(exif_gps.EMPTY, EXIF_IFD, inner, [*first, *_FIRST_OF_JPEG])
-    Image.fromarray(srgb.eight(shown)).save(
-        buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=b"Exif\0\0" + settings
-    )
-    made = exif_gps.tagged(buffer.getvalue(), _place(station, utc_ns))
+    plain = exif_settings.jpeg(srgb.eight(shown), b"Exif\0\0" + settings)
+    made = exif_gps.tagged(plain, _place(station, utc_ns))
     packet = _XMP_HEAD + sidecars.text(station.tag, station.camera, utc_ns).encode()
     return made[:2] + struct.pack(">BBH", 0xFF, 0xE1, len(packet) + 2) + packet + made[2:]
 

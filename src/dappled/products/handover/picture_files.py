@@ -13,7 +13,6 @@ import struct
 from pathlib import Path
 
 import numpy as np
-import tifffile
 from PIL import Image
 
 from dappled import durable
@@ -22,12 +21,12 @@ from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.products.geotags import exif_gps
 from dappled.products.geotags.exif_gps import Entry, text_entry
+from dappled.products.handover import exif_settings
 from dappled.products.handover.exif_settings import EXIF_IFD, ExifSettings, short_entry
 from dappled.products.handover.reflectance import ReflectancePicture
 
 SUFFIXES = (".dng", ".tif", ".tiff", ".jpg", ".jpeg", ".png")
 _GPS_IFD = 0x8825
-_QUALITY = 95
 
 
 def encoded(
@@ -45,30 +44,25 @@ def encoded(
     if reflected is not None:
         first.append(text_entry(0x010E, reflected.description))
     shown = developing.developed(made) if reflected is None else reflected.values
-    buffer = io.BytesIO()
     if kind in (".tif", ".tiff"):
-        colours = "rgb" if shown.ndim == 3 else "minisblack"
-        tifffile.imwrite(buffer, shown, byteorder="<", photometric=colours, metadata=None, software=False)
-        data = exif_gps.with_directory(buffer.getvalue(), EXIF_IFD, inner, first)
+        data = exif_gps.with_directory(exif_settings.tiff(shown), EXIF_IFD, inner, first)
     else:
         exif = b"Exif\0\0" + exif_gps.with_directory(exif_gps.EMPTY, EXIF_IFD, inner, first)
         if kind == ".png":
             # Pillow writes no 16-bit colours: 8 bits are what a PNG is looked at with.
             eight = shown if shown.ndim == 2 else srgb.eight(shown)
+            buffer = io.BytesIO()
             Image.fromarray(eight).save(buffer, "PNG", exif=exif, compress_level=1)
+            data = buffer.getvalue()
         else:
-            Image.fromarray(srgb.eight(shown)).save(buffer, "JPEG", quality=_QUALITY, subsampling=0, exif=exif)
-        data = buffer.getvalue()
+            data = exif_settings.jpeg(srgb.eight(shown), exif)
     return data if where is None else exif_gps.tagged(data, where)
 
 
 def sigma_file(made: MadePicture) -> bytes:
     """The standard error of each value of the plane, as shares of white, float32 TIFF; NaN where it is not trusted."""
-    buffer = io.BytesIO()
     picture = made.picture
-    sigma = np.where(picture.trusted, picture.sigma, np.float32(np.nan))
-    tifffile.imwrite(buffer, sigma, byteorder="<", photometric="minisblack", metadata=None, software=False)
-    return buffer.getvalue()
+    return exif_settings.tiff(np.where(picture.trusted, picture.sigma, np.float32(np.nan)))
 
 
 def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:

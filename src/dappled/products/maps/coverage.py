@@ -299,13 +299,8 @@ def _reach(eye: Eye, ground: Ground, grid: MapGrid) -> tuple[slice, slice]:
     except MapError:
         return slice(0, grid.shape[0]), slice(0, grid.shape[1])
     margin = 0 if isinstance(ground, Flat) else 0.1 * max(np.ptp(x), np.ptp(y))  # a hill shows beyond the border
-    left, right = ((side - grid.west) / grid.step_x for side in (x.min() - margin, x.max() + margin))
-    top, bottom = ((grid.north - side) / grid.step_y for side in (y.max() + margin, y.min() - margin))
-    rows, columns = grid.shape
-    return (
-        slice(min(max(math.floor(top), 0), rows), max(min(math.ceil(bottom), rows), 0)),
-        slice(min(max(math.floor(left), 0), columns), max(min(math.ceil(right), columns), 0)),
-    )
+    east, north = (np.array([side.min() - margin, side.max() + margin]) for side in (x, y))
+    return grid.reached(east, north)
 
 
 def _shown(

@@ -34,12 +34,8 @@ _SIDE = 1080  # of the picture
 
 def write_raster(covered: Coverage, path: Path, *, least: int) -> None:
     """A GeoTIFF of uint16: frames, directions, holes (1, else 0). Raises MapError."""
-    layers = np.stack([covered.frames, covered.directions, covered.holes(least)], axis=2).astype(np.uint16)
-    columns = (slice(0, covered.grid.shape[0]), slice(0, covered.grid.shape[1]), layers.astype(np.float32))
-    tags = {"DAPPLED_LEAST_FRAMES": str(least)}
-    cog.write_pieces(
-        path, covered.grid, [columns], dtype="float32", bands=3, tags=tags, names=("frames", "directions", "holes")
-    )
+    layers = np.stack([covered.frames, covered.directions, covered.holes(least)], axis=2).astype(np.float32)
+    cog.write(path, covered.grid, layers, {"DAPPLED_LEAST_FRAMES": str(least)}, ("frames", "directions", "holes"))
 
 
 def write_geojson(covered: Coverage, projection: Projection, path: Path, *, least: int) -> None:

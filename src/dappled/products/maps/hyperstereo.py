@@ -80,8 +80,9 @@ def surface(
         if not partners:
             continue
         levels.append(_level_sigma(one, partners[0], middle))
-        cells = _under(one, grid, (lowest_m, middle, highest_m))
-        if cells is None:
+        met = [one.eye.on_plane(one.eye.border(4), level) for level in (lowest_m, middle, highest_m)]
+        cells = grid.reached(*np.concatenate(met).T)
+        if any(line.start >= line.stop for line in cells):
             continue
         part = grid.part(*cells)
         found = _sweep(one, partners, part, projection=projection, heights=(lowest_m, highest_m), window=window)
@@ -147,20 +148,6 @@ def _partners(
             baseline = float(np.linalg.norm(two.eye.centre[:2] - one.eye.centre[:2]))
             shared.append((baseline * math.sqrt(share), int(other)))
     return [photographs[other] for _, other in sorted(shared, reverse=True)[:_MOST_PARTNERS]]
-
-
-def _under(one: Photograph, grid: MapGrid, levels: tuple[float, ...]) -> tuple[slice, slice] | None:
-    """The grid's rows and columns that a frame may see at some of these levels."""
-    met = np.concatenate([one.eye.on_plane(one.eye.border(4), level) for level in levels])
-    columns = (met[:, 0] - grid.west) / grid.step_x
-    rows = (grid.north - met[:, 1]) / grid.step_y
-    found = []
-    for line, side in ((rows, grid.shape[0]), (columns, grid.shape[1])):
-        first, last = max(0, math.floor(line.min())), min(side, math.ceil(line.max()))
-        if first >= last:
-            return None
-        found.append(slice(first, last))
-    return found[0], found[1]
 
 
 def _sweep(

@@ -120,11 +120,16 @@ def _box(name: str, grid: MapGrid, href: str) -> ET.Element:
     overlay = ET.Element(_k("GroundOverlay"))
     overlay.append(_element("name", name))
     ET.SubElement(overlay, _k("Icon")).append(_element("href", href))
-    west, south, east, north = grid.bounds
-    box = ET.SubElement(overlay, _k("LatLonBox"))
-    for key, value in (("north", north), ("south", south), ("east", east), ("west", west)):
-        box.append(_element(key, _degrees(value)))
+    overlay.append(_bounded("LatLonBox", grid))
     return overlay
+
+
+def _bounded(tag: str, grid: MapGrid) -> ET.Element:
+    box = ET.Element(_k(tag))
+    west, south, east, north = grid.bounds
+    for key, value in (("north", north), ("south", south), ("east", east), ("west", west)):  # in the schema's order
+        box.append(_element(key, _degrees(value)))
+    return box
 
 
 def _quad(overlay: Overlay, href: str) -> ET.Element:
@@ -140,10 +145,7 @@ def _quad(overlay: Overlay, href: str) -> ET.Element:
 def _region(grid: MapGrid) -> ET.Element:
     """The area that must be in view, and its least size on the screen (px), before a viewer loads a tile."""
     region = ET.Element(_k("Region"))
-    west, south, east, north = grid.bounds
-    box = ET.SubElement(region, _k("LatLonAltBox"))
-    for key, value in (("north", north), ("south", south), ("east", east), ("west", west)):
-        box.append(_element(key, _degrees(value)))
+    region.append(_bounded("LatLonAltBox", grid))
     lod = ET.SubElement(region, _k("Lod"))
     lod.append(_element("minLodPixels", "256"))
     lod.append(_element("maxLodPixels", "-1"))

@@ -76,6 +76,17 @@ class MapGrid:
             (rows.stop - rows.start, columns.stop - columns.start),
         )
 
+    def reached(self, x: Floats, y: Floats, beside: int = 0) -> tuple[slice, slice]:
+        """The rows and columns between places, and so many beside them, within the grid; empty ones outside of it."""
+        found = []
+        for at, side in (
+            ((self.north - y) / self.step_y, self.shape[0]),
+            ((x - self.west) / self.step_x, self.shape[1]),
+        ):
+            first, last = math.floor(at.min()) - beside, math.ceil(at.max()) + beside
+            found.append(slice(min(max(first, 0), side), max(min(last, side), 0)))
+        return found[0], found[1]
+
     def axes(self) -> tuple[Floats, Floats]:
         """(x of the columns, y of the rows), cell centres."""
         rows, columns = (np.arange(side, dtype=np.float64) + 0.5 for side in self.shape)
@@ -307,9 +318,10 @@ def pieces(
             total = np.zeros((*shape, colours), dtype=np.float32)
             weight = np.zeros(shape, dtype=np.float32)
             for one, box in zip(photographs, boxes, strict=True):
+                down, across = box
                 near = (
-                    slice(max(box[0], top), min(box[1], rows.stop)),
-                    slice(max(box[2], left), min(box[3], columns.stop)),
+                    slice(max(down.start, top), min(down.stop, rows.stop)),
+                    slice(max(across.start, left), min(across.stop, columns.stop)),
                 )
                 if near[0].start >= near[0].stop or near[1].start >= near[1].stop:
                     continue
@@ -349,17 +361,11 @@ def _say(at: NDArray[np.float64], shape: tuple[int, int]) -> Singles:
     return weight
 
 
-def _cells(one: Photograph, grid: MapGrid, ground: Ground, projection: Projection) -> tuple[int, int, int, int]:
-    """The first and last row, and the first and last column, that a frame may reach."""
+def _cells(one: Photograph, grid: MapGrid, ground: Ground, projection: Projection) -> tuple[slice, slice]:
+    """The rows and columns that a frame may reach."""
     met = footprint(one.eye, ground)
     x, y = met[:, 0], met[:, 1]
     if grid.crs == GEODETIC:
         y, x = projection.to_geodetic(x, y)
         x = unwrapped(x, (grid.bounds[0] + grid.bounds[2]) / 2)
-    columns, rows = (x - grid.west) / grid.step_x, (grid.north - y) / grid.step_y
-    return (
-        int(np.floor(rows.min())) - _MARGIN,
-        int(np.ceil(rows.max())) + _MARGIN,
-        int(np.floor(columns.min())) - _MARGIN,
-        int(np.ceil(columns.max())) + _MARGIN,
-    )
+    return grid.reached(x, y, _MARGIN)

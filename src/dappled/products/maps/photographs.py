@@ -339,6 +339,11 @@ def _which(view: str, field: LightField) -> tuple[int, int]:
     return v, u
 
 
+def pose_sigmas(photographs: Sequence[Photograph], given: tuple[float, float] | None) -> Floats:
+    """(n, 2): σ of each one's position (m) and attitude (rad), or those that are given for all."""
+    return np.array([given or (one.position_sigma_m, one.attitude_sigma_rad) for one in photographs])
+
+
 def _sigmas(pose: Pose) -> tuple[float, float]:
     position, attitude = pose.position_sigma_m, pose.attitude_sigma_rad
     return (

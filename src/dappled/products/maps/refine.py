@@ -22,7 +22,7 @@ from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.map_grid import between, footprint, sample, smoothed_to
 from dappled.products.maps.matching import Features
-from dappled.products.maps.photographs import Photograph
+from dappled.products.maps.photographs import Photograph, pose_sigmas
 from dappled.products.maps.references import BaseMap, ControlPoint
 
 LEAST_INLIERS = 15
@@ -225,13 +225,10 @@ def _to_control(photographs: Sequence[Photograph], control: Sequence[ControlPoin
 
 
 def _doubts(photographs: Sequence[Photograph], sigmas: tuple[float, float] | None, *, loose: bool) -> Floats:
-    rows = []
-    for one in photographs:
-        position, attitude = sigmas or (one.position_sigma_m, one.attitude_sigma_rad)
-        if loose and sigmas is None:
-            position, attitude = max(position, _LEAST_SIGMA_M), max(attitude, _LEAST_SIGMA_RAD)
-        rows.append([max(position, 1e-3)] * 3 + [max(attitude, 1e-5)] * 3)
-    return np.array(rows)
+    both = pose_sigmas(photographs, sigmas)
+    if loose and sigmas is None:
+        both = np.maximum(both, (_LEAST_SIGMA_M, _LEAST_SIGMA_RAD))
+    return np.repeat(np.maximum(both, (1e-3, 1e-5)), 3, axis=1)
 
 
 def _judge(

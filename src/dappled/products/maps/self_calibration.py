@@ -18,7 +18,7 @@ from dappled.findings import Code, Finding, Subject, finding
 from dappled.products.maps import hyperstereo, lens_solution, map_grid, matching
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.lens_solution import NAMES, LensSolution, Sightings
-from dappled.products.maps.photographs import Photograph
+from dappled.products.maps.photographs import Photograph, pose_sigmas
 from dappled.products.maps.references import ControlPoint
 
 _PLANE_PX = 12.0  # generous, as houses rise above the plane of the homography
@@ -238,8 +238,6 @@ def _flat(one: Photograph) -> Floats:
 
 
 def _pose_sigmas(photographs: Sequence[Photograph], sigmas: tuple[float, float] | None) -> Floats:
-    rows = []
-    for one in photographs:
-        position, attitude = sigmas or (one.position_sigma_m, one.attitude_sigma_rad)
-        rows.append([max(position, _LEAST_SIGMA_M)] * 3 + [math.hypot(attitude, _MOUNT_SIGMA_RAD)] * 3)
-    return np.array(rows)
+    position, attitude = pose_sigmas(photographs, sigmas).T
+    both = np.stack([np.maximum(position, _LEAST_SIGMA_M), np.hypot(attitude, _MOUNT_SIGMA_RAD)], axis=1)
+    return np.repeat(both, 3, axis=1)
