@@ -80,9 +80,9 @@ def parse_json(data: bytes | memoryview | str, most: int = MOST_BYTES) -> Any:
     return json.loads(data, parse_int=_integer, parse_float=_real, parse_constant=_constant)
 
 
-def parse_toml(text: str, most: int = MOST_BYTES) -> dict[str, Any]:
+def parse_toml(text: str) -> dict[str, Any]:
     """Parse TOML whose whole numbers have 64 bits. Raises ValueError; ClaimError where a limit is passed."""
-    _check_length(text, most)
+    _check_length(text, MOST_BYTES)
     _brackets(text)
     _check_toml_depth(text)
     try:

@@ -54,16 +54,14 @@ class LensletDecoder:
     buffers: SpectrumBuffers = field(default_factory=SpectrumBuffers, repr=False)
 
     @classmethod
-    def with_white(
-        cls, white_plane: Source, *, views_per_axis: int | None = None, workers: int = 1, rolloff: float | None = None
-    ) -> LensletDecoder:
+    def with_white(cls, white_plane: Source, *, workers: int = 1, rolloff: float | None = None) -> LensletDecoder:
         """A decoder with a white frame (float32 (H, W)). Raises DecodeError where that shows no lenslets."""
         shape = (white_plane.shape[0], white_plane.shape[1])
         spectrum = transform(white_plane, workers=workers)
         found = find_lattice(spectrum)
         slices = _cut(spectrum, found, workers)
         origin = lenslet_origin(slices)
-        count = views_per_axis or views_carried(found)
+        count = views_carried(found)
         views = from_lenslet_slices(slices.values, slices.carriers, origin, offsets_px(found.lattice, count), rolloff)
         white = White(found, at_centre(origin, found.lattice, shape), views)
         return cls(shape, white, count, workers, rolloff)

@@ -85,15 +85,15 @@ def oriented_frame(
     return OrientedFrame(size_mm, focal_length_mm, rotation, height, pose["latitude_deg"], pose["longitude_deg"])
 
 
-def network_link_kml(href: str, *, every_s: float = 2.0) -> bytes:
-    """A document that a globe opens once; the globe then reads `href` every `every_s`."""
-    root, document = _document("dappled")
+def network_link_kml(href: str) -> bytes:
+    """A document that a globe opens once; the globe then reads `href` every two seconds."""
+    root, document = _document()
     link = _add(document, "NetworkLink")
     _add(link, "name", "dappled, the latest frame")
     target = _add(link, "Link")
     _add(target, "href", href)
     _add(target, "refreshMode", "onInterval")
-    _add(target, "refreshInterval", f"{every_s:g}")
+    _add(target, "refreshInterval", "2")
     return _bytes(root)
 
 
@@ -101,7 +101,7 @@ def latest_kml(
     name: str, picture: str, frame: RectifiedFrame | None, track: Sequence[tuple[float, float, float]]
 ) -> bytes:
     """The frame's picture as an overlay, and the track of (longitude, latitude, altitude above sea level)."""
-    root, document = _document("dappled")
+    root, document = _document()
     if frame is not None:
         overlay = _add(document, "GroundOverlay")
         _add(overlay, "name", name)
@@ -118,10 +118,10 @@ def latest_kml(
     return _bytes(root)
 
 
-def _document(name: str) -> tuple[ET.Element, ET.Element]:
+def _document() -> tuple[ET.Element, ET.Element]:
     root = ET.Element("kml", xmlns=KML_NAMESPACE)
     document = _add(root, "Document")
-    _add(document, "name", name)
+    _add(document, "name", "dappled")
     return root, document
 
 

@@ -155,10 +155,10 @@ class Telemetry:
             self._turns.append((self._packets, system_id))
             return self._packets
 
-    def boot_clock(self, upto_packet: int | None = None) -> BootClock | None:
+    def boot_clock(self) -> BootClock | None:
         """The autopilot's clock against ours, as known from the packets below the limit; None while unknown."""
         with self._lock:
-            return self._history.clock(self._packets if upto_packet is None else upto_packet)
+            return self._history.clock(self._packets)
 
     def bracketed(self, utc_ns: int) -> bool:
         """Whether samples from after this instant have arrived: waiting longer would not improve its pose.

@@ -20,6 +20,7 @@ from dappled.decode.errors import DecodeError
 from dappled.decode.lightfield.light_field import Image, ViewStack
 from dappled.workers import each
 
+_LEAST_CONTRAST = 1e-4  # rms of the Laplacian, of white 1.0: smoother areas have no sharpest picture
 _SHARPNESS_BOX = 5  # px: the side of the box that sharpness is averaged over, twice
 # Of the windowed sinc, and its window: true views refocused reach 65.9 to 79.4 dB, by cubic convolution 51.7 to 63.6
 # (frames of benchmarks/views.py, 25 points, seed 1, four planes).
@@ -171,11 +172,8 @@ def focal_stack(
     return FocalStack(made, np.asarray(disparities, dtype=np.float64))
 
 
-def all_in_focus(stack: FocalStack, *, least_contrast: float = 1e-4) -> AllInFocus:
-    """The sharpest of the stack at every pixel: the largest local energy of the Laplacian.
-
-    `least_contrast` (rms of the Laplacian, of white 1.0): smoother areas have no sharpest picture.
-    """
+def all_in_focus(stack: FocalStack) -> AllInFocus:
+    """The sharpest of the stack at every pixel: the largest local energy of the Laplacian."""
     pictures = np.nan_to_num(stack.pictures)
     grey = pictures.mean(axis=3) if pictures.ndim == 4 else pictures
     energy = np.stack([ndimage.laplace(p, mode="nearest") for p in grey]) ** 2
@@ -183,7 +181,7 @@ def all_in_focus(stack: FocalStack, *, least_contrast: float = 1e-4) -> AllInFoc
         for _ in range(2):  # a box used twice is a smooth window
             energy = ndimage.uniform_filter1d(energy, _SHARPNESS_BOX, axis=axis)
     index = ndimage.median_filter(energy.argmax(axis=0), 3)
-    smooth = energy.max(axis=0) < least_contrast**2
+    smooth = energy.max(axis=0) < _LEAST_CONTRAST**2
     chosen = np.where(smooth, len(pictures) // 2, index)
     gather = chosen[None, ..., None] if pictures.ndim == 4 else chosen[None]
     picture = np.take_along_axis(pictures, gather, axis=0)[0]

@@ -17,6 +17,7 @@ from dappled.decode.spectrum.transform import Spectrum
 
 _SMALLEST_VERIFIED = 6  # carriers in one half plane, DC left out
 _CANDIDATES = 30  # the strongest: pairs of them are bases to try
+_MOST_POINTS = 4000
 _TOLERANCE_BINS = 1.5  # of a multiple of the basis: an order stands so near; chosen by hand
 
 
@@ -182,13 +183,13 @@ def _refit(
     return fitted
 
 
-def _half_plane(lattice: Lattice, limit: float = 0.5, most: int = 4000) -> list[Carrier]:
+def _half_plane(lattice: Lattice) -> list[Carrier]:
     """All lattice points below Nyquist with (ky, kx) above (0, 0)."""
     inverse = np.abs(np.linalg.inv(lattice.matrix()))
-    reach = [min(math.ceil(limit * float(inverse[:, axis].sum())), 200) for axis in (0, 1)]
+    reach = [min(math.ceil(0.5 * float(inverse[:, axis].sum())), 200) for axis in (0, 1)]
     orders = [(ky, kx) for ky in range(reach[0] + 1) for kx in range(-reach[1], reach[1] + 1) if (ky, kx) > (0, 0)]
-    points = [c for c in lattice.carriers(orders) if abs(c.fy) < limit and abs(c.fx) < limit]
-    return sorted(points, key=lambda c: math.hypot(c.fy, c.fx))[:most]
+    points = [c for c in lattice.carriers(orders) if abs(c.fy) < 0.5 and abs(c.fx) < 0.5]
+    return sorted(points, key=lambda c: math.hypot(c.fy, c.fx))[:_MOST_POINTS]
 
 
 def _believable(verified: list[tuple[Carrier, Measured]], predicted: int) -> bool:

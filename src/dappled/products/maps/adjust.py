@@ -19,6 +19,7 @@ from dappled.decode.array_types import Floats
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.ground import Ground
 
+_ITERATIONS = 20  # at most
 _ROBUST = 2.0  # sigmas up to which an observation has its full weight (Huber)
 _INLIER = 3.0
 _STEPS = np.array([1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5])  # metres, radians: for derivatives
@@ -74,7 +75,6 @@ def adjust(
     ground: Ground,
     *,
     sigmas: Floats,
-    iterations: int = 20,
 ) -> Solution:
     """Adjust by Gauss-Newton from the given eyes, with `sigmas` (n, 6) of their shifts (m) and turns (rad)."""
     from scipy.sparse.linalg import spsolve  # noqa: PLC0415  # an eighth of the start of verbs that adjust nothing
@@ -87,7 +87,7 @@ def adjust(
     prior = np.concatenate([1 / sigmas.ravel() ** 2, [1 / max(group.level_sigma_m, 1e-6) ** 2 for group in groups]])
     moved = list(given)
     normal = sparse.diags(prior).tocsc()
-    for _ in range(iterations):
+    for _ in range(_ITERATIONS):
         rows, columns, values = [], [], []
         gradient = prior * np.concatenate([changes.ravel(), levels])
         for number, group in enumerate(groups):

@@ -133,10 +133,10 @@ def shared(grids: Sequence[MapGrid]) -> list[tuple[slice, slice]] | None:
     ]
 
 
-def footprint(eye: Eye, ground: Ground, steps: int = 16) -> Floats:
+def footprint(eye: Eye, ground: Ground) -> Floats:
     """(n, 3) east, north, height along the view's border, each side beginning with its corner. Raises MapError where a
     ray misses the ground."""
-    met = ground.meet(eye, eye.border(steps))
+    met = ground.meet(eye, eye.border())
     if np.isnan(met).any():
         raise MapError(f"its view leaves the ground ({ground.name}): give terrain that covers it")
     return met

@@ -14,6 +14,7 @@ from dappled.products.extras import need
 
 _LIMIT = 4000  # features per picture
 _PATCHES = 600  # per picture, about
+_PATCH, _NUDGED = 25, 4  # pixels: the side of a patch, and how far it is looked for
 _REACH = 6  # pictures ahead that are tried as neighbours
 _RATIO = 0.85  # at most, of the best match's distance to the second best's
 
@@ -26,12 +27,12 @@ class Features:
     descriptors: NDArray[np.float32]
 
 
-def features(image: NDArray[np.floating], known: NDArray[np.bool_] | None = None) -> Features:
-    """The features of a picture (h, w) or (h, w, c) of any brightness scale, only well inside of `known`."""
+def features(image: NDArray[np.floating]) -> Features:
+    """The features of a picture (h, w) or (h, w, c) of any brightness scale, only well inside of what is known."""
     cv2 = need("cv2")
     grey = np.asarray(image, dtype=np.float32)
     grey = grey.mean(axis=2) if grey.ndim == 3 else grey
-    seen = np.isfinite(grey) if known is None else known & np.isfinite(grey)
+    seen = np.isfinite(grey)
     if not seen.any():
         return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
     low, high = np.percentile(grey[seen], (0.5, 99.5))
@@ -85,9 +86,7 @@ def on_one_plane(a: Floats, b: Floats, threshold_px: float) -> NDArray[np.bool_]
     return none if found is None else np.asarray(inside.ravel() > 0)
 
 
-def nudges(
-    image: NDArray[np.floating], like: NDArray[np.floating], *, patch: int = 25, reach: int = 4
-) -> tuple[Floats, Floats]:
+def nudges(image: NDArray[np.floating], like: NDArray[np.floating]) -> tuple[Floats, Floats]:
     """(places (n, 2), shifts (n, 2)) in px: where patches of `image` are found in `like`, a picture of the same shape
     that shows nearly the same, to a fraction of a pixel. Patches with a correlation below 0.7 or near NaN are left out.
     """
@@ -95,7 +94,7 @@ def nudges(
     a, b = (np.asarray(one, np.float32).mean(axis=2) if one.ndim == 3 else np.asarray(one, np.float32)
             for one in (image, like))  # fmt: skip
     rows, columns = a.shape
-    half, step = patch // 2, max(patch // 2, round(math.sqrt(rows * columns / _PATCHES)))
+    half, reach, step = _PATCH // 2, _NUDGED, max(_PATCH // 2, round(math.sqrt(rows * columns / _PATCHES)))
     places, shifts = [], []
     for row in range(half + reach, rows - half - reach, step):
         for column in range(half + reach, columns - half - reach, step):
