@@ -19,7 +19,7 @@ from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, log_reading
 from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Database, LedgerReader
+from dappled.flight.ledger import Database, LedgerReader, moved_aside
 from dappled.flight.records import ShotState
 
 FILE_NAME = "index.sqlite"
@@ -205,11 +205,8 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[Finding]]:
         path = root / FILE_NAME
         if not path.is_file():
             raise
-        aside = path.with_name(FILE_NAME + ".damaged")
         with disk_errors("move away the damaged index", path):
-            os.replace(path, aside)
-            for suffix in ("-wal", "-shm"):
-                path.with_name(FILE_NAME + suffix).unlink(missing_ok=True)
+            aside = moved_aside(path)
         return ImageIndex(root), [finding(Code.INDEX_REBUILT, Subject("flights"), why=str(error), aside=aside.name)]
 
 

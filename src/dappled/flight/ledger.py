@@ -6,6 +6,7 @@ that was hashed, so that `sha256(record)` can be checked with SQLite and sha256s
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import threading
 from abc import abstractmethod
@@ -277,6 +278,21 @@ class LedgerReader(Database):
                 f"the ledger {self.path} has version {version}, this dappled reads version {SCHEMA_VERSION}; "
                 "use the dappled that recorded it, or a newer one"
             )
+
+
+def is_closed(path: Path) -> bool:
+    """Whether a ledger says that its flight was closed. Raises FlightError."""
+    with LedgerReader.open(path) as ledger:
+        return "closed_utc_ns" in ledger.facts()
+
+
+def moved_aside(path: Path) -> Path:
+    """Move a damaged SQLite file away; what stands beside it goes. Returns its new name. Raises OSError."""
+    aside = path.with_name(path.name + ".damaged")
+    os.replace(path, aside)
+    for suffix in ("-wal", "-shm"):
+        path.with_name(path.name + suffix).unlink(missing_ok=True)
+    return aside
 
 
 class Ledger(LedgerReader):

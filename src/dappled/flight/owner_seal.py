@@ -14,7 +14,7 @@ from dappled.flight import layout, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.checks.flight_check import CheckReport
 from dappled.flight.errors import FlightError
-from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.ledger import Ledger, is_closed
 from dappled.flight.seal_key import SealKey
 
 
@@ -27,9 +27,7 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
     """
     folder = layout.open_folder(flight)
     with layout.work_lock(folder.path.resolve().parent, "seals flights in"):
-        with LedgerReader.open(folder.ledger) as ledger:
-            closed = "closed_utc_ns" in ledger.facts()
-        if not closed:
+        if not is_closed(folder.ledger):
             raise FlightError(f"{flight} was never closed, and can't be sealed: the next `dappled run` closes it")
         found = flight_check.check(folder.path, key)
         if found.problems:

@@ -21,7 +21,7 @@ from dappled.flight import layout, log_reading, logs, seals
 from dappled.flight.errors import disk_errors
 from dappled.flight.index import ImageIndex
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.ledger import Ledger, is_closed, moved_aside
 from dappled.flight.logs import ShotJournal
 from dappled.flight.records import CUT_SHORT, Frame, Stray
 from dappled.flight.seal_key import SealKey
@@ -60,8 +60,7 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
 def _closed(folder: FlightFolder) -> bool:
     """Whether the ledger says that the flight was closed; False where it can't be read."""
     try:
-        with LedgerReader.open(folder.ledger) as ledger:
-            return "closed_utc_ns" in ledger.facts()
+        return is_closed(folder.ledger)
     except DappledError:
         return False
 
@@ -115,10 +114,7 @@ def _move_damaged_ledger(folder: FlightFolder) -> list[Finding]:
     damage = ledger_damage(folder.ledger)
     if damage is None:
         return []
-    aside = folder.ledger.with_name(folder.ledger.name + ".damaged")
-    os.replace(folder.ledger, aside)
-    for suffix in ("-wal", "-shm"):
-        folder.ledger.with_name(folder.ledger.name + suffix).unlink(missing_ok=True)
+    aside = moved_aside(folder.ledger)
     if folder.seals.exists():  # they are about that ledger's chain
         os.replace(folder.seals, folder.seals.with_name(folder.seals.name + ".damaged"))
     durable.sync_folder(folder.path)

@@ -24,7 +24,7 @@ from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import layout, pruning
 from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger, LedgerReader
+from dappled.flight.ledger import Ledger, LedgerReader, is_closed
 from dappled.flight.seal_key import SealKey
 from dappled.shown import printable
 
@@ -141,9 +141,7 @@ def reopened(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | N
 
     `key` signs the seal only where it had signed all that was there before: otherwise its signature would cover what
     somebody else did in between. Raises FlightError."""
-    with LedgerReader.open(folder.ledger) as reader:
-        closed = "closed_utc_ns" in reader.facts()
-    if not closed:
+    if not is_closed(folder.ledger):
         yield
         return
     signs = key if key is not None and is_signed(folder, key) else None

@@ -21,7 +21,7 @@ from dappled.daemon.replay.verifier import ReplayVerifier
 from dappled.drivers.camera import Blob
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Finding, finding
-from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Tag, layout, seals
+from dappled.flight import FlightFolder, Frame, Ledger, LedgerReader, Tag, is_closed, layout, seals
 from dappled.flight.seal_key import SealKey
 
 
@@ -64,9 +64,7 @@ def add_missing(flight: Path, clock: Clock, key: SealKey | None, vehicle: int | 
     folder = layout.open_folder(flight)
     if not _untagged(folder):
         return []
-    with LedgerReader.open(folder.ledger) as reader:
-        closed = "closed_utc_ns" in reader.facts()
-    if not closed:
+    if not is_closed(folder.ledger):
         raise DappledError(f"{flight} is still being recorded, or was never closed: the next `dappled run` repairs it")
     facts = layout.read_facts(folder)
     if "settings" not in facts or "names" not in facts:

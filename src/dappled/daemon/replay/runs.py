@@ -20,7 +20,7 @@ from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
 from dappled.drivers.raw.darkroom import FILES, Recipe
 from dappled.errors import DappledError
-from dappled.flight import LIVE, Ledger, LedgerReader, Result, layout, provenance, seals
+from dappled.flight import LIVE, Ledger, LedgerReader, Result, is_closed, layout, provenance, seals
 from dappled.flight.seal_key import SealKey
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
@@ -45,9 +45,7 @@ class RunWriter(Closing):
         folder = layout.open_folder(flight)
         if not _NAME.fullmatch(run.name) or run.name == LIVE:
             raise DappledError(f"{run.name!r} can't name a run: use letters, digits, dots and dashes, not {LIVE!r}")
-        with LedgerReader.open(folder.ledger) as ledger:
-            facts = ledger.facts()
-        if "closed_utc_ns" not in facts:
+        if not is_closed(folder.ledger):
             held = layout.is_locked(flight.absolute().parent)
             what = (
                 "is still being recorded: wait for its end"
