@@ -9,8 +9,8 @@ import shutil
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +25,7 @@ from dappled.mocks.simulation import Simulation, World
 from tests.simulated import lytro
 
 ROOT = Path(__file__).resolve().parents[2]
+DAPPLED = (sys.executable, "-m", "dappled")
 FENCED = re.compile(r"^```(sh|console|bash)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 INDENTED = re.compile(r"(?:^ {4}\S.*\n)+", re.MULTILINE)
 OURS = re.compile(r"^(dappled|make|python|sudo dappled|uv|pip) ")
@@ -87,33 +88,39 @@ FINDINGS = {
 """Commands that may end with 1 here because of what they find, and what they say then; the documents say so too."""
 
 
+LIVE = re.compile(r"dappled (trigger|watch|status|doctor)\b")
+"""Commands that ask a daemon that flies."""
+
+
 @dataclass(frozen=True)
 class Stage:
-    """Where commands run. `port` is that of a live daemon's ground link."""
+    """Where commands run. `short` is a folder for sockets."""
 
     folder: Path
     environment: dict[str, str]
-    port: str
+    short: Path
 
-    def all_fail(self, commands: Iterable[str]) -> list[str]:
-        """Run a document's commands in order, `cd` and all; what those said that did not end well."""
+    def all_fail(self, commands: Sequence[str]) -> list[str]:
+        """Run a document's commands in order, `cd` and all; what those said that did not end well. Where one asks a
+        daemon, one flies meanwhile."""
         said, where = [], self.folder
-        for command in commands:
-            failure = self.run(command, where)
-            if failure:
-                said.append(failure)
-            if into := re.search(r"&& cd (\S+)$", command):
-                where = where / into[1]
+        with self._live() if any(map(LIVE.search, commands)) else nullcontext("") as port:
+            for command in commands:
+                failure = self.run(command, where, port)
+                if failure:
+                    said.append(failure)
+                if into := re.search(r"&& cd (\S+)$", command):
+                    where = where / into[1]
         return said
 
-    def run(self, command: str, where: Path) -> str | None:
-        """Run it; None when it went well, else what it said."""
+    def run(self, command: str, where: Path, port: str) -> str | None:
+        """Run it; None when it went well, else what it said. `port`: of the ground link of the daemon that flies."""
         if command.startswith("make "):
             return self._make(command)
         for words, test in ELSEWHERE.items():
             if words in command:
                 return None if (ROOT / test).is_file() else f"{command}: {test} is gone"
-        words = command.replace("127.0.0.1:14550", f"127.0.0.1:{self.port}").removeprefix("sudo ")
+        words = command.replace("127.0.0.1:14550", f"127.0.0.1:{port}").removeprefix("sudo ")
         for printed, ours in SUBSTITUTES.items():
             words = words.replace(printed, ours)
         environment = self.environment
@@ -139,15 +146,36 @@ class Stage:
         well = done.returncode == 0 or found
         return None if well else f"{command}\n  exit {done.returncode}: {done.stderr.strip()[-600:]}"
 
+    @contextmanager
+    def _live(self) -> Iterator[str]:
+        """A simulated daemon that photographs; the port of its ground link."""
+        live = self.folder / "live"
+        live.mkdir(exist_ok=True)
+        with Simulation(World(), configuration.load(None), live) as settings:
+            tables = configuration.to_tables(settings)
+            stream = f"ipc://{self.short}/dappled/slices"
+            tables["record"]["directory"] = str(live / "flights")
+            tables["publish"] |= {"slices": stream, "ask": f"{stream}.ask"}
+            (live / "live.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
+            daemon = subprocess.Popen(
+                [*DAPPLED, "run", "--config", "live.toml"], cwd=live, env=self.environment, stderr=subprocess.DEVNULL
+            )
+            try:
+                ground = settings.mavlink.url[1].rpartition(":")[2]
+                with GroundClient(f"udpout:127.0.0.1:{ground}", system_id=254) as client, shooting(client):
+                    yield ground
+            finally:
+                daemon.terminate()
+                daemon.wait(60)
+
     def _make(self, command: str) -> str | None:
         """The target is there; running it is what other tests and CI do."""
         done = subprocess.run(["/bin/sh", "-c", f"{command} -n"], cwd=ROOT, capture_output=True, text=True, check=False)
         return None if done.returncode == 0 else f"{command}: {done.stderr}"
 
 
-@contextmanager
-def stage(folder: Path, short: Path) -> Iterator[Stage]:
-    """Files by the names that documents use, and a live simulated daemon. `short` is for sockets."""
+def stage(folder: Path, short: Path, flight: Path) -> Stage:
+    """Files by the names that documents use, among them a flight, which is copied. `short` is for sockets."""
     environment = {
         **os.environ,
         "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}",
@@ -155,39 +183,20 @@ def stage(folder: Path, short: Path) -> Iterator[Stage]:
         "XDG_RUNTIME_DIR": str(short),
         "RUNTIME_DIRECTORY": "",
     }
-    dappled = [sys.executable, "-m", "dappled"]
     _files(folder)
-    flown = [*dappled, "run", "--simulate", "--frames", "3", "--config", "dappled.toml"]
-    subprocess.run(flown, cwd=folder, env=environment, check=True, capture_output=True)
-    flight = next((folder / "flights").glob("*Z-*"))
-    (folder / "FLIGHT").symlink_to(flight)
+    flown = shutil.copytree(flight, folder / "flights" / flight.name)
+    (folder / "FLIGHT").symlink_to(flown)
     (folder / "build/demo/flights").mkdir(parents=True)
-    (folder / "build/demo/flights" / flight.name).symlink_to(flight)
-    frame = sorted((flight / "frames").glob("*.dng"))[-1]
+    (folder / "build/demo/flights" / flight.name).symlink_to(flown)
+    frame = sorted((flown / "frames").glob("*.dng"))[-1]
     for name in ("frame.dng", "FRAME"):
         shutil.copy(frame, folder / name)
-    shutil.copy(flight / "inputs/calibration.toml", folder / "calibration.toml")
-    designed = [*dappled, "mask", "diffraction", "--mask", "mask-1", "--json"]
+    shutil.copy(flown / "inputs/calibration.toml", folder / "calibration.toml")
+    designed = [*DAPPLED, "mask", "diffraction", "--mask", "mask-1", "--json"]
     spots = json.loads(subprocess.run(designed, check=True, capture_output=True).stdout)["impulses"]
     rows = "".join(f"{spot['x_mm']:.2f},{spot['y_mm']:.2f}\n" for spot in spots)
     (folder / "bench.csv").write_text("x_mm,y_mm\n" + rows, encoding="utf-8")
-    live = folder / "live"
-    live.mkdir()
-    with Simulation(World(), configuration.load(None), live) as settings:
-        tables = configuration.to_tables(settings)
-        tables["record"]["directory"] = str(live / "flights")
-        tables["publish"] |= {"slices": f"ipc://{short}/dappled/slices", "ask": f"ipc://{short}/dappled/slices.ask"}
-        (live / "live.toml").write_text(tomli_w.dumps(tables), encoding="utf-8")
-        daemon = subprocess.Popen(
-            [*dappled, "run", "--config", "live.toml"], cwd=live, env=environment, stderr=subprocess.DEVNULL
-        )
-        try:
-            ground = settings.mavlink.url[1].rpartition(":")[2]
-            with GroundClient(f"udpout:127.0.0.1:{ground}", system_id=254) as client, shooting(client):
-                yield Stage(folder, environment, ground)
-        finally:
-            daemon.terminate()
-            daemon.wait(60)
+    return Stage(folder, environment, short)
 
 
 @contextmanager

@@ -13,9 +13,10 @@ from dappled.config.settings import CameraSettings, PublishSettings
 from dappled.daemon.console import access, connection, feed
 from dappled.daemon.live_settings import CHANGES_IN_FLIGHT
 from dappled.daemon.pipeline import repeats
+from tests.system.conftest import Flown
 from tests.system.documents import ROOT, Stage, commands, stage
 
-DOCUMENTS = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+DOCUMENTS = [page for page in sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")]) if commands(page)]
 LONG = (
     "README.md",
     "decoding.md",
@@ -47,9 +48,9 @@ def test_the_readme_s_first_screen_says_what_one_gains_and_what_it_costs() -> No
 
 
 @pytest.fixture(scope="module")
-def on_stage(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stage]:
-    with tempfile.TemporaryDirectory(prefix="doc-") as short, stage(tmp_path_factory.mktemp("d"), Path(short)) as ready:
-        yield ready
+def on_stage(tmp_path_factory: pytest.TempPathFactory, flown: Flown) -> Iterator[Stage]:
+    with tempfile.TemporaryDirectory(prefix="doc-") as short:
+        yield stage(tmp_path_factory.mktemp("d"), Path(short), flown.flight)
 
 
 def test_commands_are_found(tmp_path: Path) -> None:

@@ -13,14 +13,19 @@ from dappled.products.handover import FORMS, forms
 from dappled.products.maps.earth import Geoid
 from dappled.products.maps.georeference import Options
 from dappled.products.mounting import Mounting
+from tests import shared
 from tests.products.flown import Flown
 from tests.products.handover.handed import NAMES, UNDULATION_M
 
 
 @pytest.fixture(scope="session")
 def handed(short_flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of the flight in all forms, each frame decoded once."""
-    output = tmp_path_factory.mktemp("forms")
+    """The folder of the flight in all forms, each frame decoded once. Not to be written to."""
+    folder = shared.folder_of_run(tmp_path_factory)
+    return shared.once(folder, "forms", lambda: _in_all_forms(short_flight, folder / "forms"))
+
+
+def _in_all_forms(short_flight: Flown, output: Path) -> Path:
     kinds = [*FORMS] if _has("mcap_ros2") else [form for form in FORMS if form != "mcap"]
     placed, _ = geotags.read(short_flight.folder, Mounting(), Geoid(offset_m=UNDULATION_M))
     by_index = {one.frame.index: replace(one, utc_ns=one.tag.utc_ns) for one in placed}
