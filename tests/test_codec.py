@@ -26,7 +26,7 @@ from dappled.daemon.pipeline.picture_facts import PictureFacts
 from dappled.daemon.pipeline.recipes import Names
 from dappled.decode import DecodeError
 from dappled.decode.calibration import LatticeFit
-from dappled.decode.calibration.swept_distance import SweptDistance
+from dappled.decode.calibration.calibration import SweptDistance
 from dappled.decode.depth.ranging import Ranging
 from dappled.decode.geometry import Pose
 from dappled.decode.joint.mask_place import MaskPlace

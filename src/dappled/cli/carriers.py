@@ -27,6 +27,7 @@ if not words_only:
     from dappled.decode.spectrum.peaks import Measured, displaced, measure
     from dappled.decode.spectrum.pictures import Look, around, spectrum_boxes
     from dappled.decode.spectrum.transform import padded_shape, transform
+    from dappled.drivers.raw import recipe_check
     from dappled.drivers.raw.darkroom import Darkroom, known_to, naming
     from dappled.drivers.raw.law_check import FrameLens, LawCheck, check
     from dappled.products.exports import prints
@@ -106,7 +107,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
                 raise CallError("without a frame the focal length is unknown: give --focal-length, in mm")
             if self.picture:
                 raise CallError("--picture draws a frame's spectrum: name the frame")
-        Darkroom(self.recipe()).check()
+        recipe_check.check(self.recipe())
 
     def run(self, output: Output) -> Report:
         if self.frame is None:

@@ -24,6 +24,7 @@ from dappled.errors import DappledError
 from dappled.findings import FRAME, told
 
 if not words_only:
+    from dappled.drivers.raw import recipe_check
     from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
     from dappled.products import processes
     from dappled.products.exports import light_files
@@ -52,14 +53,14 @@ class DecodeFrames(Overwriting, Doubtable, Several, FramesArguments, Verb):
     )
     json: bool = flag("--json", "print one JSON object per frame")
 
-    def _darkroom(self) -> Darkroom:
-        return Darkroom(recorded(self.frames, self.recipe(colour=self.colour, taper=self.taper)))
+    def _recipe(self) -> Recipe:
+        return recorded(self.frames, self.recipe(colour=self.colour, taper=self.taper))
 
     def check(self) -> None:
-        self._darkroom().check()
+        recipe_check.check(self._recipe())
 
     def run(self, output: Output) -> Report:
-        recipe, found = self._darkroom().recipe, frames(self.frames)
+        recipe, found = self._recipe(), frames(self.frames)
         single = len(found) == 1 and bool(self.output.suffix)
         if not single:
             refuse_same_names(found, self.output, ".zarr")

@@ -21,7 +21,7 @@ from dappled.daemon.stream import curve, sockets
 from dappled.decode.geometry import area
 from dappled.drivers.gnss.port import address as gnss_address
 from dappled.drivers.mavlink import LinkError, parse, read_key
-from dappled.drivers.raw import reading
+from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.errors import DappledError
@@ -171,8 +171,6 @@ def _calibration(settings: Settings) -> None:
     decode = settings.decode
     if not settings.mask.profile:  # it is read only with a mask
         return
-    from dappled.drivers.raw import calibration_files  # noqa: PLC0415  # SciPy takes a small computer seconds
-
     wrong = calibration_files.misfit(
         Recipe(
             camera=settings.camera.profile,

@@ -15,6 +15,7 @@ from dappled.daemon.pipeline.capture import Observer, PendingShot
 from dappled.daemon.pipeline.occasional import Occasional
 from dappled.drivers.camera import Identity, SettingsChanged, StateChanged
 from dappled.drivers.mavlink import mavlink
+from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError, report
 from dappled.findings import Code, Finding, Subject, finding, text, told
@@ -109,8 +110,6 @@ class ShotEvents(Observer):
     def _judge_calibration(self, model: str) -> None:
         """Whether the calibration is for this camera. Its mask and law were judged before the flight began."""
         if self._recipe is not None:
-            from dappled.drivers.raw import calibration_files  # noqa: PLC0415  # what decodes loads SciPy
-
             try:
                 found = calibration_files.misfit(self._recipe, model)
                 # the flight's own copy is read: a pilot on the field has no use for its long name

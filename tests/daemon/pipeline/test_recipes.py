@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,3 +82,21 @@ def test_copies_that_can_t_be_made_are_one_sentence(tmp_path: Path) -> None:
 
 def test_versions_name_what_results_depend_on() -> None:
     assert {"python", "numpy", "scipy", "rawpy"} <= set(recipes.versions())
+
+
+def test_a_daemon_checks_its_recipe_without_what_decodes(tmp_path: Path) -> None:
+    """SciPy is a third of a start with a mask, which is to be ready soon."""
+    file = tmp_path / "dappled.toml"
+    file.write_text(f'[mask]\nprofile = "mask-2"\n[record]\ndirectory = "{tmp_path}"\n')
+    program = (
+        "import sys, pathlib\n"
+        "from dappled.cli import run\n"
+        "from dappled.config import settings\n"
+        "from dappled.daemon import settings_check\n"
+        "from dappled.daemon.pipeline import recipes\n"
+        "file = settings.examine_file(pathlib.Path(sys.argv[1]))\n"
+        "assert recipes.recipe(settings_check.checked(file, starting=True))[1] is not None\n"
+        "print('scipy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(file)], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -18,7 +18,7 @@ if not words_only:
     from dappled.config import profiles
     from dappled.decode.calibration import Calibration, report
     from dappled.decode.calibration.law_choice import CALIBRATION
-    from dappled.drivers.raw import calibration_files
+    from dappled.drivers.raw import calibration_files, recipe_check
     from dappled.drivers.raw.darkroom import Darkroom
 
 
@@ -62,7 +62,7 @@ class CalibrateMask(Overwriting, Doubtable, lens.LensArguments, RecipeArguments,
         if self.output is not None:
             self.refuse_existing(*([self.output] if self.lens else calibration_files.pair(self.output)))
         if self.mask:
-            Darkroom(self.recipe()).check()
+            recipe_check.check(self.recipe())
 
     def run(self, output: Output) -> Report:
         if self.kit is not None:

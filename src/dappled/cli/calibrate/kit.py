@@ -24,7 +24,7 @@ if not words_only:
 
     from dappled.decode.calibration import Calibration, report
     from dappled.decode.calibration.law_choice import CALIBRATION, EXPLAINED_BINS, LawFit
-    from dappled.drivers.raw import calibration_files
+    from dappled.drivers.raw import calibration_files, recipe_check
     from dappled.drivers.raw.darkroom import Darkroom, Recipe
     from dappled.drivers.raw.raw_file import exposure
 
@@ -62,9 +62,9 @@ class KitCall:
 
     def darkroom(self, name: str) -> Darkroom:
         """What reads the frames of one mask. Raises DappledError."""
-        made = Darkroom(replace(self.recipe, mask=str(self.folder / f"{name}.toml")))
-        made.check()
-        return made
+        recipe = replace(self.recipe, mask=str(self.folder / f"{name}.toml"))
+        recipe_check.check(recipe)
+        return Darkroom(recipe)
 
     def shows_full(self, path: Path) -> bool:
         """Whether a frame shows the full mask."""

@@ -31,6 +31,7 @@ from dappled.decode.lightfield.light_field import fingerprint, slice_mosaic
 from dappled.decode.picture.shadow import shadow_at
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import ChannelMessage, end_with_parent
+from dappled.drivers.raw import recipe_check
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.frame_mosaic import mosaic_of
 from dappled.drivers.raw.recipe import LawDecision
@@ -88,7 +89,7 @@ class DecodeWorker:
     def _made(self, darkroom: Darkroom, asked: Mapping[str, Any]) -> WorkerReply:
         match asked["do"]:
             case "warm up":
-                darkroom.check()
+                recipe_check.check(darkroom.recipe)
                 return {"ready": True}, ()
             case "depth":
                 return _depth(self._decided or darkroom, asked)

@@ -16,6 +16,7 @@ from typing import Any
 from dappled import durable
 from dappled.config import profiles
 from dappled.config.settings import Settings
+from dappled.drivers.raw import recipe_check
 from dappled.drivers.raw.recipe import FILES, FOLDER, Recipe, camera_name, of_flight
 from dappled.errors import DappledError
 
@@ -40,8 +41,6 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
     names = called(settings)
     if not settings.decode.enabled or not settings.mask.profile:
         return names, None
-    from dappled.drivers.raw.darkroom import Darkroom  # noqa: PLC0415  # SciPy takes a small computer seconds
-
     made = Recipe(
         camera=settings.camera.profile,
         mask=settings.mask.profile,
@@ -52,7 +51,7 @@ def recipe(settings: Settings) -> tuple[Names, Recipe | None]:
         workers=settings.decode.workers,
         try_laws=True,
     )
-    Darkroom(made).check()
+    recipe_check.check(made)
     return names, made
 
 

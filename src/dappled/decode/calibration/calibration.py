@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled import codec
-from dappled.decode.calibration.swept_distance import SweptDistance
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
 from dappled.findings import FRAME, Code, Finding, Level, finding
@@ -33,6 +32,16 @@ _AT_EDGE = 0.95  # of the farthest turn: the best may be beyond it
 _LEAST_PERIODS, _LEAST_TURN = 0.03, 3e-4  # smaller moves cost next to nothing
 _LEAST_TRANSFER = 1e-3  # a carrier that the mask doesn't make tells nothing
 _FLOOR = 1e-3  # of the mean: what the scene adds to the mean of a slice, however still its blocks are
+
+
+@dataclass(frozen=True, slots=True)
+class SweptDistance:
+    """The mask's distance times the print's scale in mm, with its standard error, as `swept_distance` finds it.
+    `stops` are the f-numbers."""
+
+    scaled_mm: float
+    sigma_mm: float
+    stops: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration.swept_distance import SweptDistance
+from dappled.decode.calibration.calibration import SweptDistance
 from dappled.decode.optics import LAWS, Lattice, Mask, MaskedOptics, Sensor
 from dappled.findings import Code, Finding, Subject, finding
 

@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from dappled.decode.calibration.calibration import SweptDistance
 from dappled.decode.calibration.lattice_fit import FrameLattice
 from dappled.decode.optics import MaskedOptics, Order, Sensor
 from dappled.decode.optics.carrier_tables import lattice_rotation
@@ -32,15 +32,6 @@ _USEFUL = 0.25  # relative: a distance known worse than this says nothing
 # (shape, its effective diameter over f/N, how often): a polygon of 5, 6 or 8 blades acts as a round stop of its area,
 # which is smaller than f/N where the lens counts N at the blades' corners.
 _SHAPES = (("round", 1.0, 3.0), ("round", 0.95, 1.0), ("round", 0.91, 1.0), ("round", 0.87, 1.0), ("square", 1.0, 3.0))
-
-
-@dataclass(frozen=True, slots=True)
-class SweptDistance:
-    """The mask's distance times the print's scale in mm, with its standard error. `stops` are the f-numbers."""
-
-    scaled_mm: float
-    sigma_mm: float
-    stops: tuple[float, ...]
 
 
 def swept_distance(frames: Sequence[FrameLattice], optics: MaskedOptics) -> SweptDistance | None:

@@ -39,7 +39,7 @@ from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, ex
 from dappled.drivers.raw.reading import RawFile
 from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, camera_name, of_flight
 from dappled.errors import DappledError
-from dappled.findings import Finding, Subject, told
+from dappled.findings import Finding, Subject
 
 Painter = Callable[[LightField], NDArray[np.float32]]  # views in colour of a light field with grey ones
 
@@ -167,24 +167,6 @@ class Darkroom:
         self._checks = recipe.try_laws or recipe.keep_law
         self._decoders: dict[tuple[tuple[int, int], str, bool], Decoder] = {}
         self._lineariser = FrameLineariser(recipe)
-
-    def check(self) -> None:
-        """Raise DappledError when the recipe names something that is missing, wrong, or for another camera or mask."""
-        if self.recipe.camera != "auto":
-            profiles.camera(self.recipe.camera)
-        if self.recipe.mask != profiles.LENSLET:
-            profiles.mask(self.recipe.mask)
-        if (wrong := calibration_files.misfit(self.recipe)) is not None:
-            raise DappledError(str(told(wrong)))
-        if self.recipe.taper and self.recipe.mask == profiles.LENSLET:
-            raise DappledError(
-                "a taper is for the bands of a printed mask; the bands of lenslets fill the whole spectrum"
-            )
-        if not 0 <= self.recipe.taper <= 1:
-            raise DappledError(f"the taper is {self.recipe.taper:g}: it must be a share of the band, from 0 to 1")
-        for path in (self.recipe.white, self.recipe.dark):
-            if path:
-                reading.read_metadata(Path(path))
 
     def decode(
         self,

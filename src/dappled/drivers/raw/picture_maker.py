@@ -21,7 +21,7 @@ from dappled.decode.picture.blocks import MosaicPlane
 from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
 from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of
 from dappled.decode.picture.shadow_fit import ExpectedShadow, shadow_of, told_by
-from dappled.drivers.raw import reading
+from dappled.drivers.raw import reading, recipe_check
 from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
 from dappled.drivers.raw.frame_mosaic import mosaic_of
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
@@ -130,7 +130,7 @@ class PictureMaker:
         """Raise DappledError when the recipe names something that is missing or wrong, or lenslets."""
         if self._recipe.mask == profiles.LENSLET:
             raise DappledError("a picture of full resolution is made behind printed masks, not behind lenslets")
-        Darkroom(self._recipe).check()
+        recipe_check.check(self._recipe)
 
     def picture(
         self,

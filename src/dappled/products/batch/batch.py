@@ -21,7 +21,8 @@ from types import MappingProxyType
 from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
 from dappled.closing import Closing
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw import recipe_check
+from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError, sentence
 from dappled.findings import Finding
@@ -117,7 +118,7 @@ def plan(
             raise DappledError(f"a batch makes {', '.join(KINDS)}, not {kind}")
     if "mcap" in kinds:
         need("mcap_ros2.writer")  # before any frame is decoded
-    Darkroom(recipe).check()
+    recipe_check.check(recipe)
     recipe = _anywhere(recipe)
     if options.terrain is not None:
         options = replace(options, terrain=options.terrain.absolute())

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from dappled.decode.lightfield import LightField
-from dappled.drivers.raw import reading
+from dappled.drivers.raw import reading, recipe_check
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError
@@ -144,7 +144,7 @@ def survey(
     level = level_of(stations, options)
     scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-maps-")))
     decoders = Laboratory(recipe)
-    decoders.darkroom.check()
+    recipe_check.check(recipe)
     if options.terrain is not None:
         check_ground(options.terrain)
     if (planned := _foreseen(flight, decoders, stations, projection, options)) is not None:
