@@ -53,7 +53,23 @@ def _moved(slices: Complexes, periods: tuple[float, float], turn_rad: float, off
     return np.asarray(slices * np.exp(2j * np.pi * cycles), dtype=np.complex64)
 
 
-def _place(slices: Complexes, kappa: float = 1.0) -> MaskPlace:
+def _blending(seed: int) -> Complexes:
+    """Boards at two disparities that blend into each other from left to right, through a smaller stop."""
+    chance = np.random.default_rng(seed)
+    made = np.zeros((len(ORDERS), *SHAPE), dtype=np.complex128)
+    f = np.stack(np.meshgrid(*(np.fft.fftfreq(side, SAMPLE_PX) for side in SHAPE), indexing="ij"), axis=-1)
+    radius = np.maximum(np.hypot(f[..., 0], f[..., 1]), 1 / 400)
+    for number, disparity in enumerate((-6.0, 8.0)):
+        texture = np.fft.ifft2(np.fft.fft2(chance.normal(size=SHAPE)) * radius**-1.3 * (radius > 1 / 400)).real
+        share = 0.5 - 0.5 * np.cos(2 * np.pi * (np.arange(SHAPE[1]) / SHAPE[1] - number / 2))
+        scene = np.fft.fft2(0.3 * (1 + 0.2 * texture / texture.std()) * share)
+        for n, (angular, size) in enumerate(zip(0.85 * ANGULAR, MAGNITUDES, strict=True)):
+            made[n] += np.fft.ifft2(size * np.sinc(angular - disparity * f).prod(axis=-1) * scene)
+    noise = chance.normal(size=(2, *made.shape))
+    return np.asarray(made + 2e-4 * (noise[0] + 1j * noise[1]), dtype=np.complex64)
+
+
+def _place(slices: Complexes, kappa: float = 1.0, *, moved: bool = False) -> MaskPlace:
     carriers = np.array(ORDERS) @ LATTICE.matrix()
     found = PlaceSearch(
         slices,
@@ -63,7 +79,7 @@ def _place(slices: Complexes, kappa: float = 1.0) -> MaskPlace:
         reach=5 * SAMPLE_PX,
         changes=CHANGES,
         steps_px=(SAMPLE_PX, SAMPLE_PX),
-    ).near()
+    ).near(moved=moved)
     assert found is not None
     return found
 
@@ -104,6 +120,14 @@ def test_means_of_patches_place_a_mask_that_has_hardly_moved(periods: tuple[floa
     found = _place(_moved(_slices(6, kappa=0.9), periods, 0.0), kappa=0.9)
     assert found.periods == pytest.approx(periods, abs=0.002)
     assert max(found.periods_sigma) < 0.002
+
+
+@pytest.mark.slow
+def test_what_light_of_several_disparities_adds_to_a_scale_is_in_its_standard_error() -> None:
+    found = [_place(_blending(seed), 0.85, moved=True) for seed in range(6)]
+    assert np.sqrt(np.mean([(one.off / one.off_sigma) ** 2 for one in found])) < 2
+    assert max(abs(one.off) / one.off_sigma for one in found) < 4
+    assert not any(_place(_blending(seed), 0.85).moved for seed in range(6))
 
 
 def test_a_mask_in_its_place_is_left_there() -> None:

@@ -16,6 +16,14 @@ places the mask somewhere, with L(δ) over its mean over all δ as sharply as wi
 all patches but an unknown share, against a place for each, say whether there is a mask, whatever the likelihood's
 scale: without a mask they are 1 on average. A scene without parallax, behind an even square stop at the ideal aperture,
 holds no trace of a mask, and tells none from its absence.
+
+Light whose parts have several disparities and which changes across the frame looks like a mask that moves by a little
+more from patch to patch: what a patch's own gradients scatter by does not tell that error, because patches beside each
+other share it. It shows where no mask can move so: as a stretch along one axis of the sensor with a squeeze along the
+other, e₁, and as a shear, e₂. Such displacements follow the gradient of a smooth thing, u = ∇ψ; where ψ has no
+direction, E ψ_xx² = E ψ_yy² = 3a and E ψ_xx ψ_yy = E ψ_xy² = a, so that the scale (ψ_xx + ψ_yy)/2 has the variance 2a,
+e₁ = (ψ_xx − ψ_yy)/2 and e₂ = ψ_xy have a each, and a turn has none. So e₁² + e₂², less their own variances, is the
+scale's; and a shift is taken to be off by as much as one of them moves the mask at a patch.
 """
 
 from __future__ import annotations
@@ -148,19 +156,19 @@ class MaskPlace:
 
 
 def carrier_changes(lattice: Lattice, sensor: Sensor) -> Floats:
-    """(2, 2, 2) by how many cycles per sensor pixel (rows ky and kx) carriers move for each radian of a small turn of
-    the mask, and for each unit of its scale."""
+    """(4, 2, 2) by how many cycles per sensor pixel (rows ky and kx) carriers move for each radian of a small turn of
+    the mask, for each unit of its scale, and of what no mask does: a stretch along the sensor's rows with a squeeze
+    along its columns, and a shear."""
     to_sensor = np.array([sensor.row_mm, sensor.column_mm])
-    quarter = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    turned = lattice.matrix() @ np.linalg.inv(to_sensor).T @ quarter @ to_sensor.T
-    return np.stack([turned, lattice.matrix()])
+    ways = np.array([[[0, 1], [-1, 0]], [[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]]])
+    return np.asarray(lattice.matrix() @ np.linalg.inv(to_sensor).T @ ways @ to_sensor.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaceSearch:
     """Looks for a mask by `slices` complex64 (K, h, w), the half plane of `model`, DC first.
 
-    `samples_px`, `noise` and `reach` as for `joint_views`. `changes` (2, 2, 2) are `carrier_changes`, `steps_px` is by
+    `samples_px`, `noise` and `reach` as for `joint_views`. `changes` (4, 2, 2) are `carrier_changes`, `steps_px` is by
     how many rows and columns of the sensor a sample steps.
     """
 
@@ -232,7 +240,8 @@ class PlaceSearch:
         return MaskWitness.of(shape, self.model, samples_px=self.samples_px, reach=self.reach, workers=self.workers)
 
     def _away(self, seen: _Textured) -> Floats:
-        """(2, N, 2) by how many periods a turn of one radian, and a scale twice as large, move the mask at patches."""
+        """(4, N, 2) by how many periods a turn of one radian, a scale twice as large, and such a stretch and shear move
+        the mask at patches."""
         middles = seen.corners + SIDE / 2 - np.array(self.slices.shape[1:]) / 2
         return np.asarray((middles * np.array(self.steps_px)) @ self.changes.swapaxes(1, 2))
 
@@ -249,7 +258,7 @@ def _with_contrast(
 ) -> MaskPlace:
     """The place with its shadow's contrast, by patches (N,) of this kind; `away` as in `_Likelihood`."""
     some = slice(None, None, -(-len(seen.patches) // _WITNESSES))
-    at = place.periods + np.tensordot([place.turn_rad, place.off], away[:, some], axes=1)
+    at = place.periods + np.tensordot([place.turn_rad, place.off], away[:2, some], axes=1)
     back = np.exp(-2j * np.pi * seen.frame.model.orders @ at.T).astype(np.complex64)
     spectra = even_spectra(slices, patches, seen.patches[some]) * back
     told = shadow_contrast(seen.frame, seen.spectrum, kind, spectra, mean=seen.mean, reach=reach)
@@ -296,7 +305,7 @@ class MaskWitness:
         whole = self.likeliest(seen, workers)
         # By parallax alone: by its means a mask that has moved by little would be no mask.
         differences, terms = _terms(replace(seen, lit=np.zeros_like(seen.lit)), whole, workers)
-        return _Likelihood(differences, terms, np.zeros((2, len(terms), 2))).nats(np.zeros(4))
+        return _Likelihood(differences, terms, np.zeros((4, len(terms), 2))).nats(np.zeros(4))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -380,7 +389,8 @@ def _tried() -> Floats:
 @dataclass(frozen=True, slots=True, eq=False)
 class _Likelihood:
     """Log likelihood of N patches over moves (ky, kx, radians, scale): `terms` (N, M) at `differences` (M, 2), and by
-    how many periods a turn of one radian and a scale twice as large move the mask at each patch, `changed` (2, N, 2).
+    how many periods a turn of one radian, a scale twice as large, and what no mask does move it at each patch,
+    `changed` (4, N, 2).
     """
 
     differences: NDArray[np.int64]
@@ -396,6 +406,9 @@ class _Likelihood:
                 found, nats = one, more
         if found.any() and nats <= _SEEN_ELSEWHERE * len(self.terms) / _OVERLAP:
             found = np.zeros(4)  # patches that gain, each for a reason of its own
+            nats = self.nats(found)
+        if found.any() and not moved and self._explained(found):
+            found = np.zeros(4)  # patches that gain for a reason that they share
             nats = self.nats(found)
         if nats > SEEN_NATS and (moved or found.any()):  # else off by what is not sure enough to be another place
             found = self._risen(found, np.arange(4))
@@ -432,7 +445,7 @@ class _Likelihood:
         return np.asarray(self._waves(move).real.sum(axis=1))
 
     def _waves(self, move: Floats) -> NDArray[np.complex128]:
-        at = move[:2] + np.tensordot(move[2:], self.changed, axes=1)
+        at = move[:2] + np.tensordot(move[2:], self.changed[:2], axes=1)
         return np.asarray(self.terms * np.exp(2j * np.pi * at @ self.differences.T))
 
     def anywhere(self) -> Floats:
@@ -466,7 +479,8 @@ class _Likelihood:
         return move
 
     def _slopes(self, move: Floats) -> tuple[Floats, Floats]:
-        """(N, 4) gradients of the patches, and (4, 4) the sum's curvature, its sign turned."""
+        """(N, 6) gradients of the patches, by the move and what no mask does, and (6, 6) the sum's curvature, its sign
+        turned."""
         waves = self._waves(move)
         along = np.stack(
             [*np.broadcast_to(self.differences.T[:, None], (2, *waves.shape)), *(self.changed @ self.differences.T)]
@@ -475,8 +489,21 @@ class _Likelihood:
         curvature = np.einsum("anm,bnm,nm->ab", along, along, waves.real) * (2 * np.pi) ** 2
         return gradient, np.asarray(curvature)
 
-    def _sigma(self, move: Floats) -> Floats:
-        """(4,) standard errors, from the scatter of the patches' own gradients: whatever a likelihood's scale."""
+    def _covariance(self, move: Floats) -> Floats:
+        """(4, 4) of a move's errors: by the scatter of the patches' own gradients, whatever a likelihood's scale, and
+        by what all patches show that no mask does."""
         gradient, curvature = self._slopes(move)
-        back = np.linalg.pinv(curvature)
-        return np.asarray(np.sqrt(np.maximum(np.diag(back @ (gradient.T @ gradient) @ back) * _OVERLAP, 0)))
+        back, own = np.linalg.pinv(curvature), np.linalg.pinv(curvature[:4, :4])
+        scattered = _OVERLAP * gradient.T @ gradient
+        strains = (back @ gradient.sum(axis=0))[4:]
+        smooth = max(0.0, float(strains @ strains - np.trace((back @ scattered @ back)[4:, 4:])))
+        shifts = smooth / 2 * float((self.changed[1] ** 2).mean())
+        return np.asarray(own @ scattered[:4, :4] @ own + np.diag([shifts, shifts, 0.0, smooth]))
+
+    def _sigma(self, move: Floats) -> Floats:
+        """(4,) standard errors."""
+        return np.asarray(np.sqrt(np.maximum(np.diag(self._covariance(move)), 0)))
+
+    def _explained(self, move: Floats) -> bool:
+        """Whether its errors explain a move as well as a mask elsewhere does."""
+        return float(move @ np.linalg.pinv(self._covariance(move)) @ move) / 2 <= SEEN_NATS
