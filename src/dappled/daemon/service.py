@@ -37,14 +37,6 @@ from dappled.daemon.flight_control import DecodingParameter, FlightControl
 from dappled.daemon.flight_handover import FlightHandover, RecipeParameters
 from dappled.daemon.health import record as health
 from dappled.daemon.health.logbook import Logbook
-from dappled.daemon.health.record import (
-    DecodingState,
-    KeepingState,
-    ServiceState,
-    ServiceTime,
-    ShootingState,
-    VehicleState,
-)
 from dappled.daemon.health.standing import StandingEvents, StandingFindings
 from dappled.daemon.health.status_text import Alarms
 from dappled.daemon.live_settings import LiveSettings
@@ -504,10 +496,10 @@ class Service:
             *(task.failing for task in self._tasks),
             self._turns.stood_still(self._clock.monotonic_ns()),
         )
-        now = ServiceState(
+        now = health.ServiceState(
             self._settings.now,
-            ServiceTime(utc_ns, self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known),
-            ShootingState(
+            health.ServiceTime(utc_ns, self._clock.monotonic_ns(), self._began_monotonic_ns, navigation.utc.known),
+            health.ShootingState(
                 self.parts.shots,
                 shutter,
                 self.parts.control.lost_triggers,
@@ -516,20 +508,20 @@ class Service:
                 codec.plain(self.parts.parameters.all()),
                 self.parts.overlap.last(utc_ns),
             ),
-            VehicleState(
+            health.VehicleState(
                 self.parts.links.statistics(),
                 navigation.telemetry.statistics(),
                 navigation.telemetry.boot_clock(),
                 navigation.pose_now(),
                 self.parts.autopilot.battery(),
             ),
-            KeepingState(
+            health.KeepingState(
                 self.folder,
                 self.parts.pipeline.statistics(),
                 self.parts.publisher.statistics(),
                 self.parts.writer.frame_bytes,
             ),
-            DecodingState(
+            health.DecodingState(
                 self.parts.decoder is not None,
                 self.parts.pipeline.decode_failures,
                 self.parts.events.misfit,

@@ -15,14 +15,7 @@ import pytest
 from dappled import codec
 from dappled.config.settings import DecodeSettings, MaskSettings, MavlinkSettings, RecordSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.health.record import (
-    DecodingState,
-    KeepingState,
-    ServiceState,
-    ServiceTime,
-    ShootingState,
-    VehicleState,
-)
+from dappled.daemon.health.record import DecodingState
 from dappled.daemon.navigation import BootClock, Telemetry
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.overlap import FrameOverlap
@@ -75,16 +68,16 @@ def record(
     stream = PublisherStatistics({}, {}, 0, 0, 0)
     disk = mock.patch.object(layout, "disk_space", return_value=more.pop("space")) if "space" in more else nullcontext()
     links = [link, *more.pop("links", ())]
-    times = ServiceTime(1_800_000_000 * S, 101 * S, more.pop("began", 90 * S), more.pop("utc_known", True))
+    times = health.ServiceTime(1_800_000_000 * S, 101 * S, more.pop("began", 90 * S), more.pop("utc_known", True))
     with disk:
-        now = ServiceState(
+        now = health.ServiceState(
             settings,
             times,
-            ShootingState(shots, ShutterStatistics(2, 0, 0, 2, 0, 2, None), **of_shots),
-            VehicleState(
+            health.ShootingState(shots, ShutterStatistics(2, 0, 0, 2, 0, 2, None), **of_shots),
+            health.VehicleState(
                 links, telemetry, more.pop("clock", CLOCK), more.pop("vehicle", HERE), more.pop("battery", None)
             ),
-            KeepingState(folder, [stage.statistics()], stream, more.pop("frame_bytes", None)),
+            health.KeepingState(folder, [stage.statistics()], stream, more.pop("frame_bytes", None)),
             more.pop("decoding", DecodingState(True)),
             more.pop("dead", ()),
             more.pop("found", ()),

@@ -19,14 +19,6 @@ from PIL import Image
 from dappled import codec, findings
 from dappled.config.settings import DecodeSettings, MaskSettings, Settings
 from dappled.daemon.health import record as health
-from dappled.daemon.health.record import (
-    DecodingState,
-    KeepingState,
-    ServiceState,
-    ServiceTime,
-    ShootingState,
-    VehicleState,
-)
 from dappled.daemon.health.standing import in_record
 from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline import capture
@@ -480,13 +472,13 @@ DOUBT = finding(Code.CARRIERS_ELSEWHERE, FRAME)
 
 def judged(one: Rig) -> list[str]:
     """The check of decoding, as a person sees it."""
-    now = ServiceState(
+    now = health.ServiceState(
         Settings(mask=MaskSettings("mask-1"), decode=DecodeSettings(calibration="c.toml")),
-        ServiceTime(1, 1, 0),
-        ShootingState(one.pending, one.shutter.statistics()),
-        VehicleState((), Telemetry().statistics()),
-        KeepingState(one.flight.folder.path, one.pipeline.statistics(), PublisherStatistics({}, {}, 0, 0, 0)),
-        DecodingState(True, one.pipeline.decode_failures),
+        health.ServiceTime(1, 1, 0),
+        health.ShootingState(one.pending, one.shutter.statistics()),
+        health.VehicleState((), Telemetry().statistics()),
+        health.KeepingState(one.flight.folder.path, one.pipeline.statistics(), PublisherStatistics({}, {}, 0, 0, 0)),
+        health.DecodingState(True, one.pipeline.decode_failures),
     )
     return [str(told(one)) for one in in_record(health.record(now)) if one.code.startswith(("decode.", "carriers."))]
 
