@@ -124,7 +124,7 @@ def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow) -> tuple[_Equat
         if (finer := equations.lattice()) is None:
             break
         # Where pixels are left out, a block's middle is not where its samples are.
-        equations = equations.moved(finer) if mosaic.valid is None else _Equations.of(means, finer, half, found)
+        equations = equations.moved(finer) if mosaic.valid is None else equations.at_finer(finer, means)
     first = equations.evidence((0,)).shadow(ShadowFrom.FRAME, degree=0)
     assert first is not None
     kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
