@@ -53,45 +53,36 @@ marked **missed** is beyond its limit by more than its noise.
 TAIL = """
 ## Limits that are out of reach
 
-**The textbook's method over ours, 20.** It takes about ten times a real FFT of the frame here, so slices in half of one
-would be needed; their transforms alone are 1.52 of one by operations (13 mm). The method was slower with older NumPy.
+**The textbook's method over ours, 20.** It takes about ten times a real FFT of the frame here, so slices would have
+to take half of one; their transforms alone are 1.52 of one by operations (13 mm).
 
 **A file from the body, 0.6 of a plain copy.** Each piece of a file is written and hashed while the next one comes. Of
-17.6 MB, in ms of a core: the body 12 (a program on these cores), libgphoto2 with TCP 20, hash and writing 19 (a thread
-of their own), the daemon 3; after that fsync and the name 3 to 9, the ledger's row 1 to 8. A plain copy takes 24 to 47,
-17 to 28 of it fsync. The body stands for hardware, so it goes before all others: behind them the transfer waited for
-it 20 to 29 of 48 ms. In turns, beside other work (load 6 on two cores): 0.78, 0.76 and 0.71 of a plain copy so, 0.71
-and 0.62 with the body behind. Over USB 2 the transfer takes half a second, and none of this shows.
+17.6 MB, in ms of a core: the body, a program on these cores, 12; libgphoto2 with TCP 20; hash and writing, in a
+thread of their own, 19; the daemon 3; then fsync and name 3 to 9, the ledger's row 1 to 8. A plain copy takes 24 to
+47, 17 to 28 of it fsync. Beside other work (load 6 on two cores) three runs gave 0.78, 0.76 and 0.71 of a plain copy.
+Over USB 2 the transfer takes half a second, and none of this shows.
 
-**Fire to trigger call, 5 ms, where others work.** A kernel that weighs sessions (`kernel.sched_autogroup_enabled`)
-looks at niceness only inside of one. Beside other sessions' work (load 6 to 9 on two cores) the median of 120 to 150
-shots was 0.4 to 0.7 ms, the 99th percentile between 4 and 100 ms. In the slow shots the camera's process, the body's or
-the caller's waited for a core for about as long (`/proc/PID/schedstat`); in a trace of 220 shots no read of
-libgphoto2's waited 30 ms, so that no delayed acknowledgement is in it. The service's unit has CPUWeight=400 against
-this.
+**Fire to trigger call, 5 ms, where others work.** Beside other sessions' work (load 6 to 9 on two cores,
+`kernel.sched_autogroup_enabled`, which makes niceness count inside a session only) the median of 120 to 150 shots was
+0.4 to 0.7 ms, the 99th percentile 4 to 100 ms: the processes waited that long for a core. The service's unit has
+CPUWeight=400 against this.
 
 **Joint views, 0.5 CPU seconds a megapixel.** Terrain of 10.24 MP, the second decode of a process, one thread, beside
-other work (load 5.7), one after the other: 14.7 CPU seconds before views were made by real numbers, 9.8 now, 0.67 of
-what it took (1.43 and 0.95 a megapixel there; a calm machine takes less for both). No part stands out. Solving patches
-with any disparity takes a quarter, and at rest another one; likelihoods of kinds a sixth, the depth map and the mask's
-place a twelfth each. By operation: products of small matrices a tenth, FFTs 4 %.
+other work (load 5.7): 0.95 a megapixel. Patches with any disparity take a quarter, patches at rest another one,
+likelihoods of kinds a sixth, depth map and the mask's place a twelfth each.
 
-**Joint views in 400 MB for 10 MP.** A decode of 10.24 MP to 5 × 5 views holds 390 MB at most (allocations of Python,
-one worker; 611 before views were made by real numbers, and spectra when they are asked for). Its frame's and its
-patches' shares grow with its size, its tables of disparities and folded detail don't.
+**Joint views in 400 MB for 10 MP.** A decode of 10.24 MP to 5 × 5 views allocates 390 MB at most in Python, with one
+worker.
 
 ## What is not measured
 
-**LFToolbox.** It is MATLAB code, and MATLAB was not at hand: no time of it is given. One that was measured elsewhere
-would be of another machine and another run. The quality of its views is compared with ours in
+**LFToolbox** needs MATLAB, which was not at hand. The quality of its views is compared in
 [decoding.md](decoding.md#quality-and-speed).
 
-**A Raspberry Pi.** None was measured: what a frame takes there is unknown. Known is what one of 10 MP takes on the
-machine above, from the body to published slices{cpu_s}, and the count of operations, which no machine
-changes: n log₂ n for each transform that 13 slices of a frame of 2776 × 3688 need, over that of one real FFT of the
-padded frame, is 1.67 at 12 mm, 1.52 at 13 mm and 0.74 at 33 mm (`slices_…_over_rfft2_operations` of
-`python benchmarks/decode.py`). `make bench` on the Pi prints its figures; `python benchmarks/table.py onboard decode`
-only those of a frame on board.
+**A Raspberry Pi.** None was measured. Known is what a frame of 10 MP takes on the machine above, from the body to
+published slices{cpu_s}, and the count of operations, n log₂ n for each transform: 13 slices of a frame of 2776 × 3688
+need 1.67 (12 mm), 1.52 (13 mm) and 0.74 (33 mm) of one real FFT of the padded frame (`slices_…_over_rfft2_operations`
+of `python benchmarks/decode.py`). `python benchmarks/table.py onboard decode` on the Pi prints its figures.
 """
 MOST_LOAD = 0.5  # of each core
 ONBOARD = "onboard.cpu_s_a_frame"
