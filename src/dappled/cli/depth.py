@@ -16,6 +16,7 @@ from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, flag, option
 from dappled.decode import DecodeError
 from dappled.errors import CallError, counted
+from dappled.findings import named, text
 
 if not words_only:
     import numpy as np
@@ -120,17 +121,18 @@ class MeasureDepth(Overwriting, FieldOrFlight, Verb):
                 placing.focus,
             )
             made = placing.placed(self.flight, output, stack, watch=seen.measure)
-            for _, why in seen.left:
-                output.remark(why)
+            for one in seen.left:
+                output.remark(str(named(one)))
             found = frame_terrain.of(made, seen.found, output.show, cell_m=self.cell)
             for path in self.output:
                 if path.suffix.lower() in _RASTERS:
                     frame_terrain.write_raster(made, found, path)
                 else:
                     prints.save(path, _picture(found.height_m, "m"))
-        lines = frame_terrain.words(made, found)
-        values = frame_terrain.summary(made, found) | {"notes": lines[1:], "written": written}
-        return Report(values, [*lines, *(f"written: {path}" for path in written)], findings=made.doubts)
+        told = frame_terrain.told(made, found)
+        values = frame_terrain.summary(made, found) | {"notes": codec.plain(told[1:]), "written": written}
+        lines = [*(str(text(one)) for one in told), *(f"written: {path}" for path in written)]
+        return Report(values, lines, findings=made.doubts)
 
     def _together(self, made: Survey, output: Output) -> Report:
         """Heights of a flight where all of its frames agree."""

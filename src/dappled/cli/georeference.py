@@ -19,6 +19,7 @@ from dappled.cli.placing import Refining
 from dappled.cli.table import words_only
 from dappled.cli.verb import Doubtable, Output, Overwriting, Report, Verb, argument, flag, option
 from dappled.errors import CallError, DappledError, counted
+from dappled.findings import Code, Finding, Subject, finding, named, text
 
 if not words_only:
     from dappled.flight import layout
@@ -41,6 +42,7 @@ _FILES = {
     "difference": ("difference.tif", "height-difference.tif"),
 }
 KINDS = tuple(_FILES)
+_MAP = Subject("map")
 _EACH = {"kmz": ".kmz", "cog": ".tif"}
 
 
@@ -109,12 +111,12 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         flight = layout.open_folder(self.flight).path
         folder = self.output or flight / "maps"
         with ExitStack() as stack:
-            missing: list[str] = []  # a sentence for each product that could not be made
+            missing: list[Finding] = []  # what could not be made
             depths = None
             if "frame-terrain" in self.kinds:
                 scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="dappled-depths-")))
                 depths = FrameDepths(scratch, lambda found: found.depth(), self.focus)
-            told: list[str] = []  # what is missing that poses alone told, before the first frame was decoded
+            told: list[Finding] = []  # what is missing that poses alone told, before the first frame was decoded
             foresee = partial(self._foresee, told, output)
             watch = None if depths is None else depths.measure
             made = self.survey(flight, output, stack, missing, watch=watch, foresee=foresee)
@@ -127,10 +129,10 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                 try:
                     fused = frame_terrain.of(made, depths.found, output.show, cell_m=self.cell)
                     files.append(frame_terrain.write_raster(made, fused, folder / "terrain-frames.tif"))
-                    made = replace(made, notes=(*made.notes, *frame_terrain.words(made, fused)))
+                    made = replace(made, notes=(*made.notes, *frame_terrain.told(made, fused)))
                 except FrameTerrainError as error:
-                    missing.append(str(error))
-                made = replace(made, notes=(*made.notes, *(why for _, why in depths.left)))
+                    missing.append(_no_heights(error))
+                made = replace(made, notes=(*made.notes, *depths.left))
             terrain_of = None
             if "terrain" in self.kinds and not told:
                 try:
@@ -139,13 +141,13 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                     files.append(terrain.write_points(made, terrain_of, folder / "terrain.las"))
                     files.append(terrain.write_ground(made, terrain_of, folder / "ground.tif"))
                 except HyperstereoError as error:
-                    missing.append(str(error))
+                    missing.append(_no_heights(error))
             if self.against:
                 files += self._changes(made, terrain_of, folder, output, missing)
         made = replace(made, notes=(*made.notes, *missing))
         report = map_files.write_report(made, folder, files)
-        for why in (*(why for _, why in made.left), *(why for why in made.notes if why not in told)):
-            output.remark(why)
+        for said in (*map(text, made.left), *(named(one, _MAP) for one in made.notes if one not in told)):
+            output.remark(str(said))
         frames = counted(len(made.photographs), "frame")
         lines = [f"{frames} on {made.projection.name}, {made.gsd_m:g} m per cell, {made.ground.name}"]
         lines += made.lens.words() if made.lens is not None else ()
@@ -156,7 +158,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
             failed=bool(missing),
         )
 
-    def _foresee(self, told: list[str], output: Output, planned: Survey) -> None:
+    def _foresee(self, told: list[Finding], output: Output, planned: Survey) -> None:
         """Say what will be missing by poses alone, and add it to `told`. Raises HyperstereoError where that is all, and
         MapError for maps that the chosen cells make too large: how fine the frames are, only their files say."""
         if self.gsd is not None and "kmz" in self.kinds:
@@ -172,7 +174,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         except HyperstereoError as error:
             if self.kinds == ("terrain",):
                 raise
-            told.append(str(error))
+            told.append(_no_heights(error))
             output.remark(str(error))
 
     def _heights(self, made: Survey, output: Output) -> TerrainModel:
@@ -217,7 +219,7 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
         return replace(self, crs=made.projection.name, frames=None, gcp=None, solve_lens=None, gsd=same)
 
     def _changes(
-        self, made: Survey, heights: TerrainModel | None, folder: Path, output: Output, missing: list[str]
+        self, made: Survey, heights: TerrainModel | None, folder: Path, output: Output, missing: list[Finding]
     ) -> list[Path]:
         """Write the change up to each flight of --against and, of several, the change over time."""
         files: list[Path] = []
@@ -239,19 +241,23 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                         path = folder / f"height-difference{tail}.tif"
                         files.append(difference.write(made, other, raised[-1], path, "m"))
                 except DappledError as error:
-                    missing.append(f"no difference to {flight}: {error}")
+                    missing.append(finding(Code.MAP_NO_DIFFERENCE, _MAP, flight=str(flight), why=str(error)))
         kinds = [("trend.tif", pictures, "share of brightness")] if self._several else []
         kinds += [("height-trend.tif", raised, "m")] if self._several and heights is not None else []
         for name, changes, unit in kinds:
             if len(changes) < len(self.against):
-                missing.append(f"no {name}: not every flight could be compared")
+                missing.append(finding(Code.MAP_NO_TREND, _MAP, name=name, why="not every flight could be compared"))
                 continue
             try:
                 made_trend = difference.over_time(times, changes)
                 files.append(difference.write_trend(made, made_trend, names, folder / name, unit))
             except DifferenceError as error:
-                missing.append(f"no {name}: {error}")
+                missing.append(finding(Code.MAP_NO_TREND, _MAP, name=name, why=str(error)))
         return files
+
+
+def _no_heights(error: DappledError) -> Finding:
+    return finding(Code.MAP_NO_HEIGHTS, _MAP, why=str(error))
 
 
 def _camera_of(flight: Path) -> str:

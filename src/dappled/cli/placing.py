@@ -17,6 +17,7 @@ from dappled.cli.verb import Doubtable, Output, argument, flag, of_setting, opti
 from dappled.config.settings import PoseSettings
 from dappled.decode.geometry import Vector3
 from dappled.errors import CallError, DappledError
+from dappled.findings import Code, Finding, Subject, finding, text
 
 if not words_only:
     from dappled.config import profiles
@@ -201,7 +202,7 @@ class Refining(Several, Placing):
         flight: Path,
         output: Output,
         stack: ExitStack,
-        missing: list[str],
+        missing: list[Finding],
         *,
         watch: Watch | None = None,
         foresee: Callable[[Survey], None] = lambda _: None,
@@ -227,7 +228,7 @@ class Refining(Several, Placing):
             try:
                 return self._refined(made, base, output)
             except BaseMapError as error:
-                missing.append(f"not refined against a base map: {error}")
+                missing.append(finding(Code.MAP_UNREFINED, Subject("map"), why=str(error)))
         if "neighbours" in self.refine or self.gcp is not None:
             return self._refined(made, None, output)
         return made
@@ -243,8 +244,8 @@ class Refining(Several, Placing):
     ) -> Survey:
         """A flight's frames on the map, for verbs that make no map. Raises DappledError."""
         made = self.survey(flight, output, stack, [], watch=watch, foresee=foresee)
-        for _, why in made.left:
-            output.remark(why)
+        for one in made.left:
+            output.remark(str(text(one)))
         return made
 
     def _refined(self, made: Survey, base: Path | None, output: Output) -> Survey:

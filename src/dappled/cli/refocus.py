@@ -17,6 +17,7 @@ from dappled.cli.placing import FieldOrFlight
 from dappled.cli.table import words_only
 from dappled.cli.verb import Output, Overwriting, Report, Verb, flag, option
 from dappled.errors import CallError
+from dappled.findings import text
 
 if not words_only:
     import numpy as np
@@ -217,8 +218,8 @@ class RefocusLightField(Overwriting, FieldOrFlight, Verb):
         ]
         lines: list[str] = []
         for height, one in zip(heights, found, strict=True):
-            first, *others = synthetic_aperture.words(one)
-            lines += [f"{height:g} m: {first}", *others]
+            first, *others = map(text, synthetic_aperture.told(one))
+            lines += [f"{height:g} m: {first}", *map(str, others)]
         return Report(
             {"file": str(self.output), "planes": planes}, [*lines, f"written: {self.output}"], findings=made.doubts
         )

@@ -17,7 +17,7 @@ import pytest
 import rasterio
 from numpy.typing import NDArray
 
-from dappled import findings
+from dappled import codec, findings
 from dappled.cli import main
 from dappled.cli.rendering import TerminalOutput
 from dappled.clock import RecordedClock
@@ -30,7 +30,7 @@ from dappled.drivers.raw import picture_maker
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.picture_maker import MadePicture, PictureMaker
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Code, Subject, finding
+from dappled.findings import FRAME, Code, Finding, Subject, finding, text
 from dappled.flight import Result, Tag, TimeSource, recording
 from dappled.mocks.autopilot.path import FlightPath, TruePose
 from dappled.mocks.scene.masked_camera import Truth, reference_camera
@@ -247,7 +247,7 @@ def test_a_control_point_of_a_frame_that_is_left_out_is_noted(
     points.write_text("\n".join(["name,frame,column,row,latitude,longitude,altitude", *rows]) + "\n")
     more = ["--as", "footprints", "--gcp", str(points), "--frames"]
     assert main(words(short_flight, tmp_path / "maps", *more, "0")) == 0
-    assert "control point p1 is left out: frame 000001 is not on the map" in capsys.readouterr().err
+    assert "control point p1: it is left out: frame 000001 is not on the map" in capsys.readouterr().err
     points.write_text("\n".join(["name,frame,column,row,latitude,longitude,altitude", rows[1]]) + "\n")
     assert main(words(short_flight, tmp_path / "none", *more, "0")) == 1
     assert "no control point is on a frame that is mapped: the first, p1" in capsys.readouterr().err
@@ -263,8 +263,8 @@ def test_a_base_map_elsewhere_leaves_the_recorded_poses(short_flight: Flown, tmp
     more = ["--as", "footprints", "--frames", "0", "--refine", str(elsewhere)]
     assert main(words(short_flight, tmp_path / "maps", *more)) == 1
     report = json.loads((tmp_path / "maps" / "report.json").read_text())
-    (why,) = report["notes"]
-    assert why.startswith(f"not refined against a base map: the base map {elsewhere} lies elsewhere")
+    (note,) = codec.read(tuple[Finding, ...], report["notes"])
+    assert str(text(note)).startswith(f"not refined against a base map: the base map {elsewhere} lies elsewhere")
     assert report["frames"] == [{"name": "000000"}]
     assert report["files"] == ["footprints.geojson"]
 
@@ -408,8 +408,8 @@ def test_what_cant_be_compared_leaves_the_maps_and_a_report(
     assert main(words(short_flight, tmp_path / "maps", *more)) == 1
     report = json.loads((tmp_path / "maps" / "report.json").read_text())
     assert report["files"] == ["mosaic.tif", "terrain.tif", "terrain.las", "ground.tif", "difference.tif"]
-    (why,) = report["notes"]
-    assert why.startswith(f"no difference to {later_flight}: no two frames")
+    (note,) = codec.read(tuple[Finding, ...], report["notes"])
+    assert str(text(note)).startswith(f"no difference to {later_flight}: no two frames")
 
 
 @pytest.mark.long
@@ -469,7 +469,7 @@ def test_frames_that_cant_be_placed_are_named_and_the_flight_goes_on(tmp_path: P
     assert main(words(broken, tmp_path / "maps", "--as", "footprints")) == 0
     report = json.loads((tmp_path / "maps" / "report.json").read_text())
     assert [frame["name"] for frame in report["frames"]] == ["000004"]
-    why = {row["name"]: row["why"] for row in report["left_out"]}
+    why = {one.subject.which: str(text(one)) for one in codec.read(tuple[Finding, ...], report["left_out"])}
     assert "never tagged" in why["frames/000000.dng"]
     assert "no position is known" in why["frames/000001.dng"]
     assert "looks above the horizon" in why["000002"]

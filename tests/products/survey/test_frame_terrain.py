@@ -15,6 +15,7 @@ from scipy import ndimage
 
 from dappled.cli import main
 from dappled.decode.depth import Ranging
+from dappled.findings import Code, text
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye
 from dappled.products.maps.georeference import Survey
@@ -164,11 +165,11 @@ def test_a_focus_that_was_told_wrong_is_doubted_and_found() -> None:
     depth = measured(made, 1e-4)["000000"]
     shifted = replace(depth, inverse_per_m=depth.inverse_per_m - np.float32(1 / 200))  # the focus was at 200 m
     found = frame_terrain.of(made, {"000000": shifted}, quiet)
-    said = frame_terrain.words(made, found)
-    assert len(said) == 2
-    assert "from the given ground as a whole" in said[1]
+    _, doubt = frame_terrain.told(made, found)
+    assert doubt.code is Code.HEIGHTS_OFF_FOCUS
+    assert "from the given ground as a whole" in str(text(doubt))
     assert found.focus_m == pytest.approx(200, rel=0.03)
-    assert len(frame_terrain.words(made, frame_terrain.of(made, {"000000": depth}, quiet))) == 1
+    assert len(frame_terrain.told(made, frame_terrain.of(made, {"000000": depth}, quiet))) == 1
 
 
 def test_frames_are_fused_by_their_sigmas() -> None:

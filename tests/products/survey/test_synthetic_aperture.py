@@ -16,6 +16,7 @@ from PIL import Image
 from dappled.cli import main
 from dappled.cli.placing import Refining
 from dappled.errors import DappledError
+from dappled.findings import text
 from dappled.products.maps.ground import Flat
 from dappled.products.survey import synthetic_aperture
 from dappled.products.survey.synthetic_aperture import RefocusedGround
@@ -81,10 +82,10 @@ def test_the_blur_of_poses_is_told_and_doubted() -> None:
     flight = seen.flown(LINE[:3])
     made = synthetic_aperture.refocus(flight, quiet)
     assert made.pose_blur_m == pytest.approx(math.hypot(0.05, 30 * 0.001), rel=0.01)
-    assert len(synthetic_aperture.words(made)) == 1
+    assert len(synthetic_aperture.told(made)) == 1
     loose = replace(flight, photographs=tuple(replace(one, position_sigma_m=0.5) for one in flight.photographs))
-    said = synthetic_aperture.words(synthetic_aperture.refocus(loose, quiet))
-    assert "the poses are known to 0.5 m on the ground only" in said[1]
+    _, doubt = synthetic_aperture.told(synthetic_aperture.refocus(loose, quiet))
+    assert "the poses are known to 0.5 m on the ground only" in str(text(doubt))
     facts = {one.name: {"refined": True, "residual_px": 0.5} for one in flight.photographs}
     refined = synthetic_aperture.refocus(replace(loose, facts=facts), quiet)
     assert refined.pose_blur_m == pytest.approx(0.5 * flight.photographs[0].eye.gsd_m(0.0), rel=0.02)

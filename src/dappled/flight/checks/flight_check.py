@@ -20,7 +20,6 @@ from dappled.flight.checks import chain_check, place_check, seal_check, telemetr
 from dappled.flight.checks.chain_check import ChainFindings
 from dappled.flight.checks.place_check import PlaceFindings
 from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
-from dappled.flight.errors import FlightError
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
 from dappled.flight.pruning import Removed
@@ -69,22 +68,23 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
     sealed = SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), (), ())
     with _examining("flight.toml", found):
         layout.read_facts(folder)
-    place = PlaceFindings((), (), (), (), None)
+    place = PlaceFindings()
     closed, recorded_as = False, ""
     with _examining("the folder", found):
         place = place_check.look(folder)
-    with _examining("the ledger", found):
-        if place.rollback is not None:
-            raise FlightError(place.rollback)
-        before = LedgerBytes.of(folder)
-        chained = _chained(folder, found)
-        with _examining("the flight", found), LedgerReader.open(folder.ledger) as ledger:
-            closed, recorded_as = "closed_utc_ns" in ledger.facts(), seals.of_flight(ledger.facts())
-            _compare(folder, ledger, counts, found)
-            with _examining("the telemetry", found):
-                found += telemetry_check.compare(folder.telemetry, chained.links)
-            with _examining("the seals", found):
-                sealed = seal_check.compare(folder, ledger, chained.links, before, key)
+    if place.rollback is not None:
+        found.append(place.rollback)
+    else:
+        with _examining("the ledger", found):
+            before = LedgerBytes.of(folder)
+            chained = _chained(folder, found)
+            with _examining("the flight", found), LedgerReader.open(folder.ledger) as ledger:
+                closed, recorded_as = "closed_utc_ns" in ledger.facts(), seals.of_flight(ledger.facts())
+                _compare(folder, ledger, counts, found)
+                with _examining("the telemetry", found):
+                    found += telemetry_check.compare(folder.telemetry, chained.links)
+                with _examining("the seals", found):
+                    sealed = seal_check.compare(folder, ledger, chained.links, before, key)
     found += [*sealed.problems, *sealed.notes]
     found += place_check.compare(place, folder, recorded_as, closed=closed, at_work=sealed.unsealed > 0)
     return CheckReport(

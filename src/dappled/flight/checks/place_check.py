@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled import durable
-from dappled.errors import counted
 from dappled.findings import Code, Finding, Level, Subject, finding
 from dappled.flight import layout
 from dappled.flight.layout import FlightFolder
@@ -23,14 +22,14 @@ _RECORDED = ("frames", "inputs")  # folders in which only dappled writes
 
 @dataclass(frozen=True, slots=True)
 class PlaceFindings:
-    """What stands in a flight folder apart from ordinary files, as it was before the ledger was opened: (name relative
-    to the flight, sentence). `rollback` says why the ledger can't be opened without being changed."""
+    """What stands in a flight folder apart from ordinary files, as it was before the ledger was opened. `rollback` says
+    why the ledger can't be opened without being changed."""
 
-    unknown: tuple[Finding, ...]
-    half_written: tuple[Finding, ...]
-    empty: tuple[Finding, ...]
-    left_by_readers: tuple[Finding, ...]
-    rollback: str | None
+    unknown: tuple[Finding, ...] = ()
+    half_written: tuple[Finding, ...] = ()
+    empty: tuple[Finding, ...] = ()
+    left_by_readers: tuple[Finding, ...] = ()
+    rollback: Finding | None = None
 
 
 def look(folder: FlightFolder) -> PlaceFindings:
@@ -51,10 +50,7 @@ def look(folder: FlightFolder) -> PlaceFindings:
     beside = {suffix: folder.ledger.with_name(folder.ledger.name + suffix) for suffix in (*_OF_READERS, _ROLLBACK)}
     rollback = None
     if beside[_ROLLBACK].is_file() and (size := beside[_ROLLBACK].stat().st_size):
-        rollback = (
-            f"{beside[_ROLLBACK].name} ({counted(size, 'byte')}) stands beside the ledger, where dappled leaves none: "
-            "SQLite would change the ledger by it, so the ledger was not opened; move it away, and check again"
-        )
+        rollback = finding(Code.LEDGER_ROLLBACK, Subject("ledger"), name=beside[_ROLLBACK].name, bytes=size)
     left = tuple(
         _found(Code.FLIGHT_LEFT_OPEN, path.name)
         for suffix, path in beside.items()

@@ -24,7 +24,7 @@ from dappled.products.maps.earth import EarthError, Projection, utm
 from dappled.products.maps.eye import Eye, EyeError
 from dappled.products.maps.ground import Flat, Ground
 from dappled.products.maps.map_grid import MapError, MapGrid, around, footprint
-from dappled.products.maps.photographs import PhotographError, Station, home_m, lens_of, stations
+from dappled.products.maps.photographs import PhotographError, Station, home_m, lens_of, stations, unplaced
 from dappled.products.mounting import Mounting
 
 CELLS = 500  # on the longer side, where no cell is asked for
@@ -101,8 +101,7 @@ def of_flight(
         results = ledger.results()
     states = {index: one.verdict.state for index, one in results.items() if one.verdict is not None}
     mounting = Mounting.of(layout.read_facts(folder))
-    placed, unplaced = stations(flight, mounting)
-    left = [finding(Code.FRAME_UNPLACED, Subject("frame", name), why=why) for name, why in unplaced]
+    placed, left = stations(flight, mounting)
 
     def keep(doubt: Callable[[Station], Finding | None]) -> None:
         found = [(one, doubt(one)) for one in placed]
@@ -126,7 +125,7 @@ def of_flight(
                 sensors[one.tag.camera] = _sensor(one, folder.path)
             eyes[one.name] = eye_of(one, projection, sensors[one.tag.camera])
         except (PhotographError, EyeError, EarthError) as error:
-            left.append(finding(Code.FRAME_UNPLACED, _of(one), why=str(error)))
+            left.append(unplaced(one.frame.name, error))
     placed = [one for one in placed if one.name in eyes]
     if placed:
         corners = [] if area is None else area.on_map(projection)

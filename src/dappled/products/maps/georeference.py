@@ -18,7 +18,7 @@ from dappled.drivers.raw import reading, recipe_check
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError
-from dappled.findings import Finding, text
+from dappled.findings import Finding, Subject, text
 from dappled.flight import FlightFolder
 from dappled.flight.flight_mask import doubts_over
 from dappled.products import processes
@@ -70,8 +70,8 @@ class Options:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """A flight's photographs on one map. `left` names the frames that are not among them, with the reason; `lens` is
-    the one that the flight told, where it was asked."""
+    """A flight's photographs on one map. `left` says why other frames are not among them, `notes` what else could not
+    be done; `lens` is the one that the flight told, where it was asked."""
 
     flight: str
     photographs: tuple[Photograph, ...]
@@ -79,8 +79,8 @@ class Survey:
     ground: Ground
     gsd_m: float
     focus_m: float
-    left: tuple[tuple[str, str], ...]
-    notes: tuple[str, ...] = ()
+    left: tuple[Finding, ...]
+    notes: tuple[Finding, ...] = ()
     facts: dict[str, dict[str, Any]] = field(default_factory=dict)
     lens: FlightLens | None = None
 
@@ -135,9 +135,9 @@ def survey(
     files = exposures(flight, [(one.frame, one.tag) for one in stations], **lens)
     if options.frames is not None:
         stations = [one for one in stations if one.frame.index in options.frames]
-        left = [pair for pair in left if int(Path(pair[0]).stem) in options.frames]
+        left = [one for one in left if int(Path(str(one.subject.which)).stem) in options.frames]
     if not stations:
-        raise DappledError(f"no frame of {flight} can be put on a map: " + (left[0][1] if left else "it has none"))
+        raise DappledError(f"no frame of {flight} can be put on a map: {text(left[0]) if left else 'it has none'}")
     first = stations[0].camera
     projection = Projection(options.crs or utm(first.latitude_deg, first.longitude_deg))
     projection.at(first.latitude_deg, first.longitude_deg)
@@ -161,7 +161,7 @@ def survey(
                 progress("develop", number, len(stations))
                 one = next(made)
                 if isinstance(one, DappledError):
-                    left.append((station.frame.name, str(one)))
+                    left.append(photographs.unplaced(station.frame.name, one))
                 else:
                     taken.append(_from_shelf(one, scratch))
     progress("develop", len(stations), len(stations))
@@ -254,7 +254,7 @@ def _foreseen(
 def on_ground(
     flight: str,
     taken: Sequence[Photograph],
-    left: Sequence[tuple[str, str]],
+    left: Sequence[Finding],
     *,
     projection: Projection,
     level_m: float,
@@ -275,9 +275,9 @@ def on_ground(
                 map_grid.footprint(one.eye, ground)
                 held.append(one)
             except EyeError as error:
-                out.append((one.name, str(error)))
+                out.append(photographs.unplaced(one.name, error))
             except MapError as error:
-                out.append((one.name, f"frame {one.name}: {error}"))
+                out.append(photographs.unplaced(one.name, f"frame {one.name}: {error}"))
         return held
 
     ground: Ground = Flat(level_m)
@@ -286,7 +286,7 @@ def on_ground(
         ground = _terrain(options.terrain, kept, projection, level_m, options.terrain_geoid)
         kept = sieve(kept, ground)
     if not kept:
-        raise DappledError(f"no frame of {flight} can be put on a map: {out[-1][1] if out else 'it has none'}")
+        raise DappledError(f"no frame of {flight} can be put on a map: {text(out[-1]) if out else 'it has none'}")
     gsd_m = options.gsd_m or _two_digits(min(one.eye.gsd_m(level_shown(ground, one.eye)) for one in kept))
     return Survey(flight, tuple(kept), projection, ground, gsd_m, options.focus_m, tuple(out))
 
@@ -321,7 +321,7 @@ def refined(
         one.name: {**made.facts.get(one.name, {}), **said.facts()} for one, said in zip(photos, judged, strict=True)
     }
     kept = [
-        f"frame {one.name} keeps its recorded pose: {text(said.why)}"
+        replace(said.why, subject=Subject("frame", one.name))
         for one, said in zip(photos, judged, strict=True)
         if said.why is not None
     ]

@@ -20,7 +20,7 @@ from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Finding
+from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye, intrinsics, through
@@ -146,19 +146,24 @@ class Photograph:
         ]
 
 
-def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[tuple[str, str]]]:
-    """A flight's frames that have a full pose, in order, and (name, sentence) of the others.
+def unplaced(name: str, why: object) -> Finding:
+    """Why a frame is not on the map."""
+    return finding(Code.FRAME_UNPLACED, Subject("frame", name), why=str(why))
+
+
+def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[Finding]]:
+    """A flight's frames that have a full pose, in order, and why the others have none.
 
     Raises FlightError.
     """
     frames, tags = recorded(flight)
     placed: list[Station] = []
-    left: list[tuple[str, str]] = []
+    left: list[Finding] = []
     for frame in frames:
         try:
             placed.append(station(frame, tags.get(frame.index), mounting))
         except PhotographError as error:
-            left.append((frame.name, str(error)))
+            left.append(unplaced(frame.name, error))
     return placed, left
 
 

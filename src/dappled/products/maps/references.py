@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats
 from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.products import csv_tables
 from dappled.products.extras import need
 from dappled.products.maps.earth import Projection, touch
@@ -139,8 +140,8 @@ def read_control_points(path: Path, projection: Projection) -> list[ControlPoint
 
 def control_of(
     path: Path | None, projection: Projection, photographs: Sequence[Photograph]
-) -> tuple[list[ControlPoint], list[str]]:
-    """The points of a file on these frames, and a sentence for each other point.
+) -> tuple[list[ControlPoint], list[Finding]]:
+    """The points of a file on these frames, and which others are left out.
 
     Raises DappledError where none is left, and as `read_control_points`."""
     points = [] if path is None else read_control_points(path, projection)
@@ -151,4 +152,4 @@ def control_of(
             f"no control point is on a frame that is mapped: the first, {points[0].name}, names frame {points[0].frame}"
         )
     others = [point for point in points if point.frame not in frames]
-    return kept, [f"control point {one.name} is left out: frame {one.frame} is not on the map" for one in others]
+    return kept, [finding(Code.CONTROL_UNMAPPED, Subject("control point", one.name), frame=one.frame) for one in others]

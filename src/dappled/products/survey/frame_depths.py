@@ -13,6 +13,7 @@ from dappled.decode.array_types import Singles
 from dappled.decode.depth import DepthMap, Ranging
 from dappled.decode.lightfield import LightField
 from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.products.maps.photographs import Photograph
 from dappled.products.opened import OpenedLightField, OpenError
 
@@ -51,14 +52,14 @@ class FrameDepths:
     """Collects the inverse distances of frames as they are decoded; arrays lie in files in the folder `scratch`.
 
     `focus_m` is where the lens was focused; a calibration with targets replaces it. `left` names the frames without
-    distances, each with a sentence.
+    distances.
     """
 
     scratch: Path
     estimate: Estimate
     focus_m: float
     found: dict[str, InverseDepth] = field(default_factory=dict)
-    left: list[tuple[str, str]] = field(default_factory=list)
+    left: list[Finding] = field(default_factory=list)
 
     def measure(self, one: Photograph, decoded: LightField) -> None:
         """Measure one decoded frame; one that has no distances is left out and named."""
@@ -66,7 +67,7 @@ class FrameDepths:
         try:
             made = of_field(opened, self.estimate(opened))
         except DappledError as error:
-            self.left.append((one.name, f"no heights from frame {one.name} by itself: {error}"))
+            self.left.append(finding(Code.FRAME_NO_HEIGHTS, Subject("frame", one.name), why=str(error)))
             return
         for kind, values in zip(_KINDS, (made.inverse_per_m, made.sigma_per_m), strict=True):
             np.save(self.scratch / f"{one.name}-{kind}.npy", values)

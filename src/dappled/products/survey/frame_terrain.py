@@ -20,7 +20,8 @@ from scipy import ndimage
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.depth.depth_map import CONTRAST_WINDOW
-from dappled.errors import DappledError, counted
+from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.products.maps import cog, map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, level_shown
@@ -156,23 +157,15 @@ def summary(made: Survey, terrain: FrameTerrain) -> dict[str, Any]:
     }
 
 
-def words(made: Survey, terrain: FrameTerrain) -> list[str]:
-    """What the heights are worth: a sentence on Eq 5's limit, and a doubt where their level can't be right."""
-    facts = summary(made, terrain)
-    single, fused = facts["single_sigma_m"], facts["sigma_m"]
-    line = (
-        f"single frames, {facts['above_ground_m']:.3g} m above ground: one frame tells a height to ±{single:.2g} m "
-        f"(Eq 5), relief from {3 * single:.2g} m on (3 σ); {counted(round(facts['frames']), 'frame')} to "
-        f"±{fused:.2g} m, all in common to ±{terrain.level_sigma_m:.2g} m; {facts['known']:.0%} of the map known"
-    )
-    said = [line]
-    limit = _LEVEL_SIGMAS * math.hypot(terrain.level_sigma_m, made.ground.sigma_m, fused)
-    if abs(terrain.level_m) > limit:
-        better = f"; a focus at {terrain.focus_m:.3g} m would put them on it (--focus)"
-        said.append(
-            f"the heights of single frames lie {terrain.level_m:+.3g} m from the given ground as a whole, which their "
-            f"σ doesn't explain: distances are by {terrain.source}{better if math.isfinite(terrain.focus_m) else ''}"
-        )
+def told(made: Survey, terrain: FrameTerrain) -> list[Finding]:
+    """What the heights are worth by Eq 5, and a doubt where their level can't be right."""
+    facts, about = summary(made, terrain), Subject("heights")
+    worth = facts | {"frames": round(facts["frames"]), "relief_m": 3 * facts["single_sigma_m"]}
+    said = [finding(Code.HEIGHTS_OF_FRAMES, about, **worth)]
+    if abs(terrain.level_m) > _LEVEL_SIGMAS * math.hypot(terrain.level_sigma_m, made.ground.sigma_m, facts["sigma_m"]):
+        code = Code.HEIGHTS_OFF_FOCUS if math.isfinite(terrain.focus_m) else Code.HEIGHTS_OFF
+        facts = {"off_m": terrain.level_m, "distances_from": terrain.source, "focus_m": terrain.focus_m}
+        said.append(finding(code, about, **facts))
     return said
 
 

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from dappled.decode.array_types import Floats, Singles
-from dappled.errors import DappledError, counted
+from dappled.errors import DappledError
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.products.maps import cog, map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, Ground, Raster, level_shown
@@ -149,21 +150,13 @@ def summary(found: RefocusedGround) -> dict[str, Any]:
     }
 
 
-def words(found: RefocusedGround) -> list[str]:
+def told(found: RefocusedGround) -> list[Finding]:
     """What is in focus, and a doubt where the poses blur the picture."""
-    facts = summary(found)
-    said = [
-        (
-            f"{counted(round(facts['frames']), 'frame')} a cell over an aperture of {found.aperture_m:.3g} m at "
-            f"{found.distance_m:.3g} m: in focus to ±{found.focused_m:.2g} m; poses blur by {found.pose_blur_m:.2g} m "
-            f"({found.pose_blur_m / found.grid.step_y:.1f} cells)"
-        )
-    ]
-    if found.pose_blur_m > _BLURRED * found.grid.step_y:
-        said.append(
-            f"the poses are known to {found.pose_blur_m:.2g} m on the ground only: finer detail is blurred; with "
-            "--refine the frames are fitted to each other first"
-        )
+    facts, about = summary(found), Subject("picture")
+    cells = found.pose_blur_m / found.grid.step_y
+    said = [finding(Code.REFOCUS_FOCUSED, about, **facts | {"frames": round(facts["frames"]), "blur_cells": cells})]
+    if cells > _BLURRED:
+        said.append(finding(Code.REFOCUS_BLURRED, about, pose_blur_m=found.pose_blur_m))
     return said
 
 
