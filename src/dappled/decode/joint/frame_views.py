@@ -17,6 +17,7 @@ from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import (
     Aperture,
     ShownContrast,
+    SlicesThroughStop,
     UsedAperture,
     angular_frequencies,
     shift_shown,
@@ -87,29 +88,16 @@ class TakenSlices:
         faded: Sequence[bool] = (False, True),
     ) -> UsedAperture:
         """The aperture that the slices' means show; `texture` and `faded` as in `used_aperture`."""
-        return used_aperture(
-            self.values,
-            self.transfers,
-            self.orders,
-            nominal_kappa=self.kappa_cycles,
-            rotation_rad=self.rotation_rad,
-            aperture=self.aperture,
-            distance_known=distance_known,
-            texture=texture,
-            faded=faded,
-        )
+        return used_aperture(self._told, distance_known=distance_known, texture=texture, faded=faded)
 
     def shift(self, *, distance_known: bool) -> tuple[float, float]:
         """By how many periods the slices' means show the mask to have moved."""
-        return shift_shown(
-            self.values,
-            self.transfers,
-            self.orders,
-            nominal_kappa=self.kappa_cycles,
-            rotation_rad=self.rotation_rad,
-            aperture=self.aperture,
-            distance_known=distance_known,
-        )
+        return shift_shown(self._told, distance_known=distance_known)
+
+    @property
+    def _told(self) -> SlicesThroughStop:
+        at = self.kappa_cycles, self.rotation_rad, self.aperture
+        return SlicesThroughStop(self.values, self.transfers, self.orders, *at)
 
     def moved(self, periods: tuple[float, float]) -> TakenSlices:
         """The same, of a mask that has moved by so many periods."""

@@ -279,84 +279,87 @@ class ShownContrast:
         return np.clip(self.contrast + self.slope * np.log(kappas / self.kappa), FAINTEST, STRONGEST)
 
 
+_Means = tuple[list[Order], NDArray[np.complex128], NDArray[np.float64]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SlicesThroughStop:
+    """Slices complex64 (K, h, w), DC first, of `orders`, with their known transfers T_k (K,), and what is told of the
+    stop that they came through: `nominal_kappa` periods of a mask turned by `rotation_rad`."""
+
+    slices: NDArray[np.complex64]
+    transfers: NDArray[np.complex128]
+    orders: Sequence[Order]
+    nominal_kappa: float
+    rotation_rad: float
+    aperture: Aperture
+
+    def means(self) -> _Means | None:
+        """The orders whose transfers are known, their slices' means over those and over the plane's mean, and what a
+        scene adds to these; None where there are none."""
+        means = mean_of_slices(self.slices)
+        known = np.abs(self.transfers) > 1e-3
+        known[0] = False
+        if not known.any() or not means[0].real > 0:
+            return None
+        wanted = [order for order, usable in zip(self.orders, known, strict=True) if usable]
+        shares = means[known] / means[0].real / self.transfers[known]
+        return wanted, shares, _TEXTURE / np.abs(self.transfers[known])
+
+
 def used_aperture(
-    slices: NDArray[np.complex64],
-    transfers: NDArray[np.complex128],
-    orders: Sequence[Order],
+    told: SlicesThroughStop,
     *,
-    nominal_kappa: float,
-    rotation_rad: float,
-    aperture: Aperture,
     distance_known: bool = True,
     texture: ShownContrast | None = None,
     faded: Sequence[bool] = (False, True),
 ) -> UsedAperture:
-    """The aperture of a frame from its slices complex64 (K, h, w), DC first, and their known transfers T_k (K,).
-
-    The most probable κ within a factor `SEARCHED` of `nominal_kappa`. An f-number is near the truth, or now and then
+    """The aperture of a frame from its slices: the most probable κ within a factor `SEARCHED` of the nominal one.
+    An f-number is near the truth, or now and then
     told wrong altogether; where the mask's distance is only known to some percent (not `distance_known`), so is κ. The
     nominal one where the means carry no information or fit no aperture. Another contrast of the shadow is taken only
     where it explains the means, which are far from those of all apertures with the calibrated one, or where that is
     far from what `texture` shows. `faded` says whether another contrast is tried.
     """
     sigma, far = (_NOMINAL_SIGMA, _FAR_NOMINAL) if distance_known else (_UNKNOWN_SIGMA, _FAR_UNKNOWN)
-    nominal = UsedAperture(nominal_kappa, sigma * nominal_kappa, False, aperture)
-    shown = _shown_means(slices, transfers, orders)
-    if shown is None:
+    nominal = UsedAperture(told.nominal_kappa, sigma * told.nominal_kappa, False, told.aperture)
+    if (shown := told.means()) is None:
         return nominal
-    wanted, seen, error = shown
     off, prior = _kappas(sigma)
     best: UsedAperture | None = None
     least = math.inf
-    kappas = nominal_kappa * np.exp(off)
-    there = _expected(wanted, kappas, rotation_rad, aperture.views)
+    kappas = told.nominal_kappa * np.exp(off)
+    there = _expected(shown[0], kappas, told.rotation_rad, told.aperture.views)
     price = _MOVED if texture is None else _SELDOM_FADED
     for another in faded:
         if another and least <= price:
             break  # another contrast costs as much
         for shape, means in zip(SHAPES, there, strict=True):
-            at = Aperture(aperture.views, shape)
-            found, cost = _fitted(
-                seen.real,
-                error,
-                means,
-                kappas,
-                aperture=at,
-                prior=prior + price * another,
-                faded=another,
-                texture=texture,
-            )
+            at = Aperture(told.aperture.views, shape)
+            cost_before = prior + price * another
+            found, cost = _fitted(shown, means, kappas, aperture=at, prior=cost_before, faded=another, texture=texture)
             if found is not None and cost + (_EVIDENCE if best else 0.0) < least:
                 best, least = found, cost
     if best is None:
         return replace(nominal, share=math.nan)
-    share = best.kappa / nominal_kappa
+    share = best.kappa / told.nominal_kappa
     return replace(best, share=share) if abs(math.log(share)) > far else best
 
 
-def shift_shown(
-    slices: NDArray[np.complex64],
-    transfers: NDArray[np.complex128],
-    orders: Sequence[Order],
-    *,
-    nominal_kappa: float,
-    rotation_rad: float,
-    aperture: Aperture,
-    distance_known: bool = True,
-) -> tuple[float, float]:
+def shift_shown(told: SlicesThroughStop, *, distance_known: bool = True) -> tuple[float, float]:
     """By how many periods (ky, kx; −0.5 to 0.5) the means of slices, as `used_aperture`, show a mask to have moved.
 
     A move by δ turns mean k by 2πk·δ, and the stop may turn its sign: so move, stop and κ are fitted together.
     (0, 0) where none is sure.
     """
-    shown = _shown_means(slices, transfers, orders)
+    shown = told.means()
     if shown is None or np.linalg.matrix_rank(shown[0]) < 2:
         return 0.0, 0.0
     wanted, seen, error = shown
     off, prior = _kappas(_NOMINAL_SIGMA if distance_known else _UNKNOWN_SIGMA)
     off, prior = off[::_COARSER], prior[::_COARSER]
-    kappas = nominal_kappa * np.exp(off)
-    there = _expected(wanted, kappas, rotation_rad, aperture.views).reshape(-1, len(wanted)) / error
+    kappas = told.nominal_kappa * np.exp(off)
+    there = _expected(wanted, kappas, told.rotation_rad, told.aperture.views).reshape(-1, len(wanted)) / error
     alone = (there**2).sum(axis=1) + np.tile(prior, len(SHAPES)) + float((np.abs(seen / error) ** 2).sum())
 
     def costs(moves: NDArray[np.float64], some: slice = slice(None)) -> NDArray[np.float64]:
@@ -374,20 +377,6 @@ def shift_shown(
     fine = tried[best] + (tried - tried[0]) * (2 / _MOVES) - 1 / _MOVES
     moved = fine[int(costs(fine, slice(at, at + 1)).argmin())]
     return _turn(float(moved[0])), _turn(float(moved[1]))
-
-
-def _shown_means(
-    slices: NDArray[np.complex64], transfers: NDArray[np.complex128], orders: Sequence[Order]
-) -> tuple[list[Order], NDArray[np.complex128], NDArray[np.float64]] | None:
-    """The orders whose transfers are known, their slices' means over those and over the plane's mean, and what a scene
-    adds to these; None where there are none."""
-    means = mean_of_slices(slices)
-    known = np.abs(transfers) > 1e-3
-    known[0] = False
-    if not known.any() or not means[0].real > 0:
-        return None
-    wanted = [order for order, usable in zip(orders, known, strict=True) if usable]
-    return wanted, means[known] / means[0].real / transfers[known], _TEXTURE / np.abs(transfers[known])
 
 
 def _expected(
@@ -459,8 +448,7 @@ def shown_aperture(
 
 
 def _fitted(
-    seen: NDArray[np.float64],
-    error: NDArray[np.float64],
+    shown: _Means,
     there: NDArray[np.float64],
     kappas: NDArray[np.float64],
     *,
@@ -471,18 +459,19 @@ def _fitted(
 ) -> tuple[UsedAperture | None, float]:
     """The most probable of `kappas`, evenly spaced in the logarithm, and its cost; None for no fit.
 
-    `there` are the means through the aperture (see `_expected`), `prior` is what each costs before the frame is seen.
-    `faded`: with the contrast that suits each, and `texture`, best.
+    `shown` are the means (see `SlicesThroughStop`), `there` those through the aperture (see `_expected`), `prior` is
+    what each costs before the frame is seen. `faded`: with the contrast that suits each, and `texture`, best.
     """
-    contrast, agreement = np.ones(len(kappas)), _AGREEMENT**2
-    shown, weight = (texture.at(kappas), texture.error**-2) if texture else (contrast, 0.0)
+    _, means, error = shown
+    seen, contrast, agreement = means.real, np.ones(len(kappas)), _AGREEMENT**2
+    told, weight = (texture.at(kappas), texture.error**-2) if texture else (contrast, 0.0)
     if faded:
         agreement = agreement if texture else _EXPLAINED
-        wanted = (there * seen / error**2).sum(axis=1) + weight * shown
+        wanted = (there * seen / error**2).sum(axis=1) + weight * told
         contrast = wanted / np.maximum((there**2 / error**2).sum(axis=1) + weight, 1e-30)
         contrast = np.clip(contrast, FAINTEST, STRONGEST)
         there = there * contrast[:, None]
-    cost = prior + weight * (contrast - shown) ** 2
+    cost = prior + weight * (contrast - told) ** 2
     deviations = ((there - seen) / error) ** 2
     cost = deviations.sum(axis=1) + cost
     best = int(np.argmin(cost))
