@@ -39,7 +39,7 @@ from dappled.decode.spectrum import Lineariser, Plane, Slices
 from dappled.decode.spectrum import plane as planes
 from dappled.decode.spectrum.lineariser import lineariser
 from dappled.decode.spectrum.plane import coloured, local_colours
-from dappled.decode.spectrum.slices import extract
+from dappled.decode.spectrum.slices import BandShape, extract
 from dappled.decode.spectrum.transform import SpectrumBuffers, noise_rms, padded_shape, transform
 
 SHAPE = (2776, 3688)
@@ -137,7 +137,7 @@ def slices(buffers: SpectrumBuffers, linear: Lineariser, decoder: MaskDecoder, m
     with buffers.lend(SHAPE) as tiles:
         rows, reach = linear.apply(mosaic), decoder.largest_fx(length)
         spectrum = transform(rows, tiles=tiles, workers=decoder.workers, largest_fx=reach)
-        cut = extract(spectrum, carriers, decoder.slice_size(lattice), workers=decoder.workers)
+        cut = extract(spectrum, carriers, BandShape(decoder.slice_size(lattice)), workers=decoder.workers)
         noise_rms(spectrum)
     return cut
 

@@ -51,7 +51,7 @@ from dappled.decode.spectrum.peaks import (
     own_lattice,
     turn_between,
 )
-from dappled.decode.spectrum.slices import Slices, extract
+from dappled.decode.spectrum.slices import BandShape, Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, padded_shape, transform
 from dappled.findings import FRAME, Code, Finding, finding
 
@@ -251,7 +251,7 @@ class MaskDecoder:
             needed = max(abs(c.fx) for c in used) + (size[1] / 2 + 1) / spectrum.padded[1]
             if reach < min(0.5, needed):  # a lattice found at the edge of the search
                 spectrum = transform(plane, tiles=tiles, workers=self.workers, largest_fx=min(0.5, needed))
-            slices = extract(spectrum, used, size, taper=self.taper, workers=self.workers)
+            slices = extract(spectrum, used, BandShape(size, taper=self.taper), workers=self.workers)
             noise = noise_rms(spectrum)
         few = carriers_from == "calibrated" and sum(one is not None for one in measured) <= _BY_CHANCE
         if views:
@@ -559,7 +559,7 @@ class MaskDecoder:
         size = self.slice_size(lattice)
         with self.buffers.lend(self.optics.sensor.shape) as tiles:
             spectrum = transform(plane, tiles=tiles, workers=self.workers)
-            values = extract(spectrum, carriers, size, taper=self.taper, workers=self.workers).values
+            values = extract(spectrum, carriers, BandShape(size, taper=self.taper), workers=self.workers).values
         taken = replace(taken, values=values, carriers=carriers)
         at, width, place = self._calibrated(taken, there, known, turn_rad + turn_between(there, lattice))
         if place is None or not place.seen:
@@ -573,7 +573,7 @@ class MaskDecoder:
         with self.buffers.lend(self.optics.sensor.shape) as tiles:
             spectrum = transform(unclipped(whole, self.clipped, taken), tiles=tiles, workers=self.workers)
             size = self.slice_size(lattice)
-            return extract(spectrum, taken.carriers, size, taper=self.taper, workers=self.workers).values
+            return extract(spectrum, taken.carriers, BandShape(size, taper=self.taper), workers=self.workers).values
 
     def _calibrated(
         self, taken: TakenSlices, lattice: Lattice, known: LatticeFit, turn_rad: float

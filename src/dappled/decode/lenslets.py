@@ -18,7 +18,7 @@ from dappled.decode.lightfield.views import Views, from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier, Lattice
 from dappled.decode.spectrum.lattice import FoundLattice, find_lattice
 from dappled.decode.spectrum.lineariser import size_text
-from dappled.decode.spectrum.slices import Slices, extract
+from dappled.decode.spectrum.slices import BandShape, Slices, extract
 from dappled.decode.spectrum.transform import Source, Spectrum, SpectrumBuffers, noise_rms, transform
 
 _MOST_VIEWS = 15  # per axis
@@ -178,7 +178,7 @@ def _reach(found: FoundLattice) -> float:
 def _cut(spectrum: Spectrum, found: FoundLattice, workers: int) -> Slices:
     """Slices of all carriers of the half plane as far out as any was verified, bands going round at Nyquist."""
     carriers = carriers_within(found.lattice, 1.01 * _reach(found))
-    return extract(spectrum, carriers, lattice=found.lattice, window="cell", wrap=True, workers=workers)
+    return extract(spectrum, carriers, BandShape(lattice=found.lattice, window="cell", wrap=True), workers=workers)
 
 
 def carriers_within(lattice: Lattice, reach: float) -> list[Carrier]:

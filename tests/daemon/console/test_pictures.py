@@ -16,7 +16,7 @@ from dappled.daemon.console import pictures
 from dappled.daemon.console.pictures import Mosaic
 from dappled.decode.lightfield.light_field import ViewStack, centred
 from dappled.decode.optics.carriers import Lattice
-from dappled.decode.spectrum.slices import extract
+from dappled.decode.spectrum.slices import BandShape, extract
 from dappled.decode.spectrum.transform import transform
 
 
@@ -32,7 +32,7 @@ def test_the_bands_go_back_to_their_places() -> None:
     fy, fx = 0.0, 0.25
     plane = (0.5 + 0.3 * np.cos(2 * np.pi * (fy * y + fx * x))).astype(np.float32)
     lattice = Lattice((0.25, 0.0), (0.0, 0.25))
-    cut = extract(transform(plane), lattice.carriers([(0, 0), (0, 1), (1, 0)]), lattice=lattice)
+    cut = extract(transform(plane), lattice.carriers([(0, 0), (0, 1), (1, 0)]), BandShape(lattice=lattice))
     rows = [[c.ky, c.kx, c.fy, c.fx] for c in cut.carriers]
     picture = pictures.spectrum(cut.values, rows, cut.grid.tolist(), (side, side))
     at = np.unravel_index(np.argmax(picture), picture.shape)

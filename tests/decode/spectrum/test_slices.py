@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics.carriers import Carrier, Lattice
-from dappled.decode.spectrum.slices import _bands, _cell_weights, _taper_weights, extract
+from dappled.decode.spectrum.slices import BandShape, _bands, _cell_weights, _taper_weights, extract
 from dappled.decode.spectrum.transform import SpectrumBuffers, transform
 from tests.decode.spectrum.equations import slice_at
 
@@ -26,7 +26,7 @@ def test_a_slice_is_the_picture_times_the_carriers_amplitude(fy: float, fx: floa
     factor = 0.3 * np.exp(1j * phase)
     picture, plane = _frame(fy, fx, factor)
     carriers = [Carrier(0, 0, 0.0, 0.0), Carrier(1, 0, fy, fx)]
-    found = extract(transform(plane), carriers, (20, 24))
+    found = extract(transform(plane), carriers, BandShape((20, 24)))
     rows = np.arange(found.values.shape[1]) * found.grid[0, 0]
     columns = np.arange(found.values.shape[2]) * found.grid[1, 1]
     assert rows[-1] <= SHAPE[0] - 1
@@ -47,12 +47,12 @@ def test_a_tapered_band_keeps_its_middle_and_rings_less() -> None:
     plane = np.zeros(SHAPE, dtype=np.float32)
     plane[:, SHAPE[1] // 2 :] = 1.0
     mean = [Carrier(0, 0, 0.0, 0.0)]
-    sharp, soft = (extract(transform(plane), mean, size, taper=taper) for taper in (0.0, 1.0))
+    sharp, soft = (extract(transform(plane), mean, BandShape(size, taper=taper)) for taper in (0.0, 1.0))
     inner = (slice(8, -8), slice(8, -8))
     assert soft.values[0].real[inner].max() < sharp.values[0].real[inner].max() - 0.05  # Gibbs' overshoot is gone
     assert soft.band == pytest.approx(sharp.band * float(np.mean(_taper_weights(size, 1.0) ** 2)))
     with pytest.raises(DecodeError, match="share of the band"):
-        extract(transform(plane), mean, size, taper=1.5)
+        extract(transform(plane), mean, BandShape(size, taper=1.5))
 
 
 def test_the_largest_boxes_do_not_overlap() -> None:
@@ -87,7 +87,7 @@ def test_cells_of_a_hexagonal_lattice_tile_the_plane() -> None:
 
 def test_white_noise_fills_a_slice_by_its_band() -> None:
     plane = np.random.default_rng(0).normal(0.5, 0.1, SHAPE).astype(np.float32)
-    found = extract(transform(plane), [Carrier(1, 1, 0.21, 0.13)], (40, 50))
+    found = extract(transform(plane), [Carrier(1, 1, 0.21, 0.13)], BandShape((40, 50)))
     assert np.mean(np.abs(found.values) ** 2) == pytest.approx(0.1**2 * found.band, rel=0.1)
 
 
@@ -95,7 +95,7 @@ def test_a_band_beyond_nyquist_is_cut_or_goes_round() -> None:
     plane = np.random.default_rng(0).normal(0.5, 0.1, SHAPE).astype(np.float32)
     spectrum = transform(plane)
     at_edge = [Carrier(1, 0, 0.49, 0.0)]
-    cut, wrapped = (extract(spectrum, at_edge, (40, 40), wrap=wrap).values for wrap in (False, True))
+    cut, wrapped = (extract(spectrum, at_edge, BandShape((40, 40), wrap=wrap)).values for wrap in (False, True))
     assert np.mean(np.abs(cut) ** 2) == pytest.approx(0.6 * np.mean(np.abs(wrapped) ** 2), rel=0.15)
 
 
@@ -103,18 +103,18 @@ def test_any_number_of_workers_gives_the_same_bytes() -> None:
     _, plane = _frame(0.2, 0.15, 0.3)
     carriers = Lattice((0.15, 0.001), (-0.001, 0.15)).carriers([(0, 0), (0, 1), (1, 0), (1, 1), (1, -1)])
     spectrum = transform(plane)
-    one, three = (extract(spectrum, carriers, (30, 36), workers=w).values for w in (1, 3))
+    one, three = (extract(spectrum, carriers, BandShape((30, 36)), workers=w).values for w in (1, 3))
     assert one.tobytes() == three.tobytes()
 
 
 def test_bad_calls_are_refused_in_words() -> None:
     spectrum = transform(_frame(0.2, 0.2, 0.3)[1])
     with pytest.raises(DecodeError, match="no carriers"):
-        extract(spectrum, [], (10, 10))
+        extract(spectrum, [], BandShape((10, 10)))
     with pytest.raises(DecodeError, match="size"):
-        extract(spectrum, [Carrier(0, 0, 0, 0)])
+        extract(spectrum, [Carrier(0, 0, 0, 0)], BandShape())
     with pytest.raises(DecodeError, match="fit"):
-        extract(spectrum, [Carrier(0, 0, 0, 0)], (1000, 10))
+        extract(spectrum, [Carrier(0, 0, 0, 0)], BandShape((1000, 10)))
     with pytest.raises(DecodeError, match="too close"):
         Lattice((1e-6, 0.0), (0.0, 1e-6)).slice_size((600, 750))
 
@@ -135,7 +135,7 @@ def test_slices_are_those_of_the_equation(
 ) -> None:
     spectrum = transform(UNEVEN)
     carrier = Carrier(0, 0, 0.0, 0.0) if mean else Carrier(1, 2, fy, fx)
-    found = extract(spectrum, [carrier], (height, width), wrap=wrap).values[0]
+    found = extract(spectrum, [carrier], BandShape((height, width), wrap=wrap)).values[0]
     expected = slice_at(UNEVEN, carrier, (height, width), level=spectrum.level, wrap=wrap)
     expected = expected[: found.shape[0], : found.shape[1]]
     assert np.abs(found - expected).max() < 1e-5 * max(np.abs(expected).max(), 1e-2)
@@ -146,14 +146,14 @@ def test_slices_are_those_of_the_equation(
 def test_any_number_of_workers_and_carriers_gives_the_same_bytes(count: int, workers: int) -> None:
     spectrum = transform(UNEVEN)
     carriers = [Carrier(1, k, 0.03 * k, 0.21 - 0.06 * k) for k in range(count)]
-    one, many = (extract(spectrum, carriers, (40, 60), workers=w).values for w in (1, workers))
+    one, many = (extract(spectrum, carriers, BandShape((40, 60)), workers=w).values for w in (1, workers))
     assert one.tobytes() == many.tobytes()
 
 
 def test_columns_that_were_not_transformed_are_refused_before_anything_is_cut() -> None:
     spectrum = transform(UNEVEN, largest_fx=0.2)
     with pytest.raises(DecodeError, match="not computed"):
-        extract(spectrum, [Carrier(0, 0, 0.0, 0.0), Carrier(0, 1, 0.0, 0.3)], (20, 20))
+        extract(spectrum, [Carrier(0, 0, 0.0, 0.0), Carrier(0, 1, 0.0, 0.3)], BandShape((20, 20)))
 
 
 def test_bands_laid_out_before_give_the_same_slices_as_new_ones() -> None:
@@ -164,9 +164,9 @@ def test_bands_laid_out_before_give_the_same_slices_as_new_ones() -> None:
         frame = np.random.default_rng(seed).random(shape).astype(np.float32)
         for size in ((20, 28), (24, 30)):
             with buffers.lend(shape) as tiles:
-                found = extract(transform(frame, tiles=tiles), carriers, size, workers=2)
+                found = extract(transform(frame, tiles=tiles), carriers, BandShape(size), workers=2)
             _bands.cache_clear()
-            fresh = extract(transform(frame), carriers, size)
+            fresh = extract(transform(frame), carriers, BandShape(size))
             assert found.values.tobytes() == fresh.values.tobytes()
             assert np.array_equal(found.grid, fresh.grid)
             assert found.carriers == fresh.carriers
@@ -174,7 +174,7 @@ def test_bands_laid_out_before_give_the_same_slices_as_new_ones() -> None:
 
 def test_slices_outlive_the_next_frame() -> None:
     with SpectrumBuffers().lend(UNEVEN.shape) as tiles:
-        first = extract(transform(UNEVEN, tiles=tiles), [Carrier(0, 0, 0.0, 0.0)], (20, 28))
+        first = extract(transform(UNEVEN, tiles=tiles), [Carrier(0, 0, 0.0, 0.0)], BandShape((20, 28)))
         before = first.values.copy()
         transform(UNEVEN * 3, tiles=tiles)
     assert np.array_equal(first.values, before)

@@ -15,7 +15,7 @@ from dappled.decode.optics import Carrier, Lattice, Mask, MaskedOptics, Order
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.mask_lattice import MaskLattice, levels
 from dappled.decode.spectrum.peaks import Measured, fit, measure, residual_bins
-from dappled.decode.spectrum.slices import extract
+from dappled.decode.spectrum.slices import BandShape, extract
 from dappled.decode.spectrum.transform import transform
 from dappled.findings import Code, Finding, Level, Subject
 
@@ -76,7 +76,7 @@ def frame_lattice(
     lattice = refine(spectrum, lattice, [(0, 0), *((c.ky, c.kx) for c, _ in found)], workers)
     residual = residual_bins(lattice.carriers([(c.ky, c.kx) for c, _ in found]), [m for _, m in found], spectrum)
     carriers = [c for c in lattice.carriers(mask.half_orders()) if c.on_sensor]
-    values = extract(spectrum, carriers, lattice=lattice, workers=workers).values
+    values = extract(spectrum, carriers, BandShape(lattice=lattice), workers=workers).values
     return FrameLattice(
         focal_length_mm,
         f_number,
@@ -120,7 +120,7 @@ def refine(spectrum: Spectrum, lattice: Lattice, orders: Sequence[Order], worker
     size = lattice.slice_size(spectrum.padded)
     for _ in range(2):
         carriers = [c for c in lattice.carriers(orders) if c.on_sensor]
-        values = extract(spectrum, carriers, size, workers=workers)
+        values = extract(spectrum, carriers, BandShape(size), workers=workers)
         k, shifts, weights = [], [], []
         for carrier, image in zip(carriers[1:], values.values[1:], strict=True):
             ramp, weight = _ramp(image * np.conj(values.values[0]))

@@ -37,36 +37,31 @@ class Slices:
     band: float
 
 
-def extract(
-    spectrum: Spectrum,
-    carriers: Sequence[Carrier],
-    size: tuple[int, int] | None = None,
-    *,
-    lattice: Lattice | None = None,
-    window: Window = "box",
-    taper: float = 0.0,
-    wrap: bool = False,
-    workers: int = 1,
-) -> Slices:
+@dataclass(frozen=True, slots=True)
+class BandShape:
+    """The band that a slice is cut from.
+
+    `size` is (height, width) in bins, by default `lattice.slice_size`; otherwise the lattice is only needed for the
+    window "cell". With `wrap` a band continues cyclically past the edge of the spectrum (sampled lenslet arrays);
+    otherwise values beyond Nyquist are 0. `taper` is the share of the band, 0 to 1, that falls off towards its edges as
+    a raised cosine (Tukey's window; 1 is Hann's): less ringing, less detail.
+    """
+
+    size: tuple[int, int] | None = None
+    lattice: Lattice | None = None
+    window: Window = "box"
+    taper: float = 0.0
+    wrap: bool = False
+
+
+def extract(spectrum: Spectrum, carriers: Sequence[Carrier], form: BandShape, workers: int = 1) -> Slices:
     """The slices of these carriers.
 
-    `size` is (height, width) of the band in bins, by default `lattice.slice_size`; otherwise the lattice is only
-    needed for the window "cell". With `wrap` a band continues cyclically past the edge of the spectrum (sampled lenslet
-    arrays); otherwise values beyond Nyquist are 0. `taper` is the share of the band, 0 to 1, that falls off towards its
-    edges as a raised cosine (Tukey's window; 1 is Hann's): less ringing, less detail. The scale makes the DC slice the
+    The scale makes the DC slice the
     plane's local mean. Phases are those at pixel (0, 0), with the fraction of a bin compensated exactly. The slices end
     where the frame ends. Raises DecodeError for a size, a taper or columns out of range.
     """
-    bands = _bands(
-        spectrum.shape,
-        spectrum.padded,
-        tuple(carriers),
-        size,
-        lattice=lattice,
-        window=window,
-        taper=taper,
-        wrap=wrap,
-    )
+    bands = _bands(spectrum.shape, spectrum.padded, tuple(carriers), form)
     for band in bands:
         spectrum.require(band.across)
     values = np.empty((len(bands), *bands[0].samples), dtype=np.complex64)
@@ -156,23 +151,16 @@ class Band:
 
 @lru_cache(maxsize=_LAYOUTS)
 def _bands(
-    shape: tuple[int, int],
-    padded: tuple[int, int],
-    carriers: tuple[Carrier, ...],
-    size: tuple[int, int] | None,
-    *,
-    lattice: Lattice | None,
-    window: Window,
-    taper: float,
-    wrap: bool,
+    shape: tuple[int, int], padded: tuple[int, int], carriers: tuple[Carrier, ...], form: BandShape
 ) -> tuple[Band, ...]:
     """The bands of `extract` for all frames of `shape`, transformed over `padded`."""
     if not carriers:
         raise DecodeError("no carriers to cut slices at")
-    if size is None or window == "cell":
+    size, lattice, taper, wrap = form.size, form.lattice, form.taper, form.wrap
+    if size is None or form.window == "cell":
         if lattice is None:
             raise DecodeError("slices need a size, or a lattice to take it from")
-        size = size or lattice.slice_size(padded, window)
+        size = size or lattice.slice_size(padded, form.window)
     height, width = size
     if not (2 <= height <= padded[0] and 2 <= width <= padded[1]):
         raise DecodeError(f"a slice of {height}×{width} bins doesn't fit a spectrum of {padded}")
@@ -180,7 +168,7 @@ def _bands(
         raise DecodeError(f"the taper is {taper:g}: it must be a share of the band, from 0 to 1")
     noise_share = height * width / (padded[0] * padded[1])
     weights = None
-    if window == "cell" and lattice is not None:
+    if form.window == "cell" and lattice is not None:
         weights = _cell_weights(lattice, padded, size)
     if taper:
         weights = _taper_weights(size, taper) * (1 if weights is None else weights)
