@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -167,8 +167,7 @@ class ReplayFlight(SettingsArgument, Doubtable, Verb):
                 recording,
                 writer,
                 progress,
-                flown,
-                recipe=recipe,
+                replace(flown, recipe=recipe),
                 publish=settings.publish if self.publish else None,
                 pace=self._pace(),
                 report=found.append,

@@ -284,13 +284,12 @@ class Service:
             common = (making, writer, shots, publisher)
             if recipe.mask != profiles.LENSLET:
                 every_s = settings.publish.picture_interval_s
-                viewers.append(LivePictures(*common, interval_s=every_s, clock=clock))
+                viewers.append(LivePictures(*common, interval_s=every_s))
             if settings.decode.depth:
                 depth = LiveDepth(
                     *common,
                     method=settings.decode.depth,
                     interval_s=settings.decode.depth_interval_s,
-                    clock=clock,
                     nearest=control.send_distance if settings.decode.depth_to_autopilot else None,
                 )
                 viewers.append(depth)

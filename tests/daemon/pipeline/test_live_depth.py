@@ -90,11 +90,10 @@ class Bench:
         self.depth = LiveDepth(
             cast(DecodeProcess, self.maker),
             cast(FlightWriter, self),
-            PendingShots(FakeCamera()),
+            PendingShots(FakeCamera(), self.clock),
             cast(Publisher, self),
             method="contrast",
             interval_s=interval_s,
-            clock=self.clock,
             nearest=self.send_distance,
         )
 
@@ -102,10 +101,9 @@ class Bench:
         self.pictures = LivePictures(
             cast(DecodeProcess, self.maker),
             cast(FlightWriter, self),
-            PendingShots(FakeCamera()),
+            PendingShots(FakeCamera(), self.clock),
             cast(Publisher, self),
             interval_s=interval_s,
-            clock=self.clock,
         )
 
     def wanted(self, topic: str) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from dappled import codec
-from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess
 from dappled.daemon.pipeline.flight_writer import FlightWriter
@@ -30,10 +29,9 @@ class LiveDepth(Occasional):
         *,
         method: str,
         interval_s: float,
-        clock: Clock,
         nearest: Callable[[tuple[float, float]], None] | None = None,
     ) -> None:
-        super().__init__(maker, writer, shots, publisher, interval_s=interval_s, clock=clock)
+        super().__init__(maker, writer, shots, publisher, interval_s=interval_s)
         self._method, self._nearest = method, nearest
 
     def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:

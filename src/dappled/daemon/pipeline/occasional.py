@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
-from dappled.clock import Clock
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
 from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess
 from dappled.daemon.pipeline.flight_writer import FlightWriter
@@ -32,13 +31,12 @@ class Occasional(OneThread, ABC):
         publisher: Stream,
         *,
         interval_s: float,
-        clock: Clock,
     ) -> None:
         self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
-        self._interval_s, self._clock = interval_s, clock
+        self._interval_s, self._clock = interval_s, shots.clock
         self._last_ns: int | None = None
         self._worker: Worker[PendingShot] = Worker(
-            self.topic, self._work, capacity=1, policy="drop oldest", clock=clock
+            self.topic, self._work, capacity=1, policy="drop oldest", clock=self._clock
         )
         self._loop = self._worker
 

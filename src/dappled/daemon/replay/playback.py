@@ -31,11 +31,13 @@ _STOP_S = 5.0
 
 @dataclass(frozen=True, slots=True)
 class FlownWith:
-    """What the tags of a replay are made with: names of camera and mask, the body's latency, the flight's settings."""
+    """What the tags of a replay are made with: names of camera and mask, the body's latency, the flight's settings; and
+    the recipe by which frames are decoded, None: they aren't."""
 
     names: Names
     latency: BodyLatency
     settings: Settings
+    recipe: Recipe | None = None
 
 
 def run(
@@ -44,23 +46,22 @@ def run(
     progress: ReplayProgress,
     flown: FlownWith,
     *,
-    recipe: Recipe | None = None,
     publish: PublishSettings | None = None,
     pace: Pace | None = None,
     report: Callable[[Finding], object] = lambda _: None,
 ) -> None:
     """Play the recording to its end (see `replay.play`), and close what was opened for it.
 
-    `writer` takes the results, `report` what is to be said of the telemetry. Without a recipe nothing is decoded,
-    without `publish` nothing is published. Raises DappledError.
+    `writer` takes the results, `report` what is to be said of the telemetry. Without `publish` nothing is
+    published. Raises DappledError.
     """
     time = replay.clock(recording)
     body = flown.settings.body
     plan = FixedPlan({} if body.check == "off" else exposure_of(plan_of(body)))
     with ExitStack() as stack:
         decoder = None
-        if recipe is not None:
-            decoder = DecodeProcess(recipe)
+        if flown.recipe is not None:
+            decoder = DecodeProcess(flown.recipe)
             stack.callback(decoder.close)
             decoder.warm_up()
         telemetry = RecordedTelemetry(

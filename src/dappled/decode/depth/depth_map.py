@@ -19,6 +19,7 @@ Map = NDArray[np.float32]
 _SCATTER = 1.1
 _EDGE, _EDGE_SHARE = 0.0005, 0.0005  # px/view, and of the disparity
 _SEAM = 2.0  # of the disparities' spread under the window
+_MOST_SIGMA = 0.25  # px/view, chosen by hand: a disparity that is known less well is unknown
 _LEAST_CONFIDENCE = 0.5  # chosen by hand: the share that is known is measured by benchmarks/depth.py
 _MOST_DISPARITIES = 400  # a volume of more is refused, as it would not fit into memory
 CONTRAST_WINDOW = 13  # px a side
@@ -175,19 +176,17 @@ def judged(
     spread: float,
     window: int,
     method: str,
-    most_sigma: float = 0.25,
-    bias: float = 0.0,
 ) -> DepthMap:
     """The map: standard errors from curvatures of the likelihood, unknown where these or the confidence are too low.
 
     At seams within the window (px a side) the error is larger, but the disparity is still known. `spread` is
-    variance over information, from `windowed`; `bias` the known systematic error of a method, in px/view.
+    variance over information, from `windowed`.
     """
     with np.errstate(divide="ignore"):
         noise = np.float32(_SCATTER**2 * spread) / curvature
     edge = _EDGE + _EDGE_SHARE * np.abs(disparity)
-    sigma = np.sqrt(noise + edge**2 + bias**2)
-    known = (sure >= _LEAST_CONFIDENCE) & (sigma <= most_sigma)
+    sigma = np.sqrt(noise + edge**2)
+    known = (sure >= _LEAST_CONFIDENCE) & (sigma <= _MOST_SIGMA)
     unknown = np.float32(np.nan)
     shown = np.where(known, disparity, unknown).astype(np.float32)
     sigma = np.hypot(sigma, np.float32(_SEAM) * seams(shown, noise, window))
