@@ -99,9 +99,9 @@ def test_a_link_is_not_followed_wherever_it_stands(tmp_path: Path) -> None:
 
 RECIPE = Recipe(camera="canon-eos-450d", mask="mask-1")
 DOORS: dict[str, Callable[[Path, Path], object]] = {
-    "geotag": lambda flight, out: geotags.write(flight, Mounting()),
-    "geotag elsewhere": lambda flight, out: geotags.write(flight, Mounting(), output=out),
-    "copies": lambda flight, out: list(geotags.copies(flight, out, Mounting())),
+    "geotag": lambda flight, out: geotags.write(flight, geotags.PlacedBy(Mounting())),
+    "geotag elsewhere": lambda flight, out: geotags.write(flight, geotags.PlacedBy(Mounting()), output=out),
+    "copies": lambda flight, out: list(geotags.copies(flight, out, geotags.PlacedBy(Mounting()))),
     "replay": lambda flight, out: replay.of_flight(flight),
     "open": lambda flight, out: list(cast(OpenedFlight, opened.open(flight, camera=RECIPE.camera, mask=RECIPE.mask))),
     "decode": lambda flight, out: Laboratory(RECIPE).frame(flight, _first(flight), None),
@@ -148,13 +148,13 @@ def test_geotag_writes_through_no_link(flight: Path, tmp_path: Path, folder: str
     if folder == "frames":
         victim = flight.parent / "victim.txt"
         (flight / "frames" / ".000000.cr2.xmp.part").symlink_to(victim)
-        geotags.write(flight, Mounting())
+        geotags.write(flight, geotags.PlacedBy(Mounting()))
         assert victim.read_bytes() == SECRET
         assert not (flight / "frames" / "000000.cr2.xmp").is_symlink()
     else:
         (flight / "geotags").symlink_to(tmp_path / "elsewhere")
         with pytest.raises(OutsideError, match="geotags is a link"):
-            geotags.write(flight, Mounting())
+            geotags.write(flight, geotags.PlacedBy(Mounting()))
     assert os.listdir(tmp_path / "elsewhere") == []
 
 

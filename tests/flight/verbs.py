@@ -112,7 +112,7 @@ def _worked_on_at_the_copy(place: Path) -> None:
     _offloaded_before(place)
     (copy,) = layout.flights(place / "disk")
     with seals.work(copy, clock(), seals.Occasion.GEOTAG, "geotags flights in", None):
-        geotags.write(copy.path, Mounting())
+        geotags.write(copy.path, geotags.PlacedBy(Mounting()))
 
 
 def _offload(place: Path, say: Say) -> None:
@@ -181,7 +181,7 @@ def _to_tag(place: Path) -> None:
 def _geotag(place: Path, say: Say) -> None:
     for flight in flown(place):
         with seals.work(layout.open_folder(flight), clock(), seals.Occasion.GEOTAG, "geotags flights in", None):
-            geotags.write(flight, Mounting())
+            geotags.write(flight, geotags.PlacedBy(Mounting()))
 
 
 def _geotagged(place: Path) -> list[str]:

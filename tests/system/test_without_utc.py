@@ -54,7 +54,7 @@ def test_a_flight_learns_utc_and_replays(tmp_path: Path, sockets: Path) -> None:
     assert 0 < time.time_ns() - began_utc_ns < 300 * SECOND_NS
     with ImageIndex(tmp_path / "flights") as index:
         assert index.flights() == {service.folder.name: began_utc_ns}
-    (placed,), _ = geotags.read(service.folder, Mounting())
+    (placed,), _ = geotags.read(service.folder, geotags.PlacedBy(Mounting()))
     assert placed.utc_ns is not None
     assert abs(time.time_ns() - placed.utc_ns) < 300 * SECOND_NS
     assert placed.tag.utc_ns < 10**17  # as it was stamped: nothing is stamped anew

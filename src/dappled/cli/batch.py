@@ -23,7 +23,7 @@ if not words_only:
     from dappled.products.batch import batch, workers
     from dappled.products.batch.batch import Done, Job, Manifest
     from dappled.products.geotags import geotags, marks
-    from dappled.products.geotags.geotags import Placed
+    from dappled.products.geotags.geotags import Placed, PlacedBy
     from dappled.products.handover import forms, photo_files
     from dappled.products.maps import earth
 
@@ -119,7 +119,7 @@ class ProcessFlights(Doubtable, Several, MarkArguments, Placing, Verb):
             doubts = [replace(one, subject=_of_flight(folder.name, one.subject)) for one in marked.doubts]
         elif "mcap" in self.kinds:  # its altitudes are above the ellipsoid, or unknown
             geoid = geoid_or_none(self.geoid, output)
-        placed, _ = geotags.read(folder.path, options.mounting, geoid, marked)
+        placed, _ = geotags.read(folder.path, PlacedBy(options.mounting, geoid, marked))
         if "photos" in self.kinds:
             output.remark(f"{folder.name}: {photo_files.ground_words(placed)}")
         by_index = {one.frame.index: one for one in placed}

@@ -27,6 +27,7 @@ if not words_only:
     from dappled.flight.layout import LockHeldError
     from dappled.flight.seal_key import SealKey
     from dappled.products.geotags import geotags, marks
+    from dappled.products.geotags.geotags import PlacedBy
     from dappled.products.maps import earth
     from dappled.products.maps.earth import EarthError, Geoid
     from dappled.products.mounting import Mounting
@@ -108,24 +109,18 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         marked = None
         if self.pos:
             marked = marks.find(self.flight, self.pos, geoid, self.mark_arm(mounting, output))
+        by = PlacedBy(mounting, geoid, marked, tags)
         folder = layout.open_folder(self.flight)
         clock = TimeOfDayClock()
         work = seals.work(folder, clock, seals.Occasion.GEOTAG, "geotags flights in", key)
         with work if into_flight else nullcontext():
             written = geotags.write(
-                self.flight,
-                mounting,
-                geoid=geoid,
-                marked=marked,
-                tags=tags,
-                output=self.output,
-                replace_extension=self.lightroom,
-                force=self.force,
+                self.flight, by, output=self.output, replace_extension=self.lightroom, force=self.force
             )
         made = {}
         if self.copies:
             with output.bar(None, "frame") as add:
-                for name, copy in geotags.copies(self.flight, self.copies, mounting, geoid, marked, tags=tags):
+                for name, copy in geotags.copies(self.flight, self.copies, by):
                     made[name] = copy
                     add(1)
         copied = [str(path) for path in made.values() if isinstance(path, Path)]

@@ -218,10 +218,8 @@ class Refining(Several, Placing):
                 self_calibration.check(planned.photographs, planned.ground)
             foresee(planned)
 
-        recipe, options = self.recipe(flight, facts), self.options(facts)
-        made = georeference.survey(
-            flight, recipe, options, output.show, stack, watch=watch, foresee=foreseen, workers=self.workers
-        )
+        recipe, options = self.recipe(flight, facts), replace(self.options(facts), workers=self.workers)
+        made = georeference.survey(flight, recipe, options, output.show, stack, watch=watch, foresee=foreseen)
         if self.solve_lens is not None:
             made = georeference.with_own_lens(made, control=self.gcp, sigmas=self._sigmas, progress=output.show)
         for base in self._base_maps:

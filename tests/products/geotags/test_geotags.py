@@ -67,7 +67,7 @@ def attributes(path: Path) -> dict[str, str]:
 def test_everything_is_written_and_nothing_recorded_is_touched(flight: Path) -> None:
     kept = [*sorted((flight / "frames").iterdir()), flight / "flight.sqlite", flight / "shots.jsonl"]
     before = {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in kept}
-    written = geotags.write(flight, Mounting())
+    written = geotags.write(flight, geotags.PlacedBy(Mounting()))
     assert {path: hashlib.sha256(path.read_bytes()).hexdigest() for path in before} == before
     assert check(flight).problems == ()
     assert (written.placed, written.without_position, written.without_tag) == (
@@ -98,7 +98,7 @@ def test_everything_is_written_and_nothing_recorded_is_touched(flight: Path) -> 
 
 
 def test_a_sidecar_says_what_is_known_and_only_that(flight: Path) -> None:
-    geotags.write(flight, Mounting())
+    geotags.write(flight, geotags.PlacedBy(Mounting()))
     known = attributes(flight / "frames" / "000000.cr2.xmp")
     assert known["{http://ns.adobe.com/exif/1.0/}GPSLatitude"].endswith("N")
     assert known["{http://ns.adobe.com/exif/1.0/}GPSLongitude"].endswith("W")
@@ -122,7 +122,7 @@ def test_somebody_elses_sidecar_stays(flight: Path, capsys: pytest.CaptureFixtur
 
 
 def test_the_other_convention_and_another_folder(flight: Path, tmp_path: Path) -> None:
-    written = geotags.write(flight, Mounting(), output=tmp_path / "out", replace_extension=True)
+    written = geotags.write(flight, geotags.PlacedBy(Mounting()), output=tmp_path / "out", replace_extension=True)
     assert sorted(path.name for path in written.files) == [
         "000000.xmp",
         "000001.xmp",
@@ -152,7 +152,7 @@ def one_frame(root: Path, frame: bytes, name: str, where: Pose, *, utc_known: bo
 
 def test_accuracies_and_the_receivers_word_are_in_every_form(tmp_path: Path) -> None:
     flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk())
-    geotags.write(flight, Mounting(), geoid=Geoid(offset_m=-33.5))
+    geotags.write(flight, geotags.PlacedBy(Mounting(), Geoid(offset_m=-33.5)))
     said = attributes(flight / "frames" / "000000.cr2.xmp")
     assert said["{http://www.dji.com/drone-dji/1.0/}RtkFlag"] == "50"
     assert said["{http://www.dji.com/drone-dji/1.0/}RtkStdHgt"] == "0.0300"
@@ -261,7 +261,7 @@ def test_a_frame_in_doubt_decides_the_exit_code(tmp_path: Path, capsys: pytest.C
 
 def test_geo_txt_has_both_accuracies_or_none(tmp_path: Path) -> None:
     flight = one_frame(tmp_path, b"raw", "IMG.CR2", replace(rtk(), vertical_sigma_m=None))
-    geotags.write(flight, Mounting())
+    geotags.write(flight, geotags.PlacedBy(Mounting()))
     (line,) = (flight / "geotags" / "geo.txt").read_text().splitlines()[1:]
     assert len(line.split()) == 7  # of eight words OpenDroneMap would read seven too
 
@@ -275,7 +275,7 @@ def test_the_track_is_cut_at_the_antimeridian(tmp_path: Path, heading: int) -> N
         begun.ledger.add_tag(replace(tag(deliver(begun, index, b"raw")), pose=where))
     begun.close()
     flight = begun.folder.path
-    geotags.write(flight, Mounting())
+    geotags.write(flight, geotags.PlacedBy(Mounting()))
     track, *points = json.loads((flight / "geotags" / "track.geojson").read_text())["features"]
     assert len(points) == 4
     assert track["geometry"]["type"] == "MultiLineString"
@@ -288,7 +288,7 @@ def test_the_track_is_cut_at_the_antimeridian(tmp_path: Path, heading: int) -> N
 
 def test_times_are_put_right_where_utc_was_learnt(tmp_path: Path) -> None:
     flight = one_frame(tmp_path, b"raw", "IMG.CR2", rtk(), utc_known=False)
-    geotags.write(flight, Mounting())
+    geotags.write(flight, geotags.PlacedBy(Mounting()))
     said = attributes(flight / "frames" / "000000.cr2.xmp")
     assert said["{http://ns.adobe.com/exif/1.0/}GPSTimeStamp"] == "2026-11-22T10:15:03.123456Z"
 
@@ -363,7 +363,7 @@ FILES = {
 @pytest.mark.parametrize("name", FILES)
 def test_a_copy_has_its_place_in_exif_and_the_original_none(tmp_path: Path, name: str) -> None:
     flight = one_frame(tmp_path, FILES[name], name, rtk(latitude_rad=-0.7266))
-    ((frame, copy),) = geotags.copies(flight, tmp_path / "copies", Mounting())
+    ((frame, copy),) = geotags.copies(flight, tmp_path / "copies", geotags.PlacedBy(Mounting()))
     assert isinstance(copy, Path)
     assert (flight / frame).read_bytes() == FILES[name]
     found = gps(copy.read_bytes())

@@ -162,7 +162,7 @@ def test_every_shot_finds_its_mark_and_its_position(tmp_path: Path) -> None:
     assert (found.lost, found.extra, found.doubts) == ((), (), ())
     assert found.offset_s == pytest.approx(0.02, abs=1e-6)
     assert found.shift_m == pytest.approx((NORTH_M, EAST_M, UP_M), abs=1e-3)
-    placed, _ = geotags.read(flight, Mounting(lever_m=(0.5, 0.0, 0.1)), GEOID, found)
+    placed, _ = geotags.read(flight, geotags.PlacedBy(Mounting(lever_m=(0.5, 0.0, 0.1)), GEOID, found))
     first = placed[0]
     assert first.camera is not None
     assert first.camera.height_ellipsoid_m is not None
@@ -200,7 +200,7 @@ def test_lost_and_extra_marks_are_named_and_lost_frames_keep_their_place(tmp_pat
     (extra,) = found.extra
     assert (extra.code, extra.facts["at"]) == (Code.MARK_OF_NO_SHOT, "10:14:33.012 UTC")
     assert [str(text(one)) for one in found.doubts] == ["1 mark of 5 not fixed: 4 (frame 2, float)"]
-    placed, _ = geotags.read(flight, Mounting(), GEOID, found)
+    placed, _ = geotags.read(flight, geotags.PlacedBy(Mounting(), GEOID, found))
     assert placed[3].tag.pose.source == "interpolated"
 
 
@@ -298,7 +298,9 @@ def test_the_marks_antenna_has_a_lever_arm_of_its_own(tmp_path: Path) -> None:
     arms = Mounting(lever_m=(0.5, 0.0, 0.1))
     one = marks.find(flight, path, GEOID)
     other = marks.find(flight, path, GEOID, (0.3, 0.0, -0.2))  # 0.3 m nearer to the nose, and higher
-    (lost, here), (same, there) = (geotags.read(flight, arms, GEOID, found)[0][:2] for found in (one, other))
+    (lost, here), (same, there) = (
+        geotags.read(flight, geotags.PlacedBy(arms, GEOID, found))[0][:2] for found in (one, other)
+    )
     assert lost.camera == same.camera
     assert here.camera is not None
     assert there.camera is not None

@@ -27,7 +27,7 @@ def handed(short_flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 def _in_all_forms(short_flight: Flown, output: Path) -> Path:
     kinds = [*FORMS] if _has("mcap_ros2") else [form for form in FORMS if form != "mcap"]
-    placed, _ = geotags.read(short_flight.folder, Mounting(), Geoid(offset_m=UNDULATION_M))
+    placed, _ = geotags.read(short_flight.folder, geotags.PlacedBy(Mounting(), Geoid(offset_m=UNDULATION_M)))
     by_index = {one.frame.index: replace(one, utc_ns=one.tag.utc_ns) for one in placed}
     jobs = batch.plan(short_flight.folder, short_flight.recipe, Options(view="ground"), kinds, output, placed=by_index)
     assert [batch.make(job).error for job in jobs] == [None, None]

@@ -30,7 +30,7 @@ EXIF = 0x8769
 @pytest.fixture(scope="module")
 def photos(short_flight: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
     output = tmp_path_factory.mktemp("photos")
-    placed, _ = geotags.read(short_flight.folder, Mounting())
+    placed, _ = geotags.read(short_flight.folder, geotags.PlacedBy(Mounting()))
     by_index = {one.frame.index: one for one in placed}
     jobs = batch.plan(short_flight.folder, short_flight.recipe, Options(), ["photos"], output, placed=by_index)
     assert [batch.make(job).error for job in jobs] == [None, None]
@@ -136,7 +136,7 @@ def test_exiv2_reads_exif_and_xmp(photos: Path) -> None:
 
 
 def test_what_a_pixel_covers_is_told_where_pictures_are_promised(short_flight: Flown) -> None:
-    placed, _ = geotags.read(short_flight.folder, Mounting())
+    placed, _ = geotags.read(short_flight.folder, geotags.PlacedBy(Mounting()))
     heights = [-truth.pose.position_ned_m[2] for truth in short_flight.truths if truth.pose is not None]
     cm = 100 * float(np.median(heights)) * 0.01 / 50  # of 10 µm behind 50 mm
     assert photo_files.ground_words(placed).startswith(f"pictures: {cm:.2g} cm of ground per pixel from ")

@@ -25,6 +25,7 @@ from dappled.products.maps.ground import Flat
 from dappled.products.maps.ground import load as load_ground
 from dappled.products.maps.photographs import Photograph
 from dappled.products.maps.references import BaseMap, BaseMapError
+from dappled.products.maps.refine import RefinedBy
 from tests.products import flown
 from tests.products.flown import Flown
 from tests.products.maps.test_eye import eye_at
@@ -111,7 +112,7 @@ def test_from_two_metres_and_a_degree_a_base_map_brings_corners_home(rough: Case
     before = rough.corner_errors_m(rough.survey.photographs)
     assert before.mean() > 40 * gsd_m
     better, said = refine.refine(
-        rough.survey.photographs, rough.survey.ground, base=rough.base, sigmas=(2.0, math.radians(1))
+        rough.survey.photographs, rough.survey.ground, RefinedBy(base=rough.base, sigmas=(2.0, math.radians(1)))
     )
     assert [one.why for one in said] == [None] * len(TIMES)
     after = rough.corner_errors_m(better)
@@ -123,7 +124,7 @@ def test_from_two_metres_and_a_degree_a_base_map_brings_corners_home(rough: Case
 def test_neighbours_agree_better_after_refinement(rough: Case) -> None:
     """Without a map the strip as a whole stays where telemetry has it, but its frames fit each other."""
     photos = rough.survey.photographs
-    better, said = refine.refine(photos, rough.survey.ground, neighbours=True, sigmas=(2.0, math.radians(1)))
+    better, said = refine.refine(photos, rough.survey.ground, RefinedBy(neighbours=True, sigmas=(2.0, math.radians(1))))
     refined = [one.why is None for one in said]
     assert sum(refined) >= len(TIMES) - 1
     steps = [np.diff([one.eye.centre for one in some], axis=0) for some in (photos, better)]
@@ -148,7 +149,7 @@ def test_control_points_place_a_frame(rough: Case, tmp_path: Path) -> None:
     (tmp_path / "gcp.csv").write_text("\n".join(lines))
     points = references.read_control_points(tmp_path / "gcp.csv", rough.survey.projection)
     better, said = refine.refine(
-        rough.survey.photographs, rough.survey.ground, control=points, sigmas=(2.0, math.radians(1))
+        rough.survey.photographs, rough.survey.ground, RefinedBy(control=points, sigmas=(2.0, math.radians(1)))
     )
     gsd_m = one.eye.gsd_m(rough.flown.path.home_altitude_msl_m)
     assert said[1].why is None
@@ -189,7 +190,7 @@ def test_a_base_map_of_something_else_is_refused_frame_by_frame(exact: Case, tmp
     with rasterio.open(tmp_path / "noise.tif", "w", **profile) as target:
         target.write(noise)
     base = BaseMap(tmp_path / "noise.tif", exact.survey.projection, exact.survey.gsd_m)
-    better, said = refine.refine(exact.survey.photographs[:2], exact.survey.ground, base=base)
+    better, said = refine.refine(exact.survey.photographs[:2], exact.survey.ground, RefinedBy(base=base))
     few = {Code.POSE_FEW_POINTS, Code.POSE_POINTS_DISAGREE, Code.POSE_UNMATCHED}
     assert all(one.why is not None and one.why.code in few for one in said)
     assert all(a is b for a, b in zip(better, exact.survey.photographs, strict=False))
@@ -237,7 +238,9 @@ def test_bad_control_points_and_base_maps_are_sentences(exact: Case, tmp_path: P
     path.write_text("name,frame,column,row,latitude,longitude,altitude\na,999,1,2,41,9,3\n")
     with pytest.raises(DappledError, match="names frame 999"):
         refine.refine(
-            exact.survey.photographs[:1], exact.survey.ground, control=references.read_control_points(path, projection)
+            exact.survey.photographs[:1],
+            exact.survey.ground,
+            RefinedBy(control=references.read_control_points(path, projection)),
         )
     with rasterio.open(exact.folder / "base.tif") as read:
         profile = {**read.profile, "transform": rasterio.Affine(1e-6, 0, 10.0, 0, -1e-6, 50.0)}

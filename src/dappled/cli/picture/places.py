@@ -23,7 +23,7 @@ def place_of(frame: Path) -> exif_gps.Place | None:
 def _placed(flight: Path) -> dict[str, exif_gps.Place]:
     """The positions of a flight's frames by their names."""
     facts = layout.read_facts(layout.open_folder(flight))
-    found, _ = geotags.read(flight, Mounting.of(facts))
+    found, _ = geotags.read(flight, geotags.PlacedBy(Mounting.of(facts)))
     return {
         one.file_name: exif_gps.place(one.camera, one.utc_ns, one.tag.pose) for one in found if one.camera is not None
     }

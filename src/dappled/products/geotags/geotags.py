@@ -50,18 +50,22 @@ class Written:
     without_tag: tuple[str, ...]
 
 
-def read(
-    flight: Path,
-    mounting: Mounting,
-    geoid: Geoid | None = None,
-    marked: Marked | None = None,
-    tags: Mapping[int, Tag] | None = None,
-) -> tuple[list[Placed], list[str]]:
-    """A flight's tagged frames in order, and the names of frames without a tag. Where a frame has a mark, its time and
-    position are the mark's. `tags` replace the recorded ones. Doubts whose a frame is that came after
+@dataclass(frozen=True, slots=True)
+class PlacedBy:
+    """What frames are placed by. Where one has a mark, its time and position are the mark's. `tags` replace the
+    recorded ones; with a geoid heights are ellipsoidal."""
+
+    mounting: Mounting
+    geoid: Geoid | None = None
+    marked: Marked | None = None
+    tags: Mapping[int, Tag] | None = None
+
+
+def read(flight: Path, by: PlacedBy) -> tuple[list[Placed], list[str]]:
+    """A flight's tagged frames in order, and the names of frames without a tag. Doubts whose a frame is that came after
     its tag are among the tag's. Raises FlightError and EarthError."""
     with LedgerReader.open(layout.open_folder(flight).ledger) as ledger:
-        tags = ledger.tags() if tags is None else tags
+        tags = ledger.tags() if by.tags is None else by.tags
         frames, correction_ns = ledger.frames(), ledger.utc_correction_ns()
         doubted = _doubts(ledger, LATER_DOUBT)
     placed = []
@@ -70,12 +74,12 @@ def read(
         if tag is None:
             continue
         utc_ns = None if correction_ns is None else tag.utc_ns + correction_ns
-        if marked is not None and frame.index in marked.marks:
-            tag = marked.tag(tag, geoid)
+        if by.marked is not None and frame.index in by.marked.marks:
+            tag = by.marked.tag(tag, by.geoid)
             utc_ns = tag.utc_ns
         later = (found for index, found in doubted if index == frame.index)
         tag = replace(tag, doubts=(*tag.doubts, *later))
-        placed.append(Placed(frame, tag, _camera(tag.pose, mounting, geoid), utc_ns))
+        placed.append(Placed(frame, tag, _camera(tag.pose, by.mounting, by.geoid), utc_ns))
     return placed, [frame.name for frame in frames if frame.index not in tags]
 
 
@@ -95,18 +99,15 @@ def doubts(flight: Path) -> list[Finding]:
 
 def write(
     flight: Path,
-    mounting: Mounting,
+    by: PlacedBy,
     *,
-    geoid: Geoid | None = None,
-    marked: Marked | None = None,
-    tags: Mapping[int, Tag] | None = None,
     output: Path | None = None,
     replace_extension: bool = False,
     force: bool = False,
 ) -> Written:
     """Write sidecars beside the frames, and geo.txt, pix4d.csv and track.geojson into `<flight>/geotags/`; or all of
     them into `output`. Raises FlightError, DappledError and EarthError."""
-    placed, without_tag = read(flight, mounting, geoid, marked, tags)
+    placed, without_tag = read(flight, by)
     inside = layout.FlightFolder(flight)
     forms: dict[str, Callable[[Sequence[Placed]], str]] = {
         "geo.txt": odm,
@@ -128,22 +129,14 @@ def write(
     return Written(tuple(files), len(placed) - len(lost), lost, tuple(without_tag))
 
 
-def copies(
-    flight: Path,
-    folder: Path,
-    mounting: Mounting,
-    geoid: Geoid | None = None,
-    marked: Marked | None = None,
-    *,
-    tags: Mapping[int, Tag] | None = None,
-) -> Iterator[tuple[str, Path | str]]:
+def copies(flight: Path, folder: Path, by: PlacedBy) -> Iterator[tuple[str, Path | str]]:
     """Copy the placed frames to `folder`, with positions in EXIF; yields (frame, its copy or why there is none).
 
     The originals are only read. Raises FlightError, also for a folder within the flight.
     """
     if folder.resolve().is_relative_to(flight.resolve()):
         raise FlightError(f"cannot write copies into the flight itself ({folder}): give another folder")
-    placed, without_tag = read(flight, mounting, geoid, marked, tags)
+    placed, without_tag = read(flight, by)
     originals = [layout.FlightFolder(flight).file(one.frame.name) for one in placed]
     _make(folder)
     for one, original in zip(placed, originals, strict=True):

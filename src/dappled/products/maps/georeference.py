@@ -32,6 +32,7 @@ from dappled.products.maps.laboratory import MEAN, Laboratory, ShadowAsked, expo
 from dappled.products.maps.map_grid import MapError
 from dappled.products.maps.photographs import Photograph, Station
 from dappled.products.maps.references import BaseMap
+from dappled.products.maps.refine import RefinedBy
 from dappled.products.maps.self_calibration import FlightLens
 from dappled.products.mounting import Mounting
 
@@ -51,7 +52,7 @@ class Options:
     at the sensor's own resolution), "ground" (all views, refocused on the ground) or "v,u". `focus_m` is the distance
     at which the lens was focused. `frames` holds the frames' numbers. `as_flown`: camera, mask, calibration
     and focal length are those of decoding in flight, so that what this told of the mask counts where no light field is
-    made.
+    made. `workers`: how many processes make the frames.
     """
 
     mounting: Mounting = field(default_factory=Mounting)
@@ -66,6 +67,7 @@ class Options:
     f_number: float | None = None
     frames: frozenset[int] | None = None
     as_flown: bool = False
+    workers: int = 1
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,11 +125,10 @@ def survey(
     *,
     watch: Watch | None = None,
     foresee: Callable[[Survey], None] = lambda _: None,
-    workers: int = 1,
 ) -> Survey:
     """Decode and place a flight's frames. Those that can't be decoded or placed are left out and named; `stack` owns
-    the pictures' scratch folder; `watch` gets each frame, in this process; without one the frames are made in so many
-    `workers`. `foresee` gets the survey without pictures before the first
+    the pictures' scratch folder; `watch` gets each frame, in this process; without one the frames are made in
+    `options.workers`. `foresee` gets the survey without pictures before the first
     one is made, where poses and optics tell it, and raises what needs no picture to be known. Raises DappledError where
     no frame is left, or the options are wrong."""
     stations, left = photographs.stations(flight, options.mounting)
@@ -149,7 +150,7 @@ def survey(
         check_ground(options.terrain)
     if (planned := _foreseen(flight, decoders, stations, projection, options)) is not None:
         foresee(planned)
-    workers = 1 if watch is not None else processes.worth(workers, len(stations))
+    workers = 1 if watch is not None else processes.worth(options.workers, len(stations))
     recipe = recipe.shared_by(workers)
     flown = photographs.flown_nats(flight) if options.as_flown else {}
     taken: list[Photograph] = []
@@ -307,16 +308,8 @@ def refined(
     if raster is not None:
         raster.check(np.concatenate([map_grid.footprint(one.eye, made.ground)[:, :2] for one in made.photographs]))
     points, unseen = references.control_of(control, made.projection, made.photographs)
-    photos, judged = refine.refine(
-        made.photographs,
-        made.ground,
-        base=raster,
-        neighbours=neighbours,
-        control=points,
-        search_m=search_m,
-        sigmas=sigmas,
-        progress=progress,
-    )
+    by = RefinedBy(raster, neighbours, points, search_m, sigmas)
+    photos, judged = refine.refine(made.photographs, made.ground, by, progress)
     facts = {
         one.name: {**made.facts.get(one.name, {}), **said.facts()} for one, said in zip(photos, judged, strict=True)
     }

@@ -53,37 +53,42 @@ class Refinement:
         return {"refined": self.why is None, **codec.plain(self)}
 
 
+@dataclass(frozen=True, slots=True)
+class RefinedBy:
+    """What poses are refined against. `search_m` is the distance over which the base map is searched; `sigmas` (m, rad)
+    replace the recorded ones."""
+
+    base: BaseMap | None = None
+    neighbours: bool = False
+    control: Sequence[ControlPoint] = ()
+    search_m: float = 5.0
+    sigmas: tuple[float, float] | None = None
+
+
 def refine(
     photographs: Sequence[Photograph],
     ground: Ground,
-    *,
-    base: BaseMap | None = None,
-    neighbours: bool = False,
-    control: Sequence[ControlPoint] = (),
-    search_m: float = 5.0,
-    sigmas: tuple[float, float] | None = None,
+    by: RefinedBy,
     progress: Callable[[str, int, int], None] = lambda *_: None,
 ) -> tuple[list[Photograph], list[Refinement]]:
-    """Refine the photographs' eyes; returns the photographs and the result for each.
-
-    `search_m` is the distance over which the base map is searched; `sigmas` (m, rad) replace the recorded ones.
-    """
-    doubts = _doubts(photographs, sigmas, loose=base is not None or bool(control))
+    """Refine the photographs' eyes; returns the photographs and the result for each."""
+    base = by.base
+    doubts = _doubts(photographs, by.sigmas, loose=base is not None or bool(by.control))
     found = matching.of_all([one.image for one in photographs], progress)
     groups: list[Marks | Ties] = []
     tried = np.zeros(len(photographs), dtype=int)
     if base is not None:
         for number, (one, seen) in enumerate(zip(photographs, found, strict=True)):
             progress("match base map", number, len(photographs))
-            marks, matches = _to_base(number, one, seen, base=base, ground=ground, search_m=search_m)
+            marks, matches = _to_base(number, one, seen, base=base, ground=ground, search_m=by.search_m)
             tried[number] += matches
             groups += [] if marks is None else [marks]
-    if neighbours:
+    if by.neighbours:
         for pair in matching.neighbours(len(photographs), progress):
             ties, matches = _to_neighbour(pair, photographs, found, ground, float(np.max(doubts[[*pair], :3])))
             tried[[*pair]] += matches
             groups += [] if ties is None else [ties]
-    groups += _to_control(photographs, control)
+    groups += _to_control(photographs, by.control)
     eyes = [one.eye for one in photographs]
     solution = adjust(eyes, groups, ground, sigmas=doubts)
     if base is not None:
