@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import pytest
@@ -44,9 +45,9 @@ class World:
     camera: CameraRemarks = field(default_factory=CameraRemarks)
     clock: RecordedClock = field(default_factory=lambda: RecordedClock(10**11))
 
-    def ground_station(self, frames: int) -> Asker:
+    def ground_station(self, frames: int) -> Callable[[], bool]:
         self.asked += frames
-        return self.asker
+        return self.asker.running
 
     def condition(self, frames: int | None = None, seconds: float | None = None) -> StopCondition:
         ask = self.ground_station if self.asks else None

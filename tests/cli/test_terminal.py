@@ -76,13 +76,9 @@ def test_a_finding_is_said_once_each_time_it_begins() -> None:
         def health(self) -> Mapping[str, Any]:
             return {**HEALTH, "findings": [{**codec.plain(one), "age_s": 0.0} for one in here]}
 
-    class Manager:
-        def status(self, text: str) -> None:
-            lines.append(text)
-
     remarks = ProblemRemarks(
         cast(Service, Daemon()),
-        Manager(),
+        lines.append,
         say=lambda text, *_, **__: said.append(text),
         clock=clock,
     )

@@ -124,7 +124,7 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
     manager, camera, tally = Notifier(), CameraRemarks(), Tally()
     frames = FrameLines(as_json=plan.as_json)
     asked, hung_up = threading.Event(), threading.Event()
-    ask = None if simulation is None else simulation.ground_station
+    ask = None if simulation is None else lambda frames: simulation.ground_station(frames).running
     goal = StopCondition(tally, plan.frames, plan.seconds, camera=camera, ask=ask, clock=SystemClock())
 
     def fly(flown: Settings, after: FlightHandover) -> bool:
@@ -134,7 +134,7 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
         )
         if service is None:
             return False
-        problems = ProblemRemarks(service, manager)
+        problems = ProblemRemarks(service, manager.status)
 
         def turn() -> bool:
             """Do what is due after each turn of the working loop. Returns whether to end."""

@@ -9,13 +9,6 @@ from dappled.cli.terminal import CameraRemarks, Tally
 from dappled.clock import Clock
 
 
-class Asker(Protocol):
-    """A ground station that asks for frames."""
-
-    def running(self) -> bool:
-        """Whether it still asks, or waits for an answer."""
-
-
 class BegunFlight(Protocol):
     """A flight that has begun."""
 
@@ -27,8 +20,9 @@ class BegunFlight(Protocol):
 class StopCondition:
     """The end of a run: `frames` shots have ended, or `seconds` have passed since the first flight began.
 
-    None means no such end. Where frames are wanted, a ground station that asks for them (`ask`) is started once the
-    `camera` is ready. The run ends when it has no more requests to send and all of its shots have ended.
+    None means no such end. Where frames are wanted, a ground station that asks for them is started by `ask` once the
+    `camera` is ready; what this returns says whether it still asks. The run ends when it has no more requests to send
+    and all of its shots have ended.
     """
 
     def __init__(
@@ -38,13 +32,13 @@ class StopCondition:
         seconds: float | None,
         *,
         camera: CameraRemarks,
-        ask: Callable[[int], Asker] | None,
+        ask: Callable[[int], Callable[[], bool]] | None,
         clock: Clock,
     ) -> None:
         self._tally, self._frames, self._seconds = tally, frames, seconds
         self._camera, self._ask, self._clock = camera, ask, clock
         self._until_ns: int | None = None
-        self._asker: Asker | None = None
+        self._asks: Callable[[], bool] | None = None  # whether it still asks, or waits for an answer
         self._flight: BegunFlight | None = None
         self._earlier = 0
 
@@ -65,9 +59,9 @@ class StopCondition:
             return True
         if self._frames is None:
             return False
-        if self._ask is not None and self._asker is None and self._camera.state == "ready":
-            self._asker = self._ask(self._frames)
+        if self._ask is not None and self._asks is None and self._camera.state == "ready":
+            self._asks = self._ask(self._frames)
         if self._tally.count >= self._frames:
             return True
         requested = self._earlier + (0 if self._flight is None else self._flight.requested)
-        return self._asker is not None and not self._asker.running() and self._tally.count >= requested
+        return self._asks is not None and not self._asks() and self._tally.count >= requested

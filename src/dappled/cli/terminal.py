@@ -11,7 +11,7 @@ import logging
 import os
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -166,25 +166,18 @@ class RunObserver(Observer):
         self._camera.changed(change)
 
 
-class StatusLine(Protocol):
-    """A service manager that shows one line."""
-
-    def status(self, text: str) -> None:
-        """Show this line."""
-
-
 class ProblemRemarks:
-    """Prints each problem once when it appears, and gives the service manager its status line, each second."""
+    """Prints each problem once when it appears, and gives the service manager its `status` line, each second."""
 
     def __init__(
         self,
         daemon: Service,
-        manager: StatusLine,
+        status: Callable[[str], object],
         *,
         say: Say = remark,
         clock: Clock | None = None,
     ) -> None:
-        self._daemon, self._manager, self._say, self._clock = daemon, manager, say, clock or SystemClock()
+        self._daemon, self._status, self._say, self._clock = daemon, status, say, clock or SystemClock()
         self._new = NewFindings()
         self._due_ns = self._clock.monotonic_ns() + _PROBLEMS_EVERY_NS
 
@@ -197,7 +190,7 @@ class ProblemRemarks:
         record = self._daemon.health()
         for one in self._new.among(unasked(record)):
             self._say(f"{one.level.word}: {told(one)}", logging.WARNING, finding=one.code.value)
-        self._manager.status(status_line(record))
+        self._status(status_line(record))
 
 
 def _journalled() -> bool:

@@ -20,18 +20,16 @@ NONE, TERMINATE, RESET, LIST, OPEN, READ, CREATE, CRC32, BURST = 0, 1, 2, 3, 4, 
 ACK, NAK = 128, 129
 
 
-class Files:
+def files() -> dict[str, bytes]:
     """One file."""
-
-    def files(self) -> dict[str, bytes]:
-        return {"camera.xml": DATA}
+    return {"camera.xml": DATA}
 
 
 class Client:
     """Speaks the protocol by hand: what it sends and hears are bytes."""
 
     def __init__(self, server: FtpServer | None = None, component: int = 190) -> None:
-        self.server = server or FtpServer(Files())
+        self.server = server or FtpServer(files)
         self.packer = mavlink.MAVLink(None, srcSystem=255, srcComponent=component)
         self.sequence = 0
         self.now_ns = 0
@@ -188,7 +186,7 @@ class Link:
 @pytest.mark.parametrize("lost", [set(), {2, 9, 10, 30}])
 def test_pymavlink_s_client_reads_a_file(tmp_path: Path, lost: set[int]) -> None:
     """Listing, checksum, and the whole file in bursts, also where answers are lost."""
-    link = Link(FtpServer(Files()), set())
+    link = Link(FtpServer(files), set())
     client = mavftp.MAVFTP(link, 1, 100)
     client.ftp_settings.retry_time = client.ftp_settings.read_retry_time = 0.2
     client.ftp_settings.idle_detection_time = 1.0

@@ -170,7 +170,7 @@ class Component:
             component_id=links.component_id,
         )
         self._parameters = ParameterServer(parameters)
-        self._files = FtpServer(self._status)
+        self._files = FtpServer(self._status.files)
         self._answers, self._words = Rate(_ANSWERS_A_S), Rate(_WORDS_A_S)
         self._dedup, self._routes = PacketDedup(), ReportRoutes()
         self._lines, self._stations = PilotMessages(), GroundStations()

@@ -11,7 +11,6 @@ import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
 
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
 
@@ -58,21 +57,14 @@ class _Answered:
     opened: _Session | None
 
 
-class ServedFiles(Protocol):
-    """What files there are: `CameraStatus`."""
-
-    def files(self) -> Mapping[str, bytes]:
-        """Their content by name, without folders, as it is now."""
-
-
 class FtpServer:
-    """Serves the files of `source`.
+    """Serves `files`, their content by name, without folders, as it is when they are asked for.
 
     At most eight files are open; one that is idle for a minute is closed.
     """
 
-    def __init__(self, source: ServedFiles) -> None:
-        self._source = source
+    def __init__(self, files: Callable[[], Mapping[str, bytes]]) -> None:
+        self._files = files
         self._sessions: dict[int, _Session] = {}
         self._last: dict[tuple[_Client, int], _Answered] = {}  # a retry gets the same answer
 
@@ -122,11 +114,11 @@ class FtpServer:
         return [_Reply()]
 
     def _checksum(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
-        data = self._source.files().get(_name(request.data))
+        data = self._files().get(_name(request.data))
         return [_refusal(_NOT_FOUND) if data is None else _Reply(data=struct.pack("<I", _crc32(data)))]
 
     def _list(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
-        names = [f"F{name}\t{len(data)}\0".encode() for name, data in sorted(self._source.files().items())]
+        names = [f"F{name}\t{len(data)}\0".encode() for name, data in sorted(self._files().items())]
         if _name(request.data) not in ("", "."):
             return [_refusal(_NOT_FOUND)]
         text = b""
@@ -137,7 +129,7 @@ class FtpServer:
         return [_Reply(data=text) if text else _refusal(_END)]
 
     def _open(self, request: _Request, client: _Client, now_ns: int) -> list[_Reply]:
-        data = self._source.files().get(_name(request.data))
+        data = self._files().get(_name(request.data))
         if data is None:
             return [_refusal(_NOT_FOUND)]
         if len(self._sessions) >= SESSIONS:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import tomli_w
@@ -16,6 +16,7 @@ from dappled.config import profiles
 from dappled.config.schema import ConfigError, read_toml
 from dappled.decode import DecodeError
 from dappled.decode.calibration import Calibration
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import first_line
 from dappled.findings import Code, Finding, Subject, finding
 
@@ -73,23 +74,7 @@ def load(path: Path) -> Calibration:
         raise ConfigError(f"{path}: {error}") from error
 
 
-class Calibrated(Protocol):
-    """What frames are decoded with: `Recipe`. `camera` and `mask` are profiles, `law` is "" for the profile's own."""
-
-    @property
-    def camera(self) -> str: ...
-
-    @property
-    def mask(self) -> str: ...
-
-    @property
-    def law(self) -> str: ...
-
-    @property
-    def calibration(self) -> str: ...
-
-
-def misfit(recipe: Calibrated, model: str = "") -> Finding | None:
+def misfit(recipe: Recipe, model: str = "") -> Finding | None:
     """Why the calibration (fact `file`) can't be used: it is for another mask, law or frame size. None where it can,
     or there is none.
 
