@@ -27,7 +27,7 @@ from dappled.clock import SystemClock
 from dappled.drivers.child_process import end_child
 from dappled.drivers.python_command import python_module
 from dappled.errors import DappledError
-from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose
+from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose, Properties
 from dappled.mocks.body.eos_card import CARD_BYTES
 from dappled.mocks.body.faults import BodyFaults
 from dappled.mocks.body.ptpip import Responder
@@ -327,16 +327,10 @@ def serve(options: BodyOptions, lines: Iterable[str], answerer: Answerer = _over
     for fault in options.faults:
         faults.command(fault)
     source = pictures(options)
-    eos = Eos450d(
-        source.expose,
-        faults,
-        clock,
-        serial=options.serial,
-        card_bytes=options.card_bytes,
-        pairs=options.pairs,
-        f_number=options.f_number,
-        exposure_s=source.exposure_s,
+    properties = Properties(
+        options.serial, pairs=options.pairs, f_number=options.f_number, exposure_s=source.exposure_s
     )
+    eos = Eos450d(source.expose, faults, clock, properties, card_bytes=options.card_bytes)
     responder = answerer(eos, faults, options)
     _say(f"port {' '.join(map(str, responder.ports))}")
     for line in lines:

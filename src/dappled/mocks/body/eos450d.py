@@ -50,24 +50,18 @@ class Eos450d:
         expose: Expose,
         faults: BodyFaults,
         clock: Clock,
+        properties: Properties | None = None,
         *,
-        serial: str = SERIAL,
         card_bytes: int = CARD_BYTES,
-        pairs: bool = False,
-        f_number: float | None = None,
-        exposure_s: float | None = None,
     ) -> None:
-        """What the body says it is set to, to the next third of a stop: f-number (None: f/2.8), exposure time in
-        seconds (None: 1/250 s)."""
         self._expose = expose
         self._faults = faults
-        self._serial = serial
         self._clock = clock
         self._lock = threading.Lock()  # held around all that follows
         self._session = self._working = False
         self._releases = self._looks = self._numbered = self._wrong_s = 0
         self._card = Card(card_bytes, faults, clock.utc_ns() // 10**9)
-        self._properties = Properties(serial, pairs=pairs, f_number=f_number, exposure_s=exposure_s)
+        self._properties = properties or Properties()
         self._handlers: dict[int, Handler] = {
             Op.GET_DEVICE_INFO: self._device_info,
             Op.OPEN_SESSION: self._open,
@@ -139,7 +133,7 @@ class Eos450d:
             data=ptp.device_info(
                 model=MODEL,
                 version="3-1.0.4",
-                serial=self._serial.rjust(32, "0"),
+                serial=self._properties.serial.rjust(32, "0"),
                 operations=_OPERATIONS,
                 events=_EVENTS,
                 properties=(0xD402, 0xD407, 0xD406),
@@ -327,8 +321,16 @@ class Properties:
     """The values of the properties, and the events not fetched yet. The caller holds the body's lock."""
 
     def __init__(
-        self, serial: str, *, pairs: bool, f_number: float | None = None, exposure_s: float | None = None
+        self,
+        serial: str = SERIAL,
+        *,
+        pairs: bool = False,
+        f_number: float | None = None,
+        exposure_s: float | None = None,
     ) -> None:
+        """What the body says it is set to, to the next third of a stop: f-number (None: f/2.8), exposure time in
+        seconds (None: 1/250 s)."""
+        self.serial = serial
         self._events: deque[bytes] = deque()
         self._values: dict[int, bytes] = {
             Prop.APERTURE: _u32(0x20 if f_number is None else _aperture(f_number)),
