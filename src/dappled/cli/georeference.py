@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
@@ -32,6 +31,7 @@ if not words_only:
     from dappled.products.survey import frame_terrain
     from dappled.products.survey.frame_depths import FrameDepths
     from dappled.products.survey.frame_terrain import FrameTerrainError
+    from dappled.products.whole_files import write_json
 
 _FILES = {
     "kmz": ("mosaic.kmz",),
@@ -145,18 +145,14 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
             if self.against:
                 files += self._changes(made, terrain_of, folder, output, missing)
         made = replace(made, notes=(*made.notes, *missing))
-        report = map_files.write_report(made, folder, files)
+        facts = map_files.report(made, files)
+        files.append(write_json(folder / "report.json", facts))
         for said in (*map(text, made.left), *(named(one, _MAP) for one in made.notes if one not in told)):
             output.remark(str(said))
         frames = counted(len(made.photographs), "frame")
         lines = [f"{frames} on {made.projection.name}, {made.gsd_m:g} m per cell, {made.ground.name}"]
         lines += made.lens.words() if made.lens is not None else ()
-        return Report(
-            json.loads(report.read_text()),
-            [*lines, *map(str, (*files, report))],
-            findings=made.doubts,
-            failed=bool(missing),
-        )
+        return Report(facts, [*lines, *map(str, files)], findings=made.doubts, failed=bool(missing))
 
     def _foresee(self, told: list[Finding], output: Output, planned: Survey) -> None:
         """Say what will be missing by poses alone, and add it to `told`. Raises HyperstereoError where that is all, and

@@ -104,9 +104,9 @@ def write_footprints(made: Survey, output: Path) -> Path:
     return write_json(output / "footprints.geojson", {"type": "FeatureCollection", "features": features})
 
 
-def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
-    """Write report.json: projection, ground and files of the map, frames left out, and how each frame was refined."""
-    facts = {
+def report(made: Survey, files: Sequence[Path]) -> dict[str, Any]:
+    """What report.json holds: projection, ground and files, frames left out, and how each frame was refined."""
+    return {
         "flight": made.flight,
         "crs": made.projection.name,
         "ground": made.ground.name,
@@ -118,7 +118,6 @@ def write_report(made: Survey, output: Path, files: Sequence[Path]) -> Path:
         "lens": None if made.lens is None else made.lens.facts(),
         "files": [path.name for path in files],
     }
-    return write_json(output / "report.json", facts)
 
 
 def feature(photograph: Photograph, ground: Ground, projection: Projection, facts: dict[str, Any]) -> dict[str, Any]:
