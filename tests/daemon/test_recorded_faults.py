@@ -13,9 +13,9 @@ import pytest
 from dappled.clock import RecordedClock
 from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.pipeline import tagging
-from dappled.daemon.pipeline.tagging import FrameSettings
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
+from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.checks.flight_check import check
 from dappled.mocks.autopilot.autopilot import BootTime
@@ -62,7 +62,7 @@ def fly(flights: Path, packets: Packets, exposures_s: list[float]) -> Path:
         with held(b"frame %d" % index) as blob:
             frame = begun.recorder.record(index, "IMG.DNG", blob, arrived_utc_ns=START_NS + called_ns + 10**8)
         exposure, pose = telemetry.locate(clocks.mid_exposure(START_NS + called_ns, LATENCY, None))
-        begun.ledger.add_tag(tagging.tag(frame, exposure, FrameSettings(), camera="test", mask="mask", pose=pose))
+        begun.ledger.add_tag(tagging.tag(frame, exposure, ExposureSettings(), camera="test", mask="mask", pose=pose))
         begun.ledger.add_result(Result(index, "0" * 64, 1, 1, "geometric", "calibrated"))
 
     for t_s, message in packets:

@@ -156,7 +156,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
                     shape, "found", None, found.lattice, rows, main, found, "found", None, found.rotation_rad
                 )
             decoder = known_to(
-                darkroom.mask_decoder(shape, raw.camera_model or ""), None if self.focal_length else raw.focal_sigma_mm
+                darkroom.mask_decoder(shape, raw.model or ""), None if self.focal_length else raw.focal_sigma_mm
             )
             length = self.focal_length or raw.focal_length_mm
             if length is None:
@@ -165,7 +165,7 @@ class ShowCarriers(Overwriting, Doubtable, RecipeArguments, Verb):
             predicted = decoder.predict(length)
             used, seen, carriers_from = decoder.locate(spectrum, length, predicted)
             stop = self.f_number or raw.f_number
-            stops = darkroom.camera(raw.camera_model or "").f_numbers
+            stops = darkroom.camera(raw.model or "").f_numbers
             lens = FrameLens(length, stop, None if stops is None else stops[1])
             checked = check(
                 decoder,

@@ -25,10 +25,10 @@ from dappled.daemon.pipeline.decode_process import (
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.pipeline.live_depth import LiveDepth
 from dappled.daemon.pipeline.live_picture import LivePictures
-from dappled.daemon.pipeline.tagging import FrameSettings as Shown
 from dappled.daemon.pipeline.tagging import tag
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
+from dappled.drivers.raw.raw_file import ExposureSettings
 from dappled.findings import FRAME, Code, finding
 from dappled.flight import Cause, Frame, Shot, TimeSource
 from tests.daemon.fakes import FakeCamera, no_pose
@@ -72,7 +72,8 @@ class FakeMaker:
 def shot(index: int, *, decoded: bool = True) -> PendingShot:
     frame = Frame(index, f"frames/{index}.dng", "IMG.DNG", 10, "0" * 64, 0)
     exposure = ExposureTime(0, 1, TimeSource.REQUEST)
-    made = tag(frame, exposure, Shown(50.0, 8.0, 0.01, 100.0), camera="c", mask="m", pose=no_pose())
+    shown = ExposureSettings(focal_length_mm=50.0, f_number=8.0, exposure_s=0.01, iso=100.0)
+    made = tag(frame, exposure, shown, camera="c", mask="m", pose=no_pose())
     result = None
     if decoded:
         grid = [[5.0, 0.0, 0.0], [0.0, 5.0, 0.0]]

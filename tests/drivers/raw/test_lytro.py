@@ -65,7 +65,7 @@ def test_a_container_comes_through_the_same_door_as_other_raws(kind: Kind, tmp_p
     assert (frame.black, frame.white) == (168, 2**kind.bits - 1)
     assert frame.cfa is not None
     assert "".join(frame.colour_names[i] for i in frame.cfa.flat) == kind.pattern.upper()
-    assert (frame.camera_make, frame.camera_model) == ("Lytro, Inc.", kind.model)
+    assert (frame.make, frame.model) == ("Lytro, Inc.", kind.model)
     assert (frame.focal_length_mm, frame.f_number, frame.exposure_s, frame.iso) == (6.45, 2.0, 0.004, 80)
     assert frame.taken == "2013-05-04T10:11:12.000"
     assert frame.balance == (1.4, 1.0, 1.2, 1.0)

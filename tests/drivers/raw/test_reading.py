@@ -62,7 +62,7 @@ def test_a_dng_gives_its_values_and_what_they_mean(pattern: bytes, cfa: list[lis
     assert frame.cfa is not None
     np.testing.assert_array_equal(names[frame.cfa], names[np.array(cfa)])
     assert frame.balance == pytest.approx((2.0, 1.0, 1.5, 1.0)[: len(frame.balance or ())])
-    assert (frame.camera_make, frame.camera_model) == ("dappled", "Test Body")
+    assert (frame.make, frame.model) == ("dappled", "Test Body")
     assert (frame.focal_length_mm, frame.f_number, frame.taken) == (None, None, None)
 
 
@@ -158,7 +158,7 @@ def test_a_grey_picture_gives_its_values(
     assert frame.mosaic.dtype == depth
     np.testing.assert_array_equal(frame.mosaic, values)
     assert (frame.black, frame.white, frame.cfa) == (0.0, np.iinfo(depth).max, None)
-    assert (frame.colour_names, frame.balance, frame.camera_make) == (("W",), None, None)
+    assert (frame.colour_names, frame.balance, frame.make) == (("W",), None, None)
     assert read_metadata(kind(values), name).make is None
 
 
@@ -198,7 +198,7 @@ def test_a_jpeg_gives_values_and_exif() -> None:
     image.save(file, "JPEG", exif=details)
     frame = read(file.getvalue())
     assert abs(int(frame.mosaic[3, 3]) - 100) <= 2
-    assert (frame.camera_make, frame.focal_length_mm, frame.developed) == ("Canon", 100.0, "it is a JPEG")
+    assert (frame.make, frame.focal_length_mm, frame.developed) == ("Canon", 100.0, "it is a JPEG")
 
 
 def with_chunk(name: bytes, data: bytes) -> bytes:
@@ -314,7 +314,7 @@ def test_files_of_the_two_bodies(
     frame = read(path)
     assert frame.mosaic.shape == shape
     assert frame.mosaic.dtype == np.uint16
-    assert (frame.camera_model, frame.focal_length_mm, frame.f_number) == (model, *lens)
+    assert (frame.model, frame.focal_length_mm, frame.f_number) == (model, *lens)
     assert frame.taken == "2026-11-21T10:00:00"
     assert frame.cfa is not None
     assert "/".join("".join(frame.colour_names[i] for i in row) for row in frame.cfa) == colours

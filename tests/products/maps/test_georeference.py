@@ -556,7 +556,7 @@ def decoded(short_flight: Flown) -> tuple[Station, LightField, CameraProfile]:
     darkroom = Darkroom(short_flight.recipe)
     made = darkroom.decode(short_flight.folder / frame.name, joint_views=False)
     station = photographs.station(frame, tags[frame.index], Mounting())
-    return station, made.light_field, darkroom.camera(made.raw.camera_model or "")
+    return station, made.light_field, darkroom.camera(made.raw.model or "")
 
 
 def test_a_lens_that_is_focused_near_stands_farther_from_the_sensor(

@@ -55,7 +55,7 @@ def view_of(darkroom: Darkroom, path: Path, given: Given = _NOTHING) -> Calibrat
         raise DappledError(
             f"{path}: {'; '.join(str(told(one, one.subject)) for one in bent)}; --anyway calibrates with it"
         )
-    camera = darkroom.camera(raw.camera_model or "")
+    camera = darkroom.camera(raw.model or "")
     stops = camera.f_numbers
     with naming(path):
         plane = darkroom.plane(raw)
@@ -65,7 +65,7 @@ def view_of(darkroom: Darkroom, path: Path, given: Given = _NOTHING) -> Calibrat
             _optics(darkroom, camera, shape),
             workers=2,
         )
-    return CalibrationView(shown, shape, raw.camera_model or "", tuple(bent))
+    return CalibrationView(shown, shape, raw.model or "", tuple(bent))
 
 
 def views_of(

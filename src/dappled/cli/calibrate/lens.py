@@ -100,13 +100,13 @@ def _picture(
         rows, columns = made.light_field.attributes["shape"]
         image = np.ascontiguousarray(made.light_field.slices[0].real)
         length = focal_length_mm or made.raw.focal_length_mm
-        return image, made.light_field.grid, (int(rows), int(columns)), made.raw.camera_model or "", length
+        return image, made.light_field.grid, (int(rows), int(columns)), made.raw.model or "", length
     raw = darkroom.read(path)
     with naming(path):
         plane = darkroom.plane(raw)
     grid = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     length = focal_length_mm or raw.focal_length_mm
-    return np.asarray(plane), grid, (plane.shape[0], plane.shape[1]), raw.camera_model or "", length
+    return np.asarray(plane), grid, (plane.shape[0], plane.shape[1]), raw.model or "", length
 
 
 def _size(shape: tuple[int, int]) -> str:

@@ -208,7 +208,7 @@ class DecodeWorker:
     def _picture(self, darkroom: Darkroom, done: DecodeResult, mean: NDArray[np.float32]) -> PictureFacts:
         """What the frame is judged by, with the bounds of its camera's profile, where it has one."""
         rows, columns = done.light_field.attributes["shape"]
-        key = done.raw.camera_model or "", rows, columns
+        key = done.raw.model or "", rows, columns
         if key not in self._sensors:
             try:
                 profile = darkroom.camera(key[0])

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
-from typing import Protocol, Self
+from typing import Protocol
 
 from dappled.daemon.navigation import BodyLatency, CameraClock, ExposureTime, clocks
 from dappled.daemon.pipeline.capture import NextStage, PendingShot, ShotEnds
@@ -34,32 +33,6 @@ class PoseSource(Protocol):
         """The turn rates of the body (rad/s, about its own axes) at a pose that `pose` gave; None where unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class FrameSettings:
-    """What the file says of the exposure; None where it doesn't. `taken` is the camera's own time (see EXIF)."""
-
-    focal_length_mm: float | None = None
-    f_number: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-    model: str = ""
-    taken: str | None = None
-    temperature_c: float | None = None
-
-    @classmethod
-    def of(cls, facts: ExposureSettings) -> Self:
-        """From a file's metadata."""
-        return cls(
-            facts.focal_length_mm,
-            facts.f_number,
-            facts.exposure_s,
-            facts.iso,
-            facts.model or "",
-            facts.taken,
-            facts.temperature_c,
-        )
-
-
 class Zoom:
     """The focal length from frame to frame. A change in flight moves every carrier."""
 
@@ -80,7 +53,7 @@ class Zoom:
 def tag(
     frame: Frame,
     exposure: ExposureTime,
-    settings: FrameSettings,
+    settings: ExposureSettings,
     *,
     camera: str,
     mask: str,
@@ -139,7 +112,7 @@ class Tagging:
     def _work(self, pending: PendingShot) -> None:
         """Tag a shot's frame. Where its file stays at the camera, report where it was exposed, and end it."""
         if pending.frame is None:
-            pending.where = self._poses.pose(pending.shot.index, self._expected(pending, FrameSettings()))
+            pending.where = self._poses.pose(pending.shot.index, self._expected(pending, ExposureSettings()))
             self._ends.tell(self._ends.observer.tagged, pending)
             self._ends.finish(pending)
             return
@@ -183,19 +156,19 @@ class Tagging:
             report(log, "turn rates", error)
             return None
 
-    def _settings(self, frame: Frame) -> FrameSettings:
+    def _settings(self, frame: Frame) -> ExposureSettings:
         try:
-            return FrameSettings.of(reading.read_metadata(self._ends.writer.path(frame)))
+            return reading.read_metadata(self._ends.writer.path(frame))
         except DappledError as error:
             found = finding(Code.FILE_UNREADABLE, FRAME, name=frame.name, why=str(error))
             self._ends.note("unreadable", found, frame.index)
-            return FrameSettings()
+            return ExposureSettings()
 
-    def _expected(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
+    def _expected(self, pending: PendingShot, settings: ExposureSettings) -> ExposureTime:
         """When the frame was exposed, and when it was requested (see `clocks.asked`)."""
         return clocks.asked(self._timed(pending, settings), pending.shot)
 
-    def _timed(self, pending: PendingShot, settings: FrameSettings) -> ExposureTime:
+    def _timed(self, pending: PendingShot, settings: ExposureSettings) -> ExposureTime:
         """When the frame was exposed, as far as trigger call and file say. See `clocks.owned` for a shot that the
         autopilot's message created.
 

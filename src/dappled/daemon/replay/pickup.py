@@ -321,8 +321,8 @@ def _accompany(recorder: Recorder, source: FileSource, index: int, found: FoundF
         recorder.record_companion(index, found.base, blob, arrived_utc_ns=utc_ns)
 
 
-def _settings(path: Path) -> tagging.FrameSettings:
+def _settings(path: Path) -> reading.ExposureSettings:
     try:
-        return tagging.FrameSettings.of(reading.read_metadata(path))
+        return reading.read_metadata(path)
     except DappledError:
-        return tagging.FrameSettings()  # an unreadable frame is still recorded
+        return reading.ExposureSettings()  # an unreadable frame is still recorded

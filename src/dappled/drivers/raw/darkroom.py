@@ -189,7 +189,7 @@ class Darkroom:
             with _timed(ms, "plane"):
                 rows, painted = self._lineariser.rows(raw, colour=self.recipe.colour and views)
                 plane = self._lineariser.upright(rows, raw)
-            decoder = self.decoder(plane.shape, raw.camera_model or "", colours=raw.cfa is not None)
+            decoder = self.decoder(plane.shape, raw.model or "", colours=raw.cfa is not None)
             clipped: Plane | None = None
             if isinstance(decoder, MaskDecoder):
                 decoder = known_to(decoder, None if focal_length_mm else raw.focal_sigma_mm)
@@ -218,7 +218,7 @@ class Darkroom:
         dropped = isinstance(decoder, MaskDecoder) and decoder.calibration is None  # its metres don't hold then
         attributes = {
             **light_field.attributes,
-            "camera": self.camera_name(raw.camera_model),
+            "camera": self.camera_name(raw.model),
             "mask": self.recipe.mask,
             "decoded_from": "grey" if raw.cfa is None else "mosaic",
             **raw.levels(),
@@ -250,7 +250,7 @@ class Darkroom:
         if search is None or search.found is None or search.law is None:
             return None
         shape, length = made.light_field.attributes["shape"], made.light_field.attributes["focal_length_mm"]
-        decoder = self.mask_decoder((shape[0], shape[1]), made.raw.camera_model or "")
+        decoder = self.mask_decoder((shape[0], shape[1]), made.raw.model or "")
         predicted = decoder.optics.by(search.law).lattice(length)
         (a, b), (c, d) = search.found.lattice.matrix() @ np.linalg.inv(predicted.matrix())
         sentence = f"decoded by the law {search.law} from frame {index} on: {search.sentence}"
@@ -310,7 +310,7 @@ class Darkroom:
 
     def _narrowest_f(self, raw: RawFile) -> float | None:
         """The narrowest stop of the camera's lens, where its profile knows it."""
-        stops = self.camera(raw.camera_model or "").f_numbers
+        stops = self.camera(raw.model or "").f_numbers
         return None if stops is None else stops[1]
 
     @cached_property
@@ -363,7 +363,7 @@ class FrameLineariser:
         """Put each sample where it is on the chip: spread the samples of a staggered sensor."""
         if self._recipe.mask == profiles.LENSLET:
             return rows
-        if self._is_staggered(rows.shape, raw.camera_model or ""):
+        if self._is_staggered(rows.shape, raw.model or ""):
             return spread(rows.plane(self._recipe.workers))
         return rows
 
@@ -373,7 +373,7 @@ class FrameLineariser:
         found = (shares_of_white(raw, 1) >= WHITE_SHARE).astype(np.float32)
         if not found.any():
             return None
-        return spread(found) if self._is_staggered(raw.mosaic.shape, raw.camera_model or "") else found
+        return spread(found) if self._is_staggered(raw.mosaic.shape, raw.model or "") else found
 
     def _is_staggered(self, shape: tuple[int, int], model: str) -> bool:
         if (shape, model) not in self._staggered:
@@ -418,13 +418,13 @@ class FrameLineariser:
         """Colours of masked frames: each from its own pixels, where they are on the chip."""
         shape = even.shape[0], even.shape[1]
         index = colour_index(shape, cfa)
-        if self._is_staggered(shape, raw.camera_model or ""):
+        if self._is_staggered(shape, raw.model or ""):
             even, index = spread(0.5 * even), np.rint(spread(index + np.float32(1)) / 2).astype(np.int8) - np.int8(1)
 
         def painted(field: LightField) -> NDArray[np.float32]:
             size = field.views.shape[2], field.views.shape[3]
             made = dc_views(even, index, colours, size, field.grid)
-            sensor = camera_profile(self._recipe, raw.camera_model or "").sensor((even.shape[0], even.shape[1]))
+            sensor = camera_profile(self._recipe, raw.model or "").sensor((even.shape[0], even.shape[1]))
             aspect = field.grid[0, 0] * math.hypot(*sensor.row_mm) / (field.grid[1, 1] * math.hypot(*sensor.column_mm))
             grey = field.slices[0].real
             return in_colour(field.views, grey, made, row_over_column=aspect, workers=self._recipe.workers)

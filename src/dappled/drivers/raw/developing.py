@@ -122,7 +122,7 @@ def dng(made: MadePicture) -> bytes:
     tags: list[tuple[int, int, int, object, bool]] = [
         (50706, _BYTE, 4, bytes((1, 4, 0, 0)), True),
         (50707, _BYTE, 4, bytes((1, 2, 0, 0)), True),
-        (50708, _ASCII, 0, made.raw.camera_model or "dappled", True),
+        (50708, _ASCII, 0, made.raw.model or "dappled", True),
         (50714, _SHORT, samples, (_BLACK,) * samples if samples > 1 else _BLACK, True),
         (50717, _SHORT, samples, (_WHITE,) * samples if samples > 1 else _WHITE, True),
     ]

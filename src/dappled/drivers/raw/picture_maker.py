@@ -108,7 +108,7 @@ class _Frame:
 
     @property
     def alike(self) -> _Alike:
-        return self.raw.camera_model, self.mosaic.shape, self.lens, self.decoder.optics.law
+        return self.raw.model, self.mosaic.shape, self.lens, self.decoder.optics.law
 
     @property
     def expected(self) -> ExpectedShadow:
@@ -165,11 +165,11 @@ class PictureMaker:
         with naming(one.path):
             mosaic, corner = self._mosaic(raw)
             shape = mosaic.shape[0] + 2 * corner[0], mosaic.shape[1] + 2 * corner[1]
-            decoder = self._darkroom.mask_decoder(shape, raw.camera_model or "")
+            decoder = self._darkroom.mask_decoder(shape, raw.model or "")
         return _Frame(one.path, raw, mosaic, corner, decoder, (focal_length_mm, one.f_number or raw.f_number))
 
     def _mosaic(self, raw: RawFile) -> tuple[MosaicPlane, tuple[int, int]]:
-        staggered = self._darkroom.camera(raw.camera_model or "").staggered(raw.mosaic.shape)
+        staggered = self._darkroom.camera(raw.model or "").staggered(raw.mosaic.shape)
         dark = reading.read(Path(self._recipe.dark)).mosaic if self._recipe.dark else None
         return mosaic_of(raw, self._most_px, staggered=staggered, dark=dark)
 

@@ -11,7 +11,7 @@ import math
 import mmap
 import re
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -60,16 +60,19 @@ class ExposureSettings:
     temperature_c: float | None = None
 
 
-@dataclass(frozen=True, slots=True)
-class RawFile:
+def _values(settings: ExposureSettings) -> dict[str, Any]:
+    return {one.name: getattr(settings, one.name) for one in fields(ExposureSettings)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawFile(ExposureSettings):
     """A frame's values and what its file records about them; unknown is None.
 
     `mosaic` (H, W), uint8, uint16 or float, the visible part of the sensor, a copy. `black` and `white` in the same
     units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
     repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
-    `balance` are the file's own white balance gains by colour index, green 1. `taken` is the camera's local time
-    without a zone, ISO 8601. `focal_sigma_mm` is half of what the file rounds its focal length to. `developed` says
-    by what it is known that a camera or a program has bent the values, "" where nothing tells.
+    `balance` are the file's own white balance gains by colour index, green 1. `developed` says by
+    what it is known that a camera or a program has bent the values, "" where nothing tells.
     """
 
     mosaic: Values
@@ -77,32 +80,13 @@ class RawFile:
     white: float
     cfa: NDArray[np.int64] | None
     colour_names: tuple[str, ...]
-    camera_make: str | None
-    camera_model: str | None
-    focal_length_mm: float | None
-    f_number: float | None
-    exposure_s: float | None
-    iso: float | None
-    taken: str | None
     balance: tuple[float, ...] | None
-    focal_sigma_mm: float | None = None
     developed: str = ""
 
     @classmethod
     def of(cls, settings: ExposureSettings, mosaic: Values, **known: Any) -> RawFile:
         """Make a frame of these values and exposure settings; `known` are the other fields."""
-        return cls(
-            mosaic=mosaic,
-            camera_make=settings.make,
-            camera_model=settings.model,
-            focal_length_mm=settings.focal_length_mm,
-            f_number=settings.f_number,
-            exposure_s=settings.exposure_s,
-            iso=settings.iso,
-            taken=settings.taken,
-            focal_sigma_mm=settings.focal_sigma_mm,
-            **known,
-        )
+        return cls(mosaic=mosaic, **_values(settings), **known)
 
     def levels(self) -> dict[str, Any]:
         """Return what makes the mosaic linear, as plain values: colour pattern, black level of each place, white.
@@ -118,16 +102,7 @@ class RawFile:
 
     def exposure_settings(self) -> ExposureSettings:
         """Return camera and exposure alone."""
-        return ExposureSettings(
-            self.camera_make,
-            self.camera_model,
-            self.focal_length_mm,
-            self.f_number,
-            self.exposure_s,
-            self.iso,
-            self.taken,
-            self.focal_sigma_mm,
-        )
+        return ExposureSettings(**_values(self))
 
     def colour_pattern(self) -> tuple[NDArray[np.int64] | None, float | tuple[float, ...]]:
         """Return colour pattern and black levels, with both greens as one colour where their black levels agree.

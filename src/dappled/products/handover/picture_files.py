@@ -72,7 +72,7 @@ def _settings(made: MadePicture) -> tuple[list[Entry], list[Entry]]:
     down, across = (1 / math.hypot(*step) for step in (made.sensor.row_mm, made.sensor.column_mm))
     taken = whole.replace("-", ":").replace("T", " ")
     lens = made.f_number, raw.iso, made.focal_length_mm, (across, down), made.sensor.shape[1]
-    settings = ExifSettings(raw.camera_make, raw.camera_model, taken, fraction, raw.exposure_s, *lens)
+    settings = ExifSettings(raw.make, raw.model, taken, fraction, raw.exposure_s, *lens)
     first, inner = settings.entries()
     return [*first, short_entry(0x0112, 1)], inner
 

@@ -118,7 +118,7 @@ def measured(
         rectangle_px=rectangle_px,
         reflectance=reflectance,
         reflectance_sigma=sigma,
-        camera=raw.camera_model,
+        camera=raw.model,
         focal_length_mm=made.focal_length_mm,
         f_number=made.f_number,
         exposure_s=raw.exposure_s,
@@ -152,7 +152,7 @@ def reflected(made: MadePicture, frame: str, panel: ReflectancePanel) -> tuple[R
     Raises DappledError for a panel of another camera.
     """
     raw, (names, pattern) = made.raw, _colours(made)
-    if (raw.camera_model, names) != (panel.camera, tuple(one.name for one in panel.colours)):
+    if (raw.model, names) != (panel.camera, tuple(one.name for one in panel.colours)):
         raise DappledError(f"{frame}: the panel was taken with another camera, {panel.camera or 'unknown'}")
     own, subject, found = _exposure(raw.exposure_s, raw.iso, made.f_number), Subject("frame", frame), []
     if own is None or panel.exposure is None:

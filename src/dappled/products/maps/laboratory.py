@@ -168,12 +168,12 @@ class FlightFrame:
         light_field, gains = decoded.light_field, photographs.true_colours(decoded.raw)
         if gains is not None and light_field.views.ndim == 5:
             light_field = replace(light_field, views=light_field.views * gains.astype(np.float32))
-        profile = laboratory.darkroom.camera(decoded.raw.camera_model or "")
+        profile = laboratory.darkroom.camera(decoded.raw.model or "")
         return photographs.photograph(station, light_field, profile, projection, view=view, focus_m=focus_m)
 
     def _pictured(self, maker: PictureMaker, station: Station, projection: Projection, focus_m: float) -> Photograph:
         made = maker.picture(self.path, focal_length_mm=self.focal_length_mm, f_number=self.f_number, told=self.told)
-        profile = self.laboratory.darkroom.camera(made.raw.camera_model or "")
+        profile = self.laboratory.darkroom.camera(made.raw.model or "")
         colour = self.laboratory.recipe.colour
         one = photographs.of_picture(station, made, profile, projection, focus_m=focus_m, colour=colour)
         self._found["picture"] = one.doubts
