@@ -45,7 +45,8 @@ class Flown:
         self.events: list[str] = []
         clock = RecordedClock(10**18)
         self.shutter = Shutter(FakeSink(), clock, next_index=0)
-        recipe = RecipeParameters(names or recipes.called(settings), after, LiveSettings(settings), self.shutter, self)
+        flown = names or recipes.called(settings)
+        recipe = RecipeParameters(flown, after, LiveSettings(settings), self.shutter, self.later)
         self.parameters = Parameters(NoBody(), (recipe,))
 
     def later(self, kind: str, found: Finding) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol
 
 from dappled.config import profiles
 from dappled.config.settings import Settings
@@ -76,18 +75,11 @@ def words(names: Names) -> tuple[str, str]:
     return names.mask or NONE, names.law or BY_BODY
 
 
-class EventWriter(Protocol):
-    """What takes the events of a flight: `pipeline.flight_writer.LedgerWriter`."""
-
-    def later(self, kind: str, found: Finding) -> None:
-        """Take an event from a thread that must not wait for the disk."""
-
-
 class RecipeParameters:
     """LF_MASK and LF_LAW of a flight with the names `flown`; read-only where no flight can come `after` it.
 
-    Another value ends the flight between two frames, and the next one is flown with it. The parameters show it from
-    then on: this flight takes no more frames.
+    Another value ends the flight between two frames, and the next one is flown with it; `later` takes that as an event
+    of the ledger. The parameters show it from then on: this flight takes no more frames.
     """
 
     def __init__(
@@ -96,10 +88,10 @@ class RecipeParameters:
         after: FlightHandover | None,
         settings: LiveSettings,
         shutter: Shutter,
-        events: EventWriter,
+        later: Callable[[str, Finding], object],
     ) -> None:
         self._mask, self._law = words(flown)
-        self._after, self._settings, self._shutter, self._events = after, settings, shutter, events
+        self._after, self._settings, self._shutter, self._later = after, settings, shutter, later
 
     def parameters(self) -> tuple[Parameter, Parameter]:
         masks, laws = ((), ()) if self._after is None else (self._after.masks(), self._after.laws())
@@ -124,7 +116,7 @@ class RecipeParameters:
         if now.pending:
             raise CameraError(f"{text} would begin another flight: {counted(now.pending, 'shot')} under way, ask again")
         after.next = following
-        self._events.later("next flight", finding(Code.FLIGHT_NEXT_SET, Subject("flight"), what=text))
+        self._later("next flight", finding(Code.FLIGHT_NEXT_SET, Subject("flight"), what=text))
 
 
 def flights(settings: Settings, fly: Callable[[Settings, FlightHandover], bool]) -> None:

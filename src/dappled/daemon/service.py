@@ -350,7 +350,7 @@ class Service:
     ) -> Parameters:
         """What a ground station may set: the body's settings, decoding in flight, the next flight's mask and law."""
         decoding = DecodingParameter(shots, writer, decodes=decodes)
-        recipe = RecipeParameters(names, self._after, self._settings, shutter, writer)
+        recipe = RecipeParameters(names, self._after, self._settings, shutter, writer.later)
         return Parameters(body, (decoding, recipe), unsigned=self._settings.now.mavlink.unsigned_parameters)
 
     def _start_parts(self, names: Names, stack: ExitStack) -> None:

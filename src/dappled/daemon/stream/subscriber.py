@@ -122,7 +122,6 @@ class _SubscriberCore(Gaps):
         from_start: bool = False,
         recover: bool = True,
         high_water_mark: int = 8,
-        answer_timeout_s: float = 30.0,
         keys: ClientKeys | None = None,
     ) -> None:
         """`endpoint` and `ask` are ZeroMQ endpoints; without `ask`, or without `recover`, gaps are only counted.
@@ -130,7 +129,7 @@ class _SubscriberCore(Gaps):
         With `from_start` the slices that a flight sent before count as a gap too. `keys` are for a tcp endpoint with
         CURVE. Raises WireError for an invalid endpoint.
         """
-        super().__init__(can_ask=bool(ask) and recover, from_start=from_start, answer_timeout_s=answer_timeout_s)
+        super().__init__(can_ask=bool(ask) and recover, from_start=from_start)
         self.ended = False
         self._zmq = self._context()
         self._poller = self._poller_of()
