@@ -25,7 +25,7 @@ def _lattice(shot: Shot) -> Lattice:
 
 
 def _shadow(shot: Shot, mosaic: MosaicPlane, *others: Shadow) -> Shadow:
-    return shadow_of(mosaic, ExpectedShadow(_lattice(shot), MASK.half_orders(), 0.03, 0.02), others)
+    return shadow_of(mosaic, ExpectedShadow(_lattice(shot), MASK.half_orders(), (), 0.03, 0.02), others)
 
 
 def _picture(shot: Shot, mosaic: MosaicPlane | None = None) -> UnmaskedPicture:

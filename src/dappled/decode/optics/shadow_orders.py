@@ -19,15 +19,15 @@ _HIGHEST = 32
 _BEYOND = 2  # orders beyond the pattern's that are looked at
 
 
-def shadow_orders(optics: MaskedOptics, lattice: Lattice, f_number: float | None) -> list[Order]:
-    """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them."""
+def shadow_orders(optics: MaskedOptics, lattice: Lattice, f_number: float | None) -> tuple[list[Order], list[Order]]:
+    """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them; and
+    those beside them that only diffraction makes."""
     drawn = [one for one in order_strengths(optics, lattice, f_number) if one.on_sensor]
     orders = [one.order for one in drawn if one.most > _WEAK] or [one.order for one in drawn]
-    made = _made(optics.mask, optics.distance_mm)
-    for one in order_strengths(optics, lattice, f_number, [order for order in made if order not in orders]):
-        if one.on_sensor and made[one.order] * one.stop * one.pixels > _MADE:
-            orders.append(one.order)
-    return orders
+    strengths = _made(optics.mask, optics.distance_mm)
+    beside = order_strengths(optics, lattice, f_number, [order for order in strengths if order not in orders])
+    made = [one.order for one in beside if one.on_sensor and strengths[one.order] * one.stop * one.pixels > _MADE]
+    return orders, made
 
 
 @lru_cache(maxsize=16)

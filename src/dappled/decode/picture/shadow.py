@@ -92,8 +92,8 @@ def shadow_at(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """Coefficients complex (colours, K, terms) as least squares give them, with their variances; `held` is the log
-    likelihood that they gain on blocks that were held out."""
+    """Coefficients complex (colours, K, terms) of the first K orders as least squares give them, with their variances;
+    `held` is the log likelihood that they gain on blocks that were held out."""
 
     degree: int
     found: Coefficients
@@ -103,14 +103,19 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShadowEvidence:
-    """What one frame, or several together, tell of the shadow. `sure` (4, 4) is one over the covariance of the
-    lattice's error in bins (see `_Equations`)."""
+    """What one frame, or several together, tell of the shadow: `fits`, the simplest first, are of the pattern's orders,
+    or of all. `sure` (4, 4) is one over the covariance of the lattice's error in bins (see `_Equations`)."""
 
     shape: tuple[int, int]
     lattice: Lattice
     orders: tuple[Order, ...]
     sure: Floats
     fits: tuple[Fit, ...]
+
+    @property
+    def drawn(self) -> tuple[Order, ...]:
+        """The pattern's orders."""
+        return self.orders[: self.fits[0].found.shape[1]]
 
     @property
     def held(self) -> float:
@@ -126,10 +131,10 @@ class ShadowEvidence:
         step = lattice_bins(self.shape, other.lattice) - lattice_bins(self.shape, self.lattice)
         mine, its = self.fits[0], other.fits[0]
         apart = (np.abs(mine.found - its.found) ** 2).sum() + _displaced(
-            self.orders, mine.found, np.outer(step, step)
+            self.drawn, mine.found, np.outer(step, step)
         ).sum()
         both = sum(
-            one.fits[0].variance.sum() + _displaced(one.orders, one.fits[0].found, np.linalg.inv(one.sure)).sum()
+            one.fits[0].variance.sum() + _displaced(one.drawn, one.fits[0].found, np.linalg.inv(one.sure)).sum()
             for one in (self, other)
         )
         return float(apart / max(both, 1e-30))
@@ -152,12 +157,13 @@ class ShadowEvidence:
         if best is None:
             return None
         own, variance = _alike(best.found, best.variance)
+        orders = self.orders[: own.shape[1]]
         trust = np.clip(1 - variance / np.maximum(np.abs(own) ** 2, 1e-30), 0, 1)
         # What is not trusted may be there all the same. Squares of terms are averaged over the frame.
         squares = (terms_at(_raster(self.shape), self.shape, best.degree) ** 2).mean(axis=0)
         lost = 2 * ((np.maximum(trust, 0.5) * variance) @ squares).sum(axis=1)
-        lost += 2 * _displaced(self.orders, own * trust, np.linalg.inv(self.sure))
-        return Shadow(self.shape, self.lattice, self.orders, own * trust, best.degree, source, np.sqrt(lost))
+        lost += 2 * _displaced(orders, own * trust, np.linalg.inv(self.sure))
+        return Shadow(self.shape, self.lattice, orders, own * trust, best.degree, source, np.sqrt(lost))
 
 
 def _displaced(orders: Sequence[Order], coefficients: Coefficients, step: NDArray[np.floating]) -> Floats:
@@ -199,7 +205,7 @@ def _no_shadow(told: ShadowEvidence) -> Shadow:
     """W = 1, known as well as a shadow is weak that a frame doesn't show."""
     found = told.fits[0].found
     sigma = np.sqrt(2 * (np.abs(found[:, :, 0]) ** 2).sum(axis=1))
-    return Shadow(told.shape, told.lattice, told.orders, 0 * found, 0, ShadowFrom.NONE, sigma)
+    return Shadow(told.shape, told.lattice, told.drawn, 0 * found, 0, ShadowFrom.NONE, sigma)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

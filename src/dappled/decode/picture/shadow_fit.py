@@ -1,8 +1,8 @@
 """What a frame tells of the mask's shadow, by least squares.
 
 With L the frame's local mean over a period, frame − L is regressed on L · e^{2πi k·F x}. Blocks weigh by what they
-leave unexplained, clipped and defective pixels by nothing, each colour has coefficients of its own, and these vary over
-the frame as polynomials where that explains blocks that were held out.
+leave unexplained, clipped and defective pixels by nothing, each colour has coefficients of its own. These vary over the
+frame as polynomials, and orders that only diffraction makes are among them, where that explains blocks held out.
 """
 
 from __future__ import annotations
@@ -53,11 +53,13 @@ _UNPULLED = 0.2  # where a few blocks make the whole fit, their scatter tells ne
 
 @dataclass(frozen=True, slots=True)
 class ExpectedShadow:
-    """Where carriers are expected, and which: orders of the half plane, without the mean. The search for the lattice
-    allows for a turn (radians) and for a print's scale (a share of the period) to either side."""
+    """Where carriers are expected, and which: the pattern's orders of the half plane, without the mean, and those that
+    only diffraction can have `made` beside them. The search for the lattice allows for a turn (radians) and for a
+    print's scale (a share of the period) to either side."""
 
     lattice: Lattice
     orders: Sequence[Order]
+    made: Sequence[Order]
     turned: float = 0.0
     scaled: float = 0.0
 
@@ -82,7 +84,14 @@ def shadow_of(
 
 def told_by(mosaic: MosaicPlane, expected: ExpectedShadow, others: Sequence[Shadow] = ()) -> OwnShadow:
     """What one frame tells of its shadow, and of `others`, see `shadow_of`."""
-    return _told(*_equations_of(mosaic, expected), others)
+    drawn = tuple(order for order in expected.orders if order != (0, 0))
+    every = (*drawn, *(order for order in expected.made if order not in drawn))
+    told = _told(*_equations_of(mosaic, expected, _Sought(every, len(drawn), len(drawn))), others)
+    if told.seen or every == drawn:
+        return told
+    # A stop may leave less of the pattern's orders than diffraction makes of others.
+    by_all = _told(*_equations_of(mosaic, expected, _Sought(every, len(drawn), len(every))), others)
+    return by_all if by_all.seen else told
 
 
 def _as_beside(mosaic: MosaicPlane, beside: Sequence[ShadowEvidence], others: Sequence[Shadow]) -> OwnShadow | None:
@@ -93,7 +102,8 @@ def _as_beside(mosaic: MosaicPlane, beside: Sequence[ShadowEvidence], others: Se
         return None
     mosaic = _unclipped(mosaic, period_of(known.lattice))
     means = _Means.of(mosaic, period_of(known.lattice), known)
-    equations = _Equations.of(means, known.lattice, known.orders)
+    sought = _Sought(every.orders, len(every.drawn), len(known.orders))
+    equations = _Equations.of(means, known.lattice, sought)
     if (finer := equations.lattice()) is not None:
         equations = equations.at_finer(finer, means)
     made = _told(equations, means, others)
@@ -102,24 +112,26 @@ def _as_beside(mosaic: MosaicPlane, beside: Sequence[ShadowEvidence], others: Se
 
 def _told(equations: _Equations, means: _Means, others: Sequence[Shadow]) -> OwnShadow:
     at: dict[tuple[Lattice, tuple[Order, ...]], _Equations] = {}
+    own = {each.sought.orders: each for each in equations.nested}
     gains = []
     for one in others:
         if (where := (one.lattice, one.orders)) not in at:
-            near = one.orders == equations.orders and equations.at_rest(one.lattice)
-            at[where] = equations.moved(one.lattice) if near else _Equations.of(means, *where)
+            near = one.orders in own and equations.at_rest(one.lattice)
+            alone = _Sought(one.orders, len(one.orders), len(one.orders))
+            at[where] = own[one.orders].moved(one.lattice) if near else _Equations.of(means, one.lattice, alone)
         gains.append(at[where].explained(one, equations.weights) - equations.unexplained)
     return OwnShadow(equations.evidence(), tuple(gains))
 
 
-def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow) -> tuple[_Equations, _Means]:
+def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow, sought: _Sought) -> tuple[_Equations, _Means]:
     """The equations of a frame's own shadow, at its own lattice; and the local means that they are of."""
-    lattice, half = expected.lattice, tuple(order for order in expected.orders if order != (0, 0))
+    lattice, leading = expected.lattice, sought.leading
     mosaic = _unclipped(mosaic, period_of(lattice))
     means = _Means.of(mosaic, period_of(lattice))
     found = lattice
     if expected.turned or expected.scaled:
-        found = searched(means.quotient(), lattice, half, turned=expected.turned, scaled=expected.scaled)
-    equations = _Equations.of(means, found, half)
+        found = searched(means.quotient(), lattice, leading.orders, turned=expected.turned, scaled=expected.scaled)
+    equations = _Equations.of(means, found, leading)
     for _ in range(_STEPS):
         if (finer := equations.lattice()) is None:
             break
@@ -127,7 +139,8 @@ def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow) -> tuple[_Equat
         equations = equations.moved(finer) if mosaic.valid is None else equations.at_finer(finer, means)
     first = equations.evidence((0,)).shadow(ShadowFrom.FRAME, degree=0)
     assert first is not None
-    kept = kept_by_mean(np.asarray(half, dtype=np.float64) @ equations.at.matrix(), means.period, mosaic.pattern.shape)
+    frequencies = np.asarray(first.orders, dtype=np.float64) @ equations.at.matrix()
+    kept = kept_by_mean(frequencies, means.period, mosaic.pattern.shape)
     lost = bool(np.any(np.abs(kept) > _KEPT))
     if lost:
         first = replace(
@@ -135,8 +148,8 @@ def _equations_of(mosaic: MosaicPlane, expected: ExpectedShadow) -> tuple[_Equat
         )
     if known := first.depth > _DEEP or mosaic.valid is not None or lost:
         means = _Means.of(mosaic, means.period, first)  # where the light was is known better behind a known shadow
-    if known or equations.at != found:
-        equations = _Equations.of(means, equations.at, half, found)
+    if known or equations.at != found or leading != sought:
+        equations = _Equations.of(means, equations.at, sought, found)
     if mosaic.valid is None and equations.at != found and (finer := equations.lattice()) is not None:
         equations = equations.at_finer(finer, means)
     return equations, means
@@ -189,6 +202,26 @@ class _Means:
         return made[start[0] : start[0] + _SEARCH_SIDE, start[1] : start[1] + _SEARCH_SIDE]
 
 
+@dataclass(frozen=True, slots=True)
+class _Sought:
+    """Orders that a frame is asked for. The first `drawn` are the pattern's, by which blocks weigh; the first `led`,
+    these or all, tell the lattice."""
+
+    orders: tuple[Order, ...]
+    drawn: int
+    led: int
+
+    @property
+    def pattern(self) -> _Sought:
+        """The pattern's alone."""
+        return _Sought(self.orders[: self.drawn], self.drawn, self.drawn)
+
+    @property
+    def leading(self) -> _Sought:
+        """Those alone that tell the lattice."""
+        return _Sought(self.orders[: self.led], self.drawn, self.led)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
     """The mean, `orders` and their opposites: `every` (n, 2); and each two of them: their differences but for the sign
@@ -212,13 +245,13 @@ def _pairs(orders: tuple[Order, ...]) -> _Pairs:
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """Normal equations of the coefficients, block by block: `sums` (colours, blocks, differences) of L² over waves of
-    the differences of orders, which make the matrix, and `right` (colours, blocks, n) of the mean, `orders` and their
-    opposites. `energy` and `count` are of each block's frame − L."""
+    the differences of orders, which make the matrix, and `right` (colours, blocks, n) of the mean, the `sought` orders
+    and their opposites. `energy` and `count` are of each block's frame − L."""
 
     shape: tuple[int, int]
     at: Lattice
     like: Lattice  # but for a turn and a scale, about as it is
-    orders: tuple[Order, ...]
+    sought: _Sought
     centres: Floats
     sums: NDArray[np.complex64]
     right: NDArray[np.complex64]
@@ -232,19 +265,19 @@ class _Equations:
         cls,
         means: _Means,
         lattice: Lattice,
-        orders: tuple[Order, ...],
+        sought: _Sought,
         like: Lattice | None = None,
         sums: NDArray[np.complex64] | None = None,
     ) -> _Equations:
         """Those of a frame; `sums` that are known already aren't taken again."""
         mosaic, floor = means.mosaic, means.floor()
-        pairs = _pairs(orders)
+        pairs = _pairs(sought.orders)
         side = max(_BLOCK_PX, math.ceil(_BLOCK_PERIODS * means.period))
         steps = mosaic.pattern.shape
         across = [math.ceil(side / step) * step for step in steps]
         blocks = [max(1, whole // one) for whole, one in zip(mosaic.shape, across, strict=True)]
         shape = (mosaic.colours, blocks[0] * blocks[1])
-        n, half = len(pairs.every), len(orders) + 1
+        n, half = len(pairs.every), len(sought.orders) + 1
         every = np.zeros((*shape, len(pairs.apart)), dtype=np.complex64) if sums is None else sums
         right = np.zeros((*shape, n), dtype=np.complex64)
         energy, count = np.zeros(shape), np.zeros(shape)
@@ -275,11 +308,23 @@ class _Equations:
         odd = np.add.outer(np.arange(blocks[0]), np.arange(blocks[1])).ravel() % 2 == 1
         centres = np.column_stack([y.ravel(), x.ravel()])
         sound = float(np.mean([1 if good is None else good.mean() for _, _, good in means.means]))
-        return cls(mosaic.shape, lattice, like or lattice, orders, centres, every, right, energy, count, odd, sound)
+        return cls(mosaic.shape, lattice, like or lattice, sought, centres, every, right, energy, count, odd, sound)
+
+    @cached_property
+    def nested(self) -> tuple[_Equations, ...]:
+        """Those of the pattern's orders alone, and of all."""
+        fewer = self.sought.pattern
+        if fewer.orders == self.sought.orders:
+            return (self,)
+        number = {tuple(apart): at for at, apart in enumerate(_pairs(self.sought.orders).apart.tolist())}
+        sums = np.take(self.sums, [number[tuple(one)] for one in _pairs(fewer.orders).apart.tolist()], axis=-1)
+        half = np.arange(1, fewer.drawn + 1)
+        right = np.take(self.right, [0, *half, *(half + len(self.sought.orders))], axis=-1)
+        return replace(self, sought=fewer, sums=sums, right=right), self
 
     def moved(self, lattice: Lattice) -> _Equations:
         """About the same at a lattice so near that waves turn little within a block."""
-        pairs, move = _pairs(self.orders), lattice.matrix() - self.at.matrix()
+        pairs, move = _pairs(self.sought.orders), lattice.matrix() - self.at.matrix()
         of_sums, of_right = (
             np.exp(-2j * np.pi * (self.centres @ (some @ move).T)).astype(np.complex64)
             for some in (pairs.apart, pairs.every)
@@ -289,11 +334,11 @@ class _Equations:
     def at_finer(self, lattice: Lattice, means: _Means) -> _Equations:
         """Those of the frame's means at a lattice next to this one: L², which is even, hardly turns."""
         sums = self.moved(lattice).sums if means.mosaic.valid is None else None
-        return _Equations.of(means, lattice, self.orders, self.like, sums)
+        return _Equations.of(means, lattice, self.sought, self.like, sums)
 
     def _image(self, colour: int, c: Coefficients, degree: int) -> Coefficients:
         """(blocks, n) each block's matrix times its coefficients, of c (n, terms)."""
-        pairs, made = _pairs(self.orders), np.zeros(self.right.shape[1:], dtype=np.complex128)
+        pairs, made = _pairs(self.sought.orders), np.zeros(self.right.shape[1:], dtype=np.complex128)
         ahead, behind = np.zeros((2, *c.shape[1:], len(pairs.apart), len(c)), dtype=np.complex64)
         rows = np.broadcast_to(np.arange(len(c))[:, None], pairs.index.shape)
         for into, chosen in ((ahead, ~pairs.turned), (behind, pairs.turned)):
@@ -309,6 +354,8 @@ class _Equations:
     @cached_property
     def weights(self) -> Floats:
         """(colours, blocks): one over what a block leaves unexplained, per pixel."""
+        if (first := self.nested[0]) is not self:
+            return first.weights
         made = []
         for colour in range(len(self.right)):
             plain = np.where(self.count[colour] > 0, 1.0, 0.0)
@@ -322,7 +369,7 @@ class _Equations:
     @property
     def _lights(self) -> Floats:
         """(colours, blocks) the sums of L²."""
-        return np.asarray(self.sums[..., _pairs(self.orders).index[0, 0]].real)
+        return np.asarray(self.sums[..., _pairs(self.sought.orders).index[0, 0]].real)
 
     def _terms(self, degree: int) -> Floats:
         return terms_at(self.centres, self.shape, degree)
@@ -347,7 +394,7 @@ class _Equations:
         count = terms.shape[1]
         first, second = np.triu_indices(count)
         pairs = weights[:, None] * terms[:, first] * terms[:, second]
-        gram, known = np.empty((count, count, n, n), dtype=np.complex128), _pairs(self.orders)
+        gram, known = np.empty((count, count, n, n), dtype=np.complex128), _pairs(self.sought.orders)
         parts = self.sums[colour].view(np.float32).astype(np.float64)
         every = (pairs.T @ parts).view(np.complex128)[:, known.index]
         np.conjugate(every, out=every, where=known.turned)
@@ -398,7 +445,8 @@ class _Equations:
     def evidence(self, degrees: Sequence[int] = _DEGREES) -> ShadowEvidence:
         """What the frame tells, with polynomials of these degrees."""
         sure = np.asarray(np.linalg.inv(self._lattice_step[1] + 1e-8 * np.eye(4)))
-        return ShadowEvidence(self.shape, self.at, self.orders, sure, tuple(map(self._fitted, degrees)))
+        fits = tuple(each._fitted(degree) for each in self.nested for degree in degrees)
+        return ShadowEvidence(self.shape, self.at, self.sought.orders, sure, fits)
 
     def _unpulled(self, colour: int, weights: Floats, terms: Floats) -> Floats:
         """(blocks,) 1 − how far a block draws the fit towards itself, by which its residual is too small."""
@@ -410,7 +458,7 @@ class _Equations:
 
     def _fitted(self, degree: int) -> Fit:
         """Coefficients, and their errors by the scatter between blocks."""
-        half = slice(1, len(self.orders) + 1)
+        half = slice(1, len(self.sought.orders) + 1)
         found, spread = [], []
         terms = self._terms(degree)
         for colour, weights in enumerate(self.weights):
@@ -442,7 +490,9 @@ class _Equations:
     def _lattice_step(self) -> tuple[Floats, Floats]:
         """(4,) how far the lattice lies off, in bins of rows of ky and kx, of columns of ky and kx; and (4, 4) the
         covariance of its error, by the scatter between blocks."""
-        half, count = np.array(self.orders, dtype=np.float64), len(self.orders)
+        if self.sought != self.sought.leading:
+            return self.nested[0]._lattice_step
+        half, count = np.array(self.sought.orders, dtype=np.float64), len(self.sought.orders)
         normal, scores = np.zeros((4 + count, 4 + count)), np.zeros((len(self.centres), 4 + count))
         levers = 2 * np.pi * np.einsum("bd,kj,d->bkdj", self.centres, half, 1 / np.array(self.shape))
         levers = levers.reshape(len(self.centres), count, 4)

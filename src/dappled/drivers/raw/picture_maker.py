@@ -14,7 +14,7 @@ from dappled.config import profiles
 from dappled.decode.array_types import Floats
 from dappled.decode.decoder import MaskDecoder
 from dappled.decode.lightfield.aperture import SHAPES, Aperture, angular_frequencies, kappa, transfer
-from dappled.decode.optics import LAWS, MaskedOptics, Order, Sensor
+from dappled.decode.optics import LAWS, MaskedOptics, Sensor
 from dappled.decode.optics.shadow_orders import shadow_orders
 from dappled.decode.optics.visibility import order_strengths
 from dappled.decode.picture.blocks import MosaicPlane
@@ -114,7 +114,9 @@ class _Frame:
     def expected(self) -> ExpectedShadow:
         """The shadow that is predicted, and how far its lattice is searched."""
         reach = (_TURNED, _SCALED) if self.decoder.calibration is None else (_TURNED_SINCE, _SCALED_SINCE)
-        return ExpectedShadow(self.decoder.lattice_at(self.lens[0]), _orders(self.decoder, *self.lens), *reach)
+        lattice = self.decoder.lattice_at(self.lens[0])
+        orders = shadow_orders(_optics(self.decoder, self.lens[0]), lattice, self.lens[1])
+        return ExpectedShadow(lattice, *orders, *reach)
 
 
 class PictureMaker:
@@ -230,10 +232,6 @@ class PictureMaker:
         if made.soft_share > 0:
             found.append(finding(Code.PICTURE_SOFT, subject, share=made.soft_share))
         return tuple(found)
-
-
-def _orders(decoder: MaskDecoder, focal_length_mm: float, f_number: float | None) -> list[Order]:
-    return shadow_orders(_optics(decoder, focal_length_mm), decoder.lattice_at(focal_length_mm), f_number)
 
 
 def _optics(decoder: MaskDecoder, focal_length_mm: float) -> MaskedOptics:
