@@ -414,6 +414,7 @@ class Service:
             PeriodicTask("body"): self._follow_body,
             PeriodicTask("resources", every_ns=HEALTH_NS): self.parts.control.look,
             PeriodicTask("health", every_ns=HEALTH_NS): self._publish_health,
+            PeriodicTask("viewers", every_ns=HEALTH_NS): self._look_at_viewers,
         }
         if not self._settings.now.mavlink.url:
             return tasks
@@ -460,6 +461,10 @@ class Service:
     def _follow_vehicle(self) -> None:
         self.parts.navigation.belongs_to(self.parts.component.vehicle)
         self.parts.navigation.note_doubt()
+
+    def _look_at_viewers(self) -> None:
+        for one in self.parts.viewers:
+            one.look()
 
     def _publish_health(self) -> None:
         record = self.health()

@@ -358,7 +358,7 @@ def test_a_picture_of_the_stream_is_shown_at_full_size_with_its_doubts(rig: Rig)
     doubt = codec.plain(finding(Code.PICTURE_CLIPPED, FRAME, share=0.03))
 
     def told() -> bool:
-        rig.feed.hub.globe_asked()  # a viewer
+        rig.feed.hub.looked_at_full_size()
         rig.publisher.publish("picture", {"frame": 4, "doubts": [doubt]}, b"\xff\xd8 a picture")
         return bool(rig.feed.frame_event(4)["picture"])
 
@@ -369,6 +369,23 @@ def test_a_picture_of_the_stream_is_shown_at_full_size_with_its_doubts(rig: Rig)
         assert client.get("/api/frames/4/full.json").json()["doubts"][0].startswith("3.0% of its pixels are clipped")
         seen(rig, 5)
         assert "no picture at full size" in client.get("/api/frames/5/full.jpg").json()["error"]
+
+
+def test_pictures_at_full_size_are_asked_for_only_while_one_is_looked_at(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with rig.client() as client, client.stream("GET", "/api/events") as stream:
+        lines = stream.iter_lines()  # the page is open as long as it reads
+        events(lines, "ready")
+        eventually(lambda: rig.publisher.wanted("slices"), "the page counts")
+        seen(rig, 4)
+        seen(rig, 5)
+        assert not rig.publisher.wanted("picture"), "a page is open, and shows no picture at full size"
+        assert rig.post("/api/full", {}).json() == {"ok": True}
+        eventually(lambda: rig.publisher.wanted("picture"), "a picture is asked for")
+        monkeypatch.setattr(feeds, "LOOK_S", 0.0)
+        eventually(lambda: not rig.publisher.wanted("picture"), "nobody looks any more")
+        assert rig.publisher.wanted("slices")
 
 
 def test_a_globe_gets_link_overlay_and_picture(rig: Rig) -> None:

@@ -186,6 +186,20 @@ def test_the_nearest_distance_is_told_where_it_is_known(bench: Bench) -> None:
     assert bench.nearest == [(7.5, 0.2)]
 
 
+def test_who_begins_to_look_at_pictures_gets_that_of_the_newest_frame_without_a_further_one(bench: Bench) -> None:
+    for index in (3, 4):
+        bench.pictures.offer(shot(index))
+        bench.pictures.look()
+    bench.viewers.add("picture")
+    bench.pictures.look()
+    bench.pictures.offer(shot(5))  # too soon
+    bench.clock.advance(10)
+    bench.pictures.look()
+    eventually(lambda: bench.published, "it is published")
+    bench.pictures.stop()
+    assert [facts["frame"] for _, facts, _ in bench.published] == [4], "once"
+
+
 def test_a_picture_is_made_only_while_somebody_has_subscribed_to_it_and_as_the_schema_says(bench: Bench) -> None:
     bench.pictures.offer(shot(3))
     bench.viewers.add("picture")

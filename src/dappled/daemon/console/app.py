@@ -68,6 +68,7 @@ class ConsoleApp:
             Route("/api/interval/stop", self._stop_interval, methods=["POST"]),
             Route("/api/setting", self._set, methods=["POST"]),
             Route("/api/live", self._live, methods=["POST"]),
+            Route("/api/full", self._look_at_full_size, methods=["POST"]),
             Route("/api/frames/{frame}/{name}", self._frame_picture),
             Route("/api/map", self._map),
             Route("/api/holes.png", self._holes),
@@ -185,6 +186,10 @@ class ConsoleApp:
         if picture is not None:
             return Response(picture, media_type="image/jpeg", headers={"cache-control": "no-store"})
         return _answered(answer)
+
+    async def _look_at_full_size(self, _: Request) -> Response:
+        self._hub.looked_at_full_size()
+        return JSONResponse({"ok": True})
 
     async def _do(self, question: Mapping[str, Any]) -> Response:
         return _answered(await self._ask(question))

@@ -30,9 +30,11 @@ from dappled.findings import FRAME, Finding, named, remedy, told
 
 log = logging.getLogger(__name__)
 FRAMES, STACK_BYTES, PICTURE_BYTES, PATH = 400, 72_000_000, 24_000_000, 3600
-_WATCHED = ("slices", "depth", "picture")  # topics that are subscribed to while a viewer is there
+_WATCHED = ("slices", "depth")  # topics that are subscribed to while a viewer is there
+_LOOKED_AT = ("picture",)  # those that are made for us alone: while it is looked at, too
 PAGES, WAITING = 24, 64
 GLOBE_S = 30.0  # a virtual globe counts as a viewer for so long after it asked
+LOOK_S = 15.0  # a page looks at pictures at full size for so long after it said so
 _ASK_S, _KEEP_ALIVE_S = 20.0, 10.0
 _END = ""  # in a page's queue: nothing follows
 
@@ -73,7 +75,7 @@ class Hub:
         self._pages: weakref.WeakSet[asyncio.Queue[str]] = (
             weakref.WeakSet()
         )  # weak: a stream that was never read goes too
-        self._globe_s = -1e9
+        self._globe_s = self._look_s = -1e9
         self._closed = False
         self.dropped = 0
 
@@ -93,6 +95,16 @@ class Hub:
     def globe_asked(self) -> None:
         """Note that a virtual globe has asked."""
         self._globe_s = time.monotonic()
+
+    def looked_at_full_size(self) -> None:
+        """Note that a page shows pictures at full size."""
+        self._look_s = time.monotonic()
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """Those of the large topics that somebody sees."""
+        looks = time.monotonic() - self._look_s < LOOK_S
+        return frozenset((*(_WATCHED if self.watched else ()), *(_LOOKED_AT if looks else ())))
 
     def send(self, event: Event) -> None:
         """Send an event to every page."""
@@ -163,18 +175,18 @@ class Feed:
         self.path: deque[tuple[float, float]] = deque(maxlen=PATH)  # (longitude, latitude) of the vehicle
 
     async def run(self) -> None:
-        """Receive until cancelled. What is large is subscribed to only while a viewer is there."""
-        topics = [topic for topic in wire.TOPICS if topic not in ("preview", *_WATCHED)]
+        """Receive until cancelled. What is large is subscribed to only while somebody sees it."""
+        topics = [topic for topic in wire.TOPICS if topic not in ("preview", *_WATCHED, *_LOOKED_AT)]
         async with AsyncSubscriber(*self._endpoints, topics=topics, high_water_mark=3, recover=False) as stream:
             self._stream = stream
             if self._endpoints[1]:
                 await stream.ask({"get": "start"})
-            listening = False
+            listening: frozenset[str] = frozenset()
             while True:
-                if self.hub.watched != listening:
-                    listening = not listening
-                    for topic in _WATCHED:
-                        stream.listen(topic, listening)
+                wanted = self.hub.topics
+                for topic in wanted ^ listening:
+                    stream.listen(topic, topic in wanted)
+                listening = wanted
                 message = await stream.receive(0.5)
                 if message is not None:
                     try:

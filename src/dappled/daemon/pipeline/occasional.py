@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from abc import ABC, abstractmethod
 from typing import ClassVar
 
@@ -35,6 +36,8 @@ class Occasional(OneThread, ABC):
         self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
         self._interval_s, self._clock = interval_s, shots.clock
         self._last_ns: int | None = None
+        self._unseen: PendingShot | None = None  # the newest frame, since when nobody would have seen what is made
+        self._choosing = threading.Lock()
         self._worker: Worker[PendingShot] = Worker(
             self.topic, self._work, capacity=1, policy="drop oldest", clock=self._clock
         )
@@ -47,11 +50,22 @@ class Occasional(OneThread, ABC):
 
     def offer(self, pending: PendingShot) -> None:
         """Take a finished frame, if one is due and it was decoded."""
-        now_ns = self._clock.monotonic_ns()
-        due = self._last_ns is None or now_ns - self._last_ns >= round(self._interval_s * 1e9)
-        if due and pending.decoded is not None and self._wanted():
-            self._last_ns = now_ns
-            self._worker.put(pending)
+        if pending.decoded is not None:
+            self._choose(pending)
+
+    def look(self) -> None:
+        """Take the newest frame, if nobody would have seen what is made of it when it came, and somebody does now."""
+        if (pending := self._unseen) is not None:
+            self._choose(pending)
+
+    def _choose(self, pending: PendingShot) -> None:
+        with self._choosing:
+            now_ns, wanted = self._clock.monotonic_ns(), self._wanted()
+            due = self._last_ns is None or now_ns - self._last_ns >= round(self._interval_s * 1e9)
+            if due and wanted:
+                self._last_ns = now_ns
+                self._worker.put(pending)
+            self._unseen = None if wanted else pending
 
     def _wanted(self) -> bool:
         """Whether somebody would see what is made."""

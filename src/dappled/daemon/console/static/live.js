@@ -1,4 +1,6 @@
 // Live view before a flight, an aid for focus and exposure: the camera's picture, its histogram, and how sharp its middle is.
+import { again } from "./pictures.js";
+
 const EVERY_MS = 400, AGAIN_MS = 2000, PATIENCE_MS = 3000, BINS = 64, CLIPPED = 250, CLOSER = 4;
 
 export class Live {
@@ -16,26 +18,22 @@ export class Live {
     if (this.running) return;
     this.running = true;
     this.best = 0;
-    while (wanted()) {
-      let wait = EVERY_MS;
-      if (!document.hidden) {
-        try {
-          const answer = await fetch("/api/live", { method: "POST", headers: { "content-type": "application/json" }, body: "{}", signal: AbortSignal.timeout(PATIENCE_MS) });
-          if (answer.headers.get("content-type") === "image/jpeg") {
-            const picture = await createImageBitmap(await answer.blob());
-            if (wanted()) shown(this.draw(picture));
-          } else {
-            const told = await answer.json();
-            if (wanted()) none(told.error ?? told.text);
-            if (told.error) wait = AGAIN_MS;
-          }
-        } catch {
-          if (wanted()) none("The vehicle does not answer: no live view.");
-          wait = AGAIN_MS;
+    await again(EVERY_MS, wanted, async () => {
+      try {
+        const answer = await fetch("/api/live", { method: "POST", headers: { "content-type": "application/json" }, body: "{}", signal: AbortSignal.timeout(PATIENCE_MS) });
+        if (answer.headers.get("content-type") === "image/jpeg") {
+          const picture = await createImageBitmap(await answer.blob());
+          if (wanted()) shown(this.draw(picture));
+          return null;
         }
+        const told = await answer.json();
+        if (wanted()) none(told.error ?? told.text);
+        return told.error ? AGAIN_MS : null;
+      } catch {
+        if (wanted()) none("The vehicle does not answer: no live view.");
+        return AGAIN_MS;
       }
-      await new Promise((done) => setTimeout(done, wait));
-    }
+    });
     this.running = false;
   }
 

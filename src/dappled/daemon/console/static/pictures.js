@@ -14,6 +14,15 @@ export function ask(url, { read = (answer) => answer.blob(), wanted = () => true
   });
 }
 
+// Call `once` again and again as long as `wanted()`, but not while the page is hidden. It may tell how long to wait then,
+// in place of `everyMs`.
+export async function again(everyMs, wanted, once) {
+  while (wanted()) {
+    const wait = (document.hidden ? null : await once()) ?? everyMs;
+    await new Promise((done) => setTimeout(done, wait));
+  }
+}
+
 // An image for a canvas or the page; it stays empty where the vehicle has none.
 export function image(url, loaded = () => {}, attributes = {}) {
   const picture = Object.assign(new Image(), attributes);

@@ -1,11 +1,12 @@
 // Show one frame as refocused picture, views, slices, spectrum or depth.
 import { element, fixed, svg } from "./format.js";
 import { Live } from "./live.js";
-import { ask, place } from "./pictures.js";
+import { again, ask, place } from "./pictures.js";
 import { Refocus, sharpest } from "./refocus.js";
 
 const TABS = ["refocus", "views", "slices", "spectrum", "full", "live", "depth"];
 const NOW_AND_THEN = { full: "picture", depth: "depth" };   // tabs of what few frames have in flight, and its name in a frame
+const LOOK_MS = 5000;   // the vehicle makes pictures at full size only while it is told that one is looked at
 const EARLY_MS = 250;   // views that were made before come sooner, and no other picture flashes before them
 const $ = (id) => document.getElementById(id);
 
@@ -17,6 +18,7 @@ export class Stage {
     this.live = new Live($("live"));
     this.layout = null;
     this.bitmap = null;
+    this.looks = false;    // whether the vehicle is told so
     this.turn = 0;         // number of the request: an older answer that comes late is ignored
     try {
       this.refocus = new Refocus($("gl"));
@@ -55,6 +57,12 @@ export class Stage {
     return !part || this.frame?.[part] ? this.frame : this.newest[part] ?? null;
   }
 
+  // Whether there is something to show. The newest frames get pictures at full size once the tab is open.
+  offers(tab) {
+    const follows = "picture" in this.newest, { slices, tag } = this.frame ?? {};
+    return Boolean(this.of(tab)) || tab === "full" && follows && Boolean(slices) && tag.mask !== "lenslet";
+  }
+
   choose(name) {
     this.tab = name;
     this.tabs();
@@ -72,8 +80,8 @@ export class Stage {
 
   tabs() {
     for (const tab of Object.keys(NOW_AND_THEN)) {
-      show($(`tab-${tab}`), Boolean(this.of(tab)));
-      if (this.tab === tab && !this.of(tab)) this.tab = "refocus";
+      show($(`tab-${tab}`), this.offers(tab));
+      if (this.tab === tab && !this.offers(tab)) this.tab = "refocus";
     }
     for (const name of TABS) {
       const chosen = name === this.tab;
@@ -94,6 +102,8 @@ export class Stage {
     if (tab === "live") { this.watch(); return; }
     if ($("live").hasAttribute("data-on")) this.leave();
     $("frame-box").toggleAttribute("data-full", false);
+    if (tab === "full") this.look();
+    if (!frame && tab === "full") this.nothing("Pictures at full size are made while this tab is open: the newest frame gets one.");
     if (!frame) return;
     const index = frame.tag.frame, base = `/api/frames/${index}/`;
     const name = `frame ${index}${frame === this.frame ? "" : ", the newest that has one"}`;
@@ -107,6 +117,17 @@ export class Stage {
       if (turn === this.turn) await this.fall(base, turn, error.message);
     }
     if (turn === this.turn) $("which").textContent = name;
+  }
+
+  async look() {
+    if (this.looks) return;
+    this.looks = true;
+    await again(LOOK_MS, () => this.tab === "full" && !document.body.hasAttribute("data-recording"), async () => {
+      try {
+        await fetch("/api/full", { method: "POST", headers: { "content-type": "application/json" }, body: "{}", signal: AbortSignal.timeout(LOOK_MS) });
+      } catch { /* no connection: said again */ }
+    });
+    this.looks = false;
   }
 
   watch() {
@@ -159,7 +180,10 @@ export class Stage {
         return;
       } catch { /* not decoded at all: the sentence stands alone */ }
     }
-    if (turn !== this.turn) return;
+    if (turn === this.turn) this.nothing(why);
+  }
+
+  nothing(why) {
     for (const id of ["gl", "picture", "overlay"]) show($(id), false);
     show($("empty"), true);
     $("empty").textContent = why;
