@@ -2,6 +2,7 @@
 
 A film's amplitude is the root of its transmittance, and has orders that this has not. On the way to the sensor they are
 shifted against each other, so that their products don't cancel there: c_m = Σ t_k t*_{k−m} e^{−2πi λ d (k − m/2)·m f²}.
+Orders beyond the sensor's Nyquist frequency darken pixels too: their waves fold.
 """
 
 from __future__ import annotations
@@ -21,12 +22,12 @@ _BEYOND = 2  # orders beyond the pattern's that are looked at
 
 def shadow_orders(optics: MaskedOptics, lattice: Lattice, f_number: float | None) -> tuple[list[Order], list[Order]]:
     """The half plane's orders that may be seen, by what pattern, film, diffraction, stop and pixels leave of them; and
-    those beside them that only diffraction makes."""
+    those beside them that only diffraction makes, or that lie beyond the sensor's Nyquist frequency and fold."""
     drawn = [one for one in order_strengths(optics, lattice, f_number) if one.on_sensor]
     orders = [one.order for one in drawn if one.most > _WEAK] or [one.order for one in drawn]
     strengths = _made(optics.mask, optics.distance_mm)
     beside = order_strengths(optics, lattice, f_number, [order for order in strengths if order not in orders])
-    made = [one.order for one in beside if one.on_sensor and strengths[one.order] * one.stop * one.pixels > _MADE]
+    made = [one.order for one in beside if strengths[one.order] * one.stop * one.pixels > _MADE]
     return orders, made
 
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.polynomial.legendre import legvander
 from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
@@ -75,15 +76,15 @@ def shadow_at(
     terms = coefficients.reshape(len(frequencies), -1)
     down = 2 * np.exp(2j * np.pi * np.outer(rows, frequencies[:, 0]))
     across = np.exp(2j * np.pi * np.outer(columns, frequencies[:, 1]))
-    y, x = rows / (shape[0] / 2), columns / (shape[1] / 2)
+    y, x = (legvander(at / (side / 2), degree) for at, side in zip((rows, columns), shape, strict=True))
     made = np.ones((len(rows), len(columns)), dtype=np.float32)
     powers = _powers(degree)
     for b in range(degree + 1):
         wave = np.zeros_like(down)
         for term, (a, other) in enumerate(powers):
             if other == b:
-                wave += down * terms[:, term] * (y**a)[:, None]
-        side = across * (x**b)[:, None]
+                wave += down * terms[:, term] * y[:, a, None]
+        side = across * x[:, b, None]
         left = np.concatenate([wave.real, -wave.imag], axis=1).astype(np.float32)
         right = np.concatenate([side.real, side.imag], axis=1).astype(np.float32)
         made += left @ right.T
@@ -99,6 +100,10 @@ class Fit:
     found: Coefficients
     variance: Floats
     held: float
+
+    def like(self, other: Fit) -> bool:
+        """Whether it is of as many orders and of the same degree."""
+        return (self.degree, self.found.shape[1]) == (other.degree, other.found.shape[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -146,7 +151,8 @@ class ShadowEvidence:
         first = lattice_bins(self.shape, self.lattice)
         steps = [one.sure @ (lattice_bins(self.shape, one.lattice) - first) for one in every]
         lattice = lattice_of_bins(self.shape, first + np.linalg.solve(sure, np.sum(steps, axis=0)))
-        fits = tuple(map(_averaged, zip(*(one.fits for one in every), strict=True)))
+        alike = [[one for each in every for one in each.fits if one.like(fit)] for fit in self.fits]
+        fits = tuple(_averaged(those) for those in alike if len(those) == len(every))
         return ShadowEvidence(self.shape, lattice, self.orders, sure, fits)
 
     def shadow(self, source: ShadowFrom, degree: int | None = None) -> Shadow | None:
@@ -251,8 +257,8 @@ def _powers(degree: int) -> list[tuple[int, int]]:
 
 def terms_at(places: Floats, shape: tuple[int, int], degree: int) -> Floats:
     """(n, terms) of the polynomial at places (n, 2) from the frame's centre."""
-    y, x = (places / (np.array(shape) / 2)).T
-    return np.stack([y**a * x**b for a, b in _powers(degree)], axis=1)
+    y, x = (legvander(at, degree) for at in (places / (np.array(shape) / 2)).T)
+    return np.stack([y[:, a] * x[:, b] for a, b in _powers(degree)], axis=1)
 
 
 def _alike(found: Coefficients, variance: Floats) -> tuple[Coefficients, Floats]:

@@ -39,6 +39,7 @@ from dappled.decode.picture.shadow import (
 _BLOCK_PX, _BLOCK_PERIODS = 64, 4  # a block's side is at least both
 _RIDGE = 1e-6  # of the mean of the diagonal: orders that fall together on a coarse pattern share what they explain
 _DEGREES = (0, 2)  # of the polynomials that are tried
+_FOR_A_TERM = 2  # blocks for each of a polynomial's terms, of either half that the other is held out for
 _SEARCH_SIDE = 2048  # pixels of the frame's middle that the lattice is searched in
 _FOUND_BINS = 0.5  # standard error of the lattice after the search
 _DEEP = 0.2  # standard deviation of W from which on local means are taken again with the shadow known
@@ -445,7 +446,9 @@ class _Equations:
     def evidence(self, degrees: Sequence[int] = _DEGREES) -> ShadowEvidence:
         """What the frame tells, with polynomials of these degrees."""
         sure = np.asarray(np.linalg.inv(self._lattice_step[1] + 1e-8 * np.eye(4)))
-        fits = tuple(each._fitted(degree) for each in self.nested for degree in degrees)
+        fewest = min(int(self.odd.sum()), int((~self.odd).sum()))
+        known = [one for one in degrees if one == 0 or _FOR_A_TERM * self._terms(one).shape[1] <= fewest]
+        fits = tuple(each._fitted(degree) for each in self.nested for degree in known)
         return ShadowEvidence(self.shape, self.at, self.sought.orders, sure, fits)
 
     def _unpulled(self, colour: int, weights: Floats, terms: Floats) -> Floats:
