@@ -34,6 +34,8 @@ from dappled.decode.picture.shadow import (
     terms_at,
 )
 
+_Blocks = NDArray[np.bool_] | slice
+_EVERY = slice(None)
 # Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
 
 _BLOCK_PX, _BLOCK_PERIODS = 64, 4  # a block's side is at least both
@@ -225,10 +227,11 @@ class _Sought:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Pairs:
-    """The mean, `orders` and their opposites: `every` (n, 2); and each two of them: their differences but for the sign
-    `apart` (m, 2), which of these each is by `index` (n, n), and where it is `turned`."""
+    """The mean and the orders: `half` (h, 2); and the differences of each of them and each of the mean, the orders and
+    their opposites (n), but for the sign: `apart` (m, 2), which of these each is by `index` (h, n), and where it is
+    `turned`."""
 
-    every: NDArray[np.intp]
+    half: NDArray[np.intp]
     apart: NDArray[np.intp]
     index: NDArray[np.intp]
     turned: NDArray[np.bool_]
@@ -237,17 +240,38 @@ class _Pairs:
 @lru_cache(maxsize=8)
 def _pairs(orders: tuple[Order, ...]) -> _Pairs:
     every = np.array([(0, 0), *orders, *((-ky, -kx) for ky, kx in orders)], dtype=np.intp)
-    apart = every[:, None] - every[None, :]
+    half = every[: len(orders) + 1]
+    apart = half[:, None] - every[None, :]
     turned = (apart[..., 0] < 0) | ((apart[..., 0] == 0) & (apart[..., 1] < 0))
     unique, index = np.unique(np.where(turned[..., None], -apart, apart).reshape(-1, 2), axis=0, return_inverse=True)
-    return _Pairs(every, unique, index.reshape(turned.shape), turned)
+    return _Pairs(half, unique, index.reshape(turned.shape), turned)
+
+
+def _real(values: NDArray[np.complexfloating]) -> Floats:
+    """(…, n) of the mean and orders (…, half): the mean's real part, real and imaginary parts of the others, times √2,
+    with which products are those of all orders and their opposites."""
+    parts = values[..., :1].real, math.sqrt(2) * values[..., 1:].real, math.sqrt(2) * values[..., 1:].imag
+    return np.concatenate(parts, axis=-1).astype(np.float64)
+
+
+def _complex(values: Floats) -> Coefficients:
+    """Coefficients (half, terms) of what `_real` makes of them (n, terms)."""
+    half = len(values) // 2 + 1
+    return np.concatenate([values[:1] + 0j, (values[1:half] + 1j * values[half:]) / math.sqrt(2)])
+
+
+def _products(one: NDArray[np.complexfloating], other: NDArray[np.complexfloating]) -> Floats:
+    """(blocks,) of two (blocks, half), over all orders and their opposites."""
+    each = (one.conj() * other).real
+    return np.asarray(2 * each.sum(axis=1) - each[:, 0])
 
 
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """Normal equations of the coefficients, block by block: `sums` (colours, blocks, differences) of L² over waves of
-    the differences of orders, which make the matrix, and `right` (colours, blocks, n) of the mean, the `sought` orders
-    and their opposites. `energy` and `count` are of each block's frame − L."""
+    the differences of orders, which make the matrix, and `right` (colours, blocks, half) of the mean and the `sought`
+    orders, as all coefficients `c` are: those of their opposites are the conjugates. `energy` and `count` are of each
+    block's frame − L."""
 
     shape: tuple[int, int]
     at: Lattice
@@ -278,9 +302,8 @@ class _Equations:
         across = [math.ceil(side / step) * step for step in steps]
         blocks = [max(1, whole // one) for whole, one in zip(mosaic.shape, across, strict=True)]
         shape = (mosaic.colours, blocks[0] * blocks[1])
-        n, half = len(pairs.every), len(sought.orders) + 1
         every = np.zeros((*shape, len(pairs.apart)), dtype=np.complex64) if sums is None else sums
-        right = np.zeros((*shape, n), dtype=np.complex64)
+        right = np.zeros((*shape, len(pairs.half)), dtype=np.complex64)
         energy, count = np.zeros(shape), np.zeros(shape)
         matrix = lattice.matrix()
         for place, mean, good in means.means:
@@ -293,14 +316,13 @@ class _Equations:
             edges = tuple(
                 np.arange(number) * (one // step) for number, one, step in zip(blocks, across, steps, strict=True)
             )
-            waves = wave_sums(weight * high, rows, columns, pairs.every[:half] @ matrix, (edges[0], edges[1]))
-            right[place.colour, :, :half] += waves.reshape(shape[1], -1)
+            waves = wave_sums(weight * high, rows, columns, pairs.half @ matrix, (edges[0], edges[1]))
+            right[place.colour] += waves.reshape(shape[1], -1)
             if sums is None:
                 waves = wave_sums(weight * mean, rows, columns, pairs.apart @ matrix, (edges[0], edges[1]))
                 every[place.colour] += waves.reshape(shape[1], -1)
             for values, into in ((high * high, energy), (keep, count)):
                 into[place.colour] += block_sums(values, edges[0], edges[1]).ravel()
-        right[..., half:] = right[..., 1:half].conj()
         middles = []
         for number, one, full in zip(blocks, across, mosaic.shape, strict=True):
             ends = np.append(np.arange(number) * one, full)  # the last is longer
@@ -319,16 +341,14 @@ class _Equations:
             return (self,)
         number = {tuple(apart): at for at, apart in enumerate(_pairs(self.sought.orders).apart.tolist())}
         sums = np.take(self.sums, [number[tuple(one)] for one in _pairs(fewer.orders).apart.tolist()], axis=-1)
-        half = np.arange(1, fewer.drawn + 1)
-        right = np.take(self.right, [0, *half, *(half + len(self.sought.orders))], axis=-1)
-        return replace(self, sought=fewer, sums=sums, right=right), self
+        return replace(self, sought=fewer, sums=sums, right=self.right[..., : fewer.drawn + 1]), self
 
     def moved(self, lattice: Lattice) -> _Equations:
         """About the same at a lattice so near that waves turn little within a block."""
         pairs, move = _pairs(self.sought.orders), lattice.matrix() - self.at.matrix()
         of_sums, of_right = (
             np.exp(-2j * np.pi * (self.centres @ (some @ move).T)).astype(np.complex64)
-            for some in (pairs.apart, pairs.every)
+            for some in (pairs.apart, pairs.half)
         )
         return replace(self, at=lattice, sums=self.sums * of_sums, right=self.right * of_right)
 
@@ -337,18 +357,18 @@ class _Equations:
         sums = self.moved(lattice).sums if means.mosaic.valid is None else None
         return _Equations.of(means, lattice, self.sought, self.like, sums)
 
-    def _image(self, colour: int, c: Coefficients, degree: int) -> Coefficients:
-        """(blocks, n) each block's matrix times its coefficients, of c (n, terms)."""
-        pairs, made = _pairs(self.sought.orders), np.zeros(self.right.shape[1:], dtype=np.complex128)
-        ahead, behind = np.zeros((2, *c.shape[1:], len(pairs.apart), len(c)), dtype=np.complex64)
+    def _image(self, colour: int, c: Coefficients, degree: int, blocks: _Blocks = _EVERY) -> Coefficients:
+        """(blocks, half) each block's matrix times its coefficients, of c (half, terms)."""
+        pairs, own, terms = _pairs(self.sought.orders), self.sums[colour][blocks], self._terms(degree)[blocks]
+        every = np.concatenate([c, c[1:].conj()]).T
+        made = np.zeros((len(own), len(c)), dtype=np.complex128)
+        ahead, behind = np.zeros((2, len(every), len(pairs.apart), len(c)), dtype=np.complex64)
         rows = np.broadcast_to(np.arange(len(c))[:, None], pairs.index.shape)
         for into, chosen in ((ahead, ~pairs.turned), (behind, pairs.turned)):
-            into[:, pairs.index[chosen], rows[chosen]] = np.broadcast_to(c.T[:, None], (c.shape[1], *chosen.shape))[
-                :, chosen
-            ]
-        own = self.sums[colour]
+            values = np.broadcast_to(every[:, None], (len(every), *chosen.shape))
+            into[:, pairs.index[chosen], rows[chosen]] = values[:, chosen]
         other = own.conj()
-        for term, first, second in zip(self._terms(degree).T, ahead, behind, strict=True):
+        for term, first, second in zip(terms.T, ahead, behind, strict=True):
             made += term[:, None] * (own @ first + other @ second)
         return made
 
@@ -375,36 +395,40 @@ class _Equations:
     def _terms(self, degree: int) -> Floats:
         return terms_at(self.centres, self.shape, degree)
 
-    def _local(self, c: Coefficients, degree: int) -> Coefficients:
-        """(blocks, n) the coefficients at each block, of c (n, terms)."""
-        return np.asarray(self._terms(degree) @ c.T)
-
-    def _gains(self, colour: int, c: Coefficients, degree: int) -> Floats:
-        """(blocks,) how much of a block's energy coefficients (n, terms) explain."""
-        local = self._local(c, degree).conj()
-        return np.asarray((local * (2 * self.right[colour] - self._image(colour, c, degree))).sum(axis=1).real)
+    def _gains(self, colour: int, c: Coefficients, degree: int, blocks: _Blocks = _EVERY) -> Floats:
+        """(blocks,) how much of a block's energy coefficients (half, terms) explain."""
+        image = self._image(colour, c, degree, blocks)
+        return _products(self._terms(degree)[blocks] @ c.T, 2 * self.right[colour][blocks] - image)
 
     def _solved(self, colour: int, weights: Floats, degree: int) -> Coefficients:
-        """Coefficients (n, terms)."""
+        """Coefficients (half, terms)."""
         whole, right = self._normal(colour, weights, degree)
-        return np.asarray(np.linalg.solve(whole, right).reshape(self.right.shape[2], -1))
+        found: Floats = np.asarray(np.linalg.solve(whole, right), dtype=np.float64)
+        return _complex(found.reshape(-1, self._terms(degree).shape[1]))
 
-    def _normal(self, colour: int, weights: Floats, degree: int) -> tuple[Coefficients, Coefficients]:
-        """The normal equations of coefficients (n, terms): matrix and right side."""
-        terms, n = self._terms(degree), self.right.shape[2]
-        count = terms.shape[1]
+    def _normal(self, colour: int, weights: Floats, degree: int) -> tuple[Floats, Floats]:
+        """The normal equations of `_real` coefficients (n, terms): matrix and right side."""
+        terms, known, h = self._terms(degree), _pairs(self.sought.orders), self.right.shape[2]
+        count, n = terms.shape[1], 2 * h - 1
         first, second = np.triu_indices(count)
         pairs = weights[:, None] * terms[:, first] * terms[:, second]
-        gram, known = np.empty((count, count, n, n), dtype=np.complex128), _pairs(self.sought.orders)
         parts = self.sums[colour].view(np.float32).astype(np.float64)
         every = (pairs.T @ parts).view(np.complex128)[:, known.index]
         np.conjugate(every, out=every, where=known.turned)
-        gram[first, second] = every
-        gram[second, first] = gram[first, second]
+        less, more = every[..., :h], every[..., [0, *range(h, n)]]  # of an order and another, of it and the opposite
+        blocks = np.empty((len(pairs.T), n, n))
+        blocks[:, :h, :h] = (less + more).real
+        blocks[:, :h, h:] = (more - less)[..., 1:].imag
+        blocks[:, h:, :h] = (more + less)[:, 1:].imag
+        blocks[:, h:, h:] = (less - more)[:, 1:, 1:].real
+        blocks[:, 0] /= math.sqrt(2)
+        blocks[:, :, 0] /= math.sqrt(2)
+        gram = np.empty((count, count, n, n))
+        gram[first, second] = gram[second, first] = blocks
         whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count)
-        right = (self.right[colour].T @ (weights[:, None] * terms)).reshape(n * count).astype(np.complex128)
-        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole).real) / len(whole), 1e-30)
-        return whole, right
+        right = _real(self.right[colour]).T @ (weights[:, None] * terms)
+        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole)) / len(whole), 1e-30)
+        return whole, right.reshape(n * count)
 
     def held_out(self, degree: int) -> float:
         """Log likelihood that coefficients gain over the mean alone, on the blocks that they were not fitted to."""
@@ -414,7 +438,7 @@ class _Equations:
                 if not fold.any() or fold.all():
                     continue
                 c = self._solved(colour, np.where(fold, 0.0, weights), degree)
-                total += float((weights * self._gains(colour, c, degree))[fold].sum()) / 2
+                total += float(weights[fold] @ self._gains(colour, c, degree, fold)) / 2
         return total
 
     @cached_property
@@ -425,19 +449,18 @@ class _Equations:
     def explained(self, other: Shadow | None, weights_of_blocks: Floats | None = None) -> float:
         """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none.
         (Those of several shadows compare where blocks weigh the same.)"""
-        total, n = 0.0, self.right.shape[2]
+        total, half = 0.0, self.right.shape[2]
         for colour, weights in enumerate(self.weights if weights_of_blocks is None else weights_of_blocks):
             degree = 0 if other is None else other.degree
-            c = np.zeros((n, len(terms_at(self.centres[:1], self.shape, degree)[0])), dtype=np.complex128)
+            c = np.zeros((half, len(terms_at(self.centres[:1], self.shape, degree)[0])), dtype=np.complex128)
             c[0, 0] = 1
             if other is not None:
-                own = other.coefficients[min(colour, len(other.coefficients) - 1)]
-                c[1:] = np.concatenate([own, own.conj()])
-            local, image = self._local(c, degree), self._image(colour, c, degree)
+                c[1:] = other.coefficients[min(colour, len(other.coefficients) - 1)]
+            local, image = self._terms(degree) @ c.T, self._image(colour, c, degree)
             base = np.zeros_like(c[:, :1])
             base[0] = 1
-            found = (local.conj() * (self.right[colour] + self._image(colour, base, 0))).sum(axis=1).real
-            whole = (local.conj() * image).sum(axis=1).real
+            found = _products(local, self.right[colour] + self._image(colour, base, 0))
+            whole = _products(local, image)
             c *= (weights @ found) / max(float(weights @ whole), 1e-30)
             c[0, 0] -= 1
             total += float((weights * self._gains(colour, c, degree)).sum()) / 2
@@ -461,20 +484,19 @@ class _Equations:
 
     def _fitted(self, degree: int) -> Fit:
         """Coefficients, and their errors by the scatter between blocks."""
-        half = slice(1, len(self.sought.orders) + 1)
         found, spread = [], []
         terms = self._terms(degree)
         for colour, weights in enumerate(self.weights):
             whole, right = self._normal(colour, weights, degree)
             inverse = np.linalg.inv(whole)
-            c = (inverse @ right).reshape(-1, terms.shape[1])
-            image = self._image(colour, c, degree)
-            scores = (weights[:, None] * (self.right[colour] - image))[:, :, None] * terms[:, None, :]
-            errors = (scores.reshape(len(terms), -1) @ inverse.T).reshape(len(terms), *c.shape)
-            errors /= self._unpulled(colour, weights, terms)[:, None, None]
+            c = _complex((inverse @ right).reshape(-1, terms.shape[1]))
+            left = weights[:, None] * _real(self.right[colour] - self._image(colour, c, degree))
+            scores = (left[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
+            errors = scores @ inverse / self._unpulled(colour, weights, terms)[:, None]
+            both = (errors**2).sum(axis=0).reshape(-1, terms.shape[1])[1:] / 2  # real and imaginary parts
             # Where pixels are clipped dark places alone are left, which err alike.
-            spread.append((np.abs(errors) ** 2).sum(axis=0)[half] / max(self.sound, _LEAST) ** 2)
-            found.append(c[half] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
+            spread.append(both.reshape(2, len(c) - 1, -1).sum(axis=0) / max(self.sound, _LEAST) ** 2)
+            found.append(c[1:] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
         return Fit(degree, np.array(found), np.array(spread), self.held_out(degree))
 
     def lattice(self) -> Lattice | None:
@@ -501,8 +523,8 @@ class _Equations:
         levers = levers.reshape(len(self.centres), count, 4)
         parts = []
         for colour, weights in enumerate(self.weights):
-            c = self._solved(colour, weights, 0)[1 : count + 1, 0]
-            turned = weights[:, None] * (c.conj() * self.right[colour][:, 1 : count + 1]).imag
+            c = self._solved(colour, weights, 0)[1:, 0]
+            turned = weights[:, None] * (c.conj() * self.right[colour][:, 1:]).imag
             sure = (weights * self._lights[colour])[:, None] * np.abs(c) ** 2
             parts.append(sure)
             normal[:4, :4] += np.einsum("bki,bk,bkj->ij", levers, sure, levers)
