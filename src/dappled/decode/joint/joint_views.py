@@ -68,7 +68,7 @@ _TRUST = np.float32(0.75)
 _UNLIKE = 1e-4  # of the light, times a transfer: what a slice's mean doesn't tell of a wrong aperture
 # Of a slice's power, what no light field explains: what edges of opaque things leave, or next to nothing. Each patch
 # says which (`likely_errors`): boards that hide each other, SNR 100, have 43.1 dB with the first alone, 42.5 with the
-# second and 43.0 so; boards that blend, without noise, 53.4, 58.8 and 58.8.
+# second and 43.0 so; boards that blend, without noise, 53.4, 58.8 and 58.8; apart, 52.1, 57.1 and 57.1.
 _ERRORS = (5e-4, 5e-6)
 _RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
 # Of a patch's mean square difference to the views that it and its neighbours were joined to, of the model's variance of

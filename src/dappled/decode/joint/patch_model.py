@@ -82,9 +82,10 @@ _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patche
 _ROUNDING = 1e-9  # of the strongest direction's power: far below what is not explained
 _SINGLE = 5e-6  # of a covariance's diagonal: some fifty of single precision's last places, summed up
 _ERROR = 5e-4  # of a slice's power: what no light field explains, where nothing is measured
-# Waves over a patch: boards that hide each other, SNR 100, have 43.0 dB where longer and shorter ones must agree, 42.9
-# where all decide together.
+# Waves over a patch, of those that say what a patch's error is: boards that hide each other, SNR 100, have 43.0 dB by
+# these, 42.5 where all decide together.
 _SHORT = 3.2
+_SMALL_NATS = 4.6  # odds of 100: where noise hides which error it is, the larger one costs nothing
 _UNLIKE = 1e-3  # of the light, times a transfer: what a wrong aperture leaves in each slice, where nothing is measured
 
 
@@ -295,13 +296,19 @@ def wholes_of(frame: FrameModel, rests: Rests, numbers: Iterable[int], some: sli
         yield rests.whole(number, details[place], some)
 
 
-def usual_nats(frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra: Complexes) -> Floats:
-    """(N,) log likelihoods of patches (F, A, N) that are of these `kinds` (N,), all of the usual range; (…, N) where a
-    frame's `weights` are (…, F)."""
-    detail, found = detail_of(frame.ranges[USUAL].seen, rests.own), np.empty((*frame.weights.shape[:-1], len(kinds)))
+def usual_nats(
+    frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra: Complexes, *, any_strength: bool = False
+) -> Floats:
+    """(N,) log likelihoods of patches (F, A, N) that are of these `kinds` (N,), all of the usual range; at `any_strength`
+    of all that is in them, the likeliest."""
+    detail, found = detail_of(frame.ranges[USUAL].seen, rests.own), np.empty(len(kinds))
+    measured = spectra.shape[1] * float(frame.weights.sum())
     for number in map(int, np.unique(kinds)):
         here = kinds == number
-        found[..., here] = likelihoods([rests.whole(number, detail)], some_of(spectra, here), frame.weights)[0]
+        volume, squares = _fit(rests.whole(number, detail), some_of(spectra, here), frame.weights)
+        if any_strength:
+            squares = measured * np.log(np.maximum(squares / measured, LEAST_NOISE)) + measured
+        found[here] = volume - squares
     return found
 
 
@@ -309,16 +316,17 @@ def likely_errors(
     frames: Sequence[FrameModel], rests: Sequence[Rests], kinds: NDArray[np.intp], spectra: Complexes
 ) -> NDArray[np.intp]:
     """(N,) which of two frames, that of the larger `error` first, patches (F, A, N) of these `kinds` (N,) are of, by
-    the `rests_of` their group in each: of the second where long and short waves both say so. Long ones alone are
-    surest, and would outvote what an edge of an opaque thing leaves in the others."""
+    the `rests_of` their group in each: of the second where short waves say so with odds of 100. Long ones say so
+    beside edges of opaque things, too. A patch is asked at its own strength: one that is stronger than its group has
+    more of everything, which at the group's strength only a larger error explains."""
     usual, radius = np.isin(kinds, USUAL_KINDS), frames[0].radius(frames[0].frequencies)
-    apart = frames[0].weights * np.stack([radius < _SHORT, radius >= _SHORT])
+    short = frames[0].weights * (radius >= _SHORT).astype(np.float32)
     large, small = (
-        usual_nats(replace(one, weights=apart), rest, kinds[usual], some_of(spectra, usual))
+        usual_nats(replace(one, weights=short), rest, kinds[usual], some_of(spectra, usual), any_strength=True)
         for one, rest in zip(frames, rests, strict=True)
     )
     found = np.zeros(len(kinds), dtype=np.intp)
-    found[usual] = (small > large).all(axis=0)
+    found[usual] = small > large + _SMALL_NATS
     return found
 
 
@@ -381,20 +389,27 @@ def summed(parts: NDArray[Any]) -> NDArray[Any]:
 
 
 def likelihoods(wholes: Iterable[Terms], spectra: Complexes, weights: Singles, workers: int = 1) -> Floats:
-    """(B, …, N) log likelihoods of patches (F, A, N) whose slices have these covariances (F, A, A), by frequencies'
-    `weights` (…, F)."""
+    """(B, N) log likelihoods of patches (F, A, N) whose slices have these covariances (F, A, A), by frequencies'
+    `weights` (F,)."""
     listed = list(wholes)
-    found = np.empty((len(listed), *weights.shape[:-1], spectra.shape[2]))
+    found = np.empty((len(listed), spectra.shape[2]))
 
     def one(number: int) -> None:
-        exact = whitener_of(listed[number])
-        whitener, volume = single(exact), weights @ _volume(exact)
-        for some in spans(spectra.shape[2], AT_A_TIME):
-            power = weights @ _squares(times(whitener, spectra[:, :, some])).astype(np.float64)
-            found[number, ..., some] = volume[..., None] - summed(power)
+        volume, squares = _fit(listed[number], spectra, weights)
+        found[number] = volume - squares
 
     each(one, range(len(listed)), workers)
     return found
+
+
+def _fit(whole: Terms, spectra: Complexes, weights: Singles) -> tuple[float, Floats]:
+    """The two parts of the log likelihoods of patches (F, A, N): a volume less their squares (N,) behind the whitener
+    of their covariance (F, A, A)."""
+    exact = whitener_of(whole)
+    whitener, squares = single(exact), np.empty(spectra.shape[2])
+    for some in spans(spectra.shape[2], AT_A_TIME):
+        squares[some] = summed(weights @ _squares(times(whitener, spectra[:, :, some])).astype(np.float64))
+    return float(weights @ _volume(exact)), squares
 
 
 def likely_kinds(frame: FrameModel, rests: Rests, spectra: Complexes, *, with_parallax: bool) -> NDArray[np.intp]:
