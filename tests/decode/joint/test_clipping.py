@@ -108,7 +108,7 @@ def test_the_share_of_each_patch_that_is_clipped() -> None:
     np.testing.assert_array_equal(np.argwhere(shares > 0), [[4, 2], [4, 3], [5, 2], [5, 3]])
 
 
-@pytest.fixture(scope="module", params=[0, pytest.param(1, marks=pytest.mark.long)])
+@pytest.fixture(scope="module", params=[0, *(pytest.param(seed, marks=pytest.mark.long) for seed in (1, 5))])
 def half_open(request: pytest.FixtureRequest) -> HalfOpen:
     """Half the ideal aperture, one pixel in a hundred at white."""
     scene = RaySum(finest=BAND, snr=100, kappa=0.5, seed=request.param, covers="apart", shape=(240, 280))
