@@ -299,8 +299,8 @@ def wholes_of(frame: FrameModel, rests: Rests, numbers: Iterable[int], some: sli
 def usual_nats(
     frame: FrameModel, rests: Rests, kinds: NDArray[np.intp], spectra: Complexes, *, any_strength: bool = False
 ) -> Floats:
-    """(N,) log likelihoods of patches (F, A, N) that are of these `kinds` (N,), all of the usual range; at `any_strength`
-    of all that is in them, the likeliest."""
+    """(N,) log likelihoods of patches (F, A, N) that are of these `kinds` (N,), all of the usual range; at
+    `any_strength` of all that is in them, the likeliest."""
     detail, found = detail_of(frame.ranges[USUAL].seen, rests.own), np.empty(len(kinds))
     measured = spectra.shape[1] * float(frame.weights.sum())
     for number in map(int, np.unique(kinds)):
