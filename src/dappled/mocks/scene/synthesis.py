@@ -106,7 +106,9 @@ def mosaic(
     carriers' phase in radians at pixel (0, 0).
     """
     orders = list(weights)
-    real, imaginary = _angular_slices(radiance, angular)
+    light = radiance.reshape(len(radiance), -1)
+    parts = np.stack([angular.real, angular.imag], axis=1).astype(np.float32)
+    summed = np.empty((2, *radiance.shape[1:]), dtype=np.float32)  # real and imaginary; used again for each carrier
     shifted = np.empty(radiance.shape[1:], dtype=np.complex64)
     half = grid.fine[0] // 2, grid.fine[1] // 2
     spectra = np.zeros((len(sites), *half), dtype=np.complex64)
@@ -124,9 +126,10 @@ def mosaic(
         ramp_y = (start * np.exp(2j * np.pi * rest[0] * rows)).astype(np.complex64)
         ramp_x = np.exp(2j * np.pi * rest[1] * columns).astype(np.complex64)
         ramp = ramp_y[:, None] * ramp_x[None, :] * fade
-        shifted.real, shifted.imag = real[number], imaginary[number]
+        np.matmul(parts[number], light, out=summed.reshape(2, -1))
+        shifted.real, shifted.imag = summed
         shifted *= ramp
-        spectrum = fft.fft2(shifted, norm="forward", workers=WORKERS)
+        spectrum = fft.fft2(shifted, norm="forward", overwrite_x=True, workers=WORKERS)
         at = [_Band.of(grid, axis, bins[axis], rest[axis]) for axis in (0, 1)]
         for channel in range(3):
             box = spectrum[channel][np.ix_(at[0].source, at[1].source)]
@@ -183,15 +186,6 @@ class _Band:
             first=(carrier_bin - reach) % (fine // 2),
             response=(response.astype(np.complex64), odd.astype(np.complex64)),
         )
-
-
-def _angular_slices(
-    radiance: NDArray[np.float32], angular: NDArray[np.complex128]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Real and imaginary part, (K, 3, h, w) each: the sum over aperture points of view times `angular`."""
-    both = np.concatenate([angular.real, angular.imag]).astype(np.float32) @ radiance.reshape(len(radiance), -1)
-    halves = both.reshape(2, len(angular), *radiance.shape[1:])
-    return halves[0], halves[1]
 
 
 def _add(target: NDArray[np.complex64], box: NDArray[np.complex64], at: list[_Band]) -> None:
