@@ -7,7 +7,6 @@ one clause with its place, what it must be and what it is.
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 import types
@@ -87,8 +86,15 @@ def read_json(kind: type[Record], text: str | bytes) -> Record:
 def hint(key: str, known: Iterable[str]) -> str:
     """The known key that is next to an unknown one, or all of them."""
     names = list(known)
-    near = difflib.get_close_matches(key, names, 1, 0.4)
-    return f"did you mean {near[0]!r}?" if near else f"known: {', '.join(names)}"
+    near = nearest(key, names)
+    return f"did you mean {near!r}?" if near else f"known: {', '.join(names)}"
+
+
+def nearest(word: str, known: Iterable[str], likeness: float = 0.4) -> str:
+    """The known word that is next to an unknown one; "" where none is so like it (0 to 1)."""
+    import difflib  # noqa: PLC0415  # a start without a mistake doesn't need it
+
+    return next(iter(difflib.get_close_matches(word, list(known), 1, likeness)), "")
 
 
 def shown(value: Any) -> str:

@@ -206,10 +206,11 @@ class Worker(Loop, Generic[Item]):
             report(log, f"{self.name}: reporting an item", error)
 
 
-def renice(by: int) -> None:
-    """Change the calling thread's own niceness by so much; others run before it where it grows. Raises OSError."""
-    me = threading.get_native_id()
-    os.setpriority(os.PRIO_PROCESS, me, os.getpriority(os.PRIO_PROCESS, me) + by)
+def renice(by: int, task: int | None = None) -> None:
+    """Change the niceness of the calling thread, or of a process that begins, by so much; others run before it where
+    it grows. Raises OSError."""
+    task = task or threading.get_native_id()
+    os.setpriority(os.PRIO_PROCESS, task, os.getpriority(os.PRIO_PROCESS, task) + by)
 
 
 Part = TypeVar("Part")

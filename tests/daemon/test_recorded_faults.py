@@ -15,7 +15,7 @@ from dappled.daemon.navigation import BodyLatency, Telemetry, clocks
 from dappled.daemon.pipeline import tagging
 from dappled.decode.geometry import Pose
 from dappled.drivers.mavlink import MavlinkMessage, PacketParser, mavlink
-from dappled.drivers.raw.raw_file import ExposureSettings
+from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.flight import Cause, LedgerReader, Result, Shot, recording
 from dappled.flight.checks.flight_check import check
 from dappled.mocks.autopilot.autopilot import BootTime

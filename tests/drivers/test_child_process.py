@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -120,6 +121,16 @@ def test_the_restart_budget_allows_its_limit_in_any_window() -> None:
     assert budget.wait_ns(60 * second) == 0
     budget.spend(60 * second)
     assert budget.wait_ns(61 * second) == 9 * second
+
+
+def test_a_child_lets_others_run_before_it_from_its_first_import_on() -> None:
+    own, found = os.getpriority(os.PRIO_PROCESS, threading.get_native_id()), []
+    for niceness in (0, 3):
+        process, channel = start_child("dappled.drivers.wired.ptp_source", "usb:", niceness=niceness)
+        found.append(os.getpriority(os.PRIO_PROCESS, process.pid))
+        end_child(process, 0.0)
+        channel.close()
+    assert found == [own, own + 3]
 
 
 def test_looking_goes_before_decoding_and_decoding_before_the_rest() -> None:

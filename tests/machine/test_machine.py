@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import time
 from collections.abc import Callable
 
 import pytest
@@ -21,9 +22,7 @@ def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
 ) -> None:
     flown = scene(suite=suite)
     flown.configure()
-    flown.machine.run("systemctl start dappled")
-    began_us, ready_us = (int(flown.shown(f"{name}TimestampMonotonic")) for name in ("InactiveExit", "ActiveEnter"))
-    table(f"{suite}: READY=1, s from the start of the unit", (ready_us - began_us) / 1e6)
+    table(f"{suite}: READY=1, s from the start of the unit", flown.start())
     flown.begin()
     for _ in range(20):
         flown.station.shoot()
@@ -40,6 +39,22 @@ def test_the_package_is_ready_soon_records_every_byte_and_is_confined(
     doctor = flown.machine.run("dappled doctor --config /etc/dappled/dappled.toml 2>&1 || true")
     assert "of user dappled runs here" in doctor
     assert "holds" not in doctor  # its own camera process is nobody who is in the way
+
+
+def test_a_daemon_with_a_mask_is_ready_soon_and_takes_a_photograph(
+    scene: Make, table: Callable[[str, object], None]
+) -> None:
+    flown = scene()
+    flown.configure(more='[mask]\nprofile = "mask-2"\n')
+    for turn in range(3):
+        began = time.monotonic()
+        table(f"with a mask: READY=1, s from the start of the unit, start {turn + 1}", flown.start())
+        accepted_s = flown.station.accepted() - began
+        table(f"with a mask: a photograph is accepted, s from the start of the unit, start {turn + 1}", accepted_s)
+        flown.station.until(lambda it: len(it.captured) == len(it.accepted_s), "an announced image")
+        flown.machine.run("systemctl stop dappled")
+    assert len(flown.frames()) == len(flown.station.captured) >= 3
+    assert flown.shown("NRestarts") == "0"
 
 
 def test_what_is_killed_comes_back_and_its_flight_stays(scene: Make) -> None:

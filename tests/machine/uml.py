@@ -28,6 +28,7 @@ _NETWORK = "/proc/thread-self/ns/net"
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _MARK = b"mark"
 _ANSWER_S = 2.0
+_AGAIN_S = 0.5
 _PAGE = 4096  # what flash writes as a whole, and a block of ext4
 
 
@@ -295,14 +296,31 @@ class Station:
         )
         self._socket.sendto(asked.pack(self._mav), self._peer)
 
+    def accepted(self) -> float:
+        """From its next heartbeat on, ask for photographs until one is accepted. Returns when that was heard
+        (monotonic, s)."""
+        heard, known = self.heartbeats, len(self.accepted_s)
+        self.until(lambda it: it.heartbeats > heard, "a camera's heartbeat")
+        for _ in range(240):
+            answers = self._answers()
+            self.request()
+            with self._lock:
+                self._lock.wait_for(lambda: self._answers() > answers, _ANSWER_S)  # noqa: B023 (asked in this turn)
+                if self._lock.wait_for(lambda: len(self.accepted_s) > known, _AGAIN_S):
+                    return self.accepted_s[known]
+        raise AssertionError(self)
+
+    def _answers(self) -> int:
+        return len(self.accepted_s) + len(self.refused_s)
+
     def shoot(self) -> None:
         """One photograph, to its announcement. A request that is not answered is repeated, for less than the 10 s in
         which a repeated one is no new one."""
-        known, answers = len(self.captured), len(self.accepted_s) + len(self.refused_s)
+        known, answers = len(self.captured), self._answers()
         for repeat in range(4):
             self.request(repeat=repeat)
             with self._lock:
-                if self._lock.wait_for(lambda: len(self.accepted_s) + len(self.refused_s) > answers, _ANSWER_S):
+                if self._lock.wait_for(lambda: self._answers() > answers, _ANSWER_S):
                     break
         self.until(lambda it: len(it.captured) > known, "an announced image")
 

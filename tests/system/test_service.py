@@ -57,6 +57,27 @@ Service.step = until_told
 sys.exit(main(sys.argv[2:]))
 """
 """The daemon, its working loop standing still while a file is there; all its other threads go on."""
+LOADED = """
+import sys
+from pathlib import Path
+from dappled.cli import main
+from dappled.daemon import after_ready
+from dappled.daemon.health.systemd import Notifier
+
+ready, load, folder = Notifier.ready, after_ready.load, Path(sys.argv[1])
+
+def told(self, monotonic_ns):
+    (folder / "at-ready").write_text(" ".join(sys.modules))
+    ready(self, monotonic_ns)
+
+def loaded():
+    load()
+    (folder / "later").write_text(" ".join(sys.modules))
+
+Notifier.ready, after_ready.load = told, loaded
+sys.exit(main(sys.argv[2:]))
+"""
+"""The daemon, which writes down what is loaded when it is ready, and when the rest is."""
 
 
 @contextmanager
@@ -112,6 +133,19 @@ def test_systemd_hears_of_a_whole_life(manager: socket.socket, served: subproces
     assert "reload: record.min_free_mb is 2 now (was 1)" in said
     assert "takes a restart" in said
     assert "reload: the settings stay as they are:" in said
+
+
+def test_what_only_frames_need_is_loaded_once_it_is_ready(manager: socket.socket, tmp_path: Path) -> None:
+    """On a small computer READY goes with the pages of what is loaded before it."""
+    readers = {"PIL", "rawpy", "tifffile"}
+    settings = f'{RECORD}[mask]\nprofile = "mask-2"\n[mavlink]\nurl = "udpin:127.0.0.1:{free_port()}"\n'
+    later = tmp_path / "later"
+    with serving(manager, tmp_path, settings, ("-c", LOADED, str(tmp_path))):
+        until(manager, lambda _: later.exists() and bool(later.read_text()))  # the watchdog is fed all the time
+    at_ready = set((tmp_path / "at-ready").read_text().split())
+    assert not at_ready & (readers | {"difflib", "gpiod", "scipy", "usb", "xml"})
+    assert len(at_ready) < 550
+    assert readers < set(later.read_text().split())
 
 
 @pytest.mark.slow

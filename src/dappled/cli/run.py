@@ -27,9 +27,11 @@ from dappled.errors import DappledError, sentence
 from dappled.key_files import KeyFileError
 
 if not words_only:
+    import numpy  # noqa: F401  # first: from deep in the imports below it takes 1 500 page faults more
+
     from dappled.cli.stop_condition import StopCondition
     from dappled.cli.terminal import CameraRemarks, FrameLines, ProblemRemarks, RunObserver, Tally, remark
-    from dappled.daemon import settings_check
+    from dappled.daemon import after_ready, settings_check
     from dappled.daemon.flight_handover import FlightHandover, flights
     from dappled.daemon.grounded import answer_meanwhile
     from dappled.daemon.health.patience import Patience
@@ -151,6 +153,7 @@ def serve(settings: Settings, plan: RunPlan, simulation: Simulation | None) -> i
             stack.callback(lambda: None if after.next and not asked.is_set() else manager.stopping())
             after.began = True
             manager.ready(time.monotonic_ns())
+            after_ready.begin()
             remark(f"flight {service.folder}")
             remark(f"stream {flown.publish.slices}")
             if service.console_url:

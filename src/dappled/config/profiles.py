@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 import tomllib
 from dataclasses import MISSING, dataclass, field
@@ -10,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from dappled import codec
 from dappled.config.schema import ConfigError, TomlSource, build, read_toml, setting
 from dappled.decode.optics import LAWS, Mask, Sensor
 
@@ -253,8 +253,8 @@ def _read(name: str, kind: str) -> tuple[dict[str, Any], TomlSource]:
         return read_toml(Path(name).expanduser())
     names = shipped(kind)
     if name not in names:
-        near = difflib.get_close_matches(name, names, 1, 0.4)
-        hint = f"did you mean {near[0]}?" if near else f"shipped: {', '.join(names)}"
+        near = codec.nearest(name, names)
+        hint = f"did you mean {near}?" if near else f"shipped: {', '.join(names)}"
         raise ConfigError(f"no {kind[:-1]} profile {name!r}; {hint} A profile of your own is named by its .toml file")
     text = (resources.files("dappled.config") / "profiles" / kind / f"{name}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text), TomlSource(f"profile {name}", text)

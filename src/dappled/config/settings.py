@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -341,8 +340,8 @@ def _examine_tables(tables: Mapping[str, Any], source: TomlSource) -> tuple[Sett
     findings: list[BadSetting] = []
     for name, table in tables.items():
         if name not in TABLES:
-            near = difflib.get_close_matches(name, TABLES, 1, 0.4)
-            hint = f"did you mean [{near[0]}]?" if near else f"known: {', '.join(TABLES)}"
+            near = codec.nearest(name, TABLES)
+            hint = f"did you mean [{near}]?" if near else f"known: {', '.join(TABLES)}"
             findings.append(BadSetting(name, "", f"{source.where('', name)} is not a known table; {hint}"))
         elif not isinstance(table, Mapping):
             text = f"{source.where('', name)} must be a table: write [{name}] on a line of its own"

@@ -15,13 +15,11 @@ from dappled.config import profiles
 from dappled.config.schema import BadSetting, ConfigError, refuse
 from dappled.config.settings import Settings, SettingsFile
 from dappled.daemon.configured_links import key_files
-from dappled.daemon.console import placement
 from dappled.daemon.console import process as console_process
 from dappled.daemon.stream import curve, sockets
-from dappled.decode.geometry import area
 from dappled.drivers.gnss.port import address as gnss_address
 from dappled.drivers.mavlink import LinkError, parse, read_key
-from dappled.drivers.raw import calibration_files, reading
+from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.errors import DappledError
@@ -185,6 +183,8 @@ def _calibration(settings: Settings) -> None:
 
 def _frame(settings: Settings, name: str) -> None:
     if name and settings.mask.profile:
+        from dappled.drivers.raw import reading  # noqa: PLC0415  # see `after_ready`
+
         reading.read_metadata(Path(name))
 
 
@@ -204,11 +204,15 @@ def _console(settings: Settings) -> None:
 
 def _map(settings: Settings) -> None:
     if settings.console.map:
+        from dappled.daemon.console import placement  # noqa: PLC0415  # a daemon that starts does not ask for it
+
         placement.load_background(Path(settings.console.map))
 
 
 def _area(settings: Settings) -> None:
     if settings.console.area:
+        from dappled.decode.geometry import area  # noqa: PLC0415  # as above
+
         area.read(Path(settings.console.area))
 
 

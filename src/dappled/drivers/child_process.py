@@ -31,7 +31,7 @@ from typing import Any
 
 from dappled.clock import Clock, SystemClock
 from dappled.drivers.python_command import python_module
-from dappled.workers import Loop
+from dappled.workers import Loop, renice
 
 _MESSAGE_BYTES = 131072  # below net.core.wmem_default, 212992, which bounds a packet
 _FDS = 4
@@ -220,13 +220,15 @@ def start_child(
     environment: Mapping[str, str] | None = None,
     quiet: bool = False,
     goes_first: int | None = None,
+    niceness: int = 0,
 ) -> tuple[subprocess.Popen[bytes], ProcessChannel]:
     """Start `python -m module` with a channel to it.
 
     The child's arguments are the channel's descriptor, this process' id, and `arguments`. It inherits `descriptors`,
     and `environment` in addition to this process' own. `quiet` discards what it writes to standard error.
-    With `goes_first` the kernel, when it is short of memory, ends it before those with a lower score (proc(5),
-    oom_score_adj), from its first import on; where the system allows it. Raises OSError.
+    From its first import on, others run before it by `niceness`, and with `goes_first` the kernel, when it is short of
+    memory, ends it before those with a lower score (proc(5), oom_score_adj), where the system allows it.
+    Raises OSError.
     """
     channel, other = ProcessChannel.pair()
     with other:
@@ -242,6 +244,8 @@ def start_child(
         except OSError:
             channel.close()
             raise
+    with contextlib.suppress(OSError):  # it has ended already
+        renice(niceness, process.pid)
     if goes_first is not None:
         with contextlib.suppress(OSError):
             Path(f"/proc/{process.pid}/oom_score_adj").write_text(str(goes_first), encoding="ascii")

@@ -28,7 +28,7 @@ from dappled.daemon.pipeline.live_picture import LivePictures
 from dappled.daemon.pipeline.tagging import tag
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
-from dappled.drivers.raw.raw_file import ExposureSettings
+from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.findings import FRAME, Code, finding
 from dappled.flight import Cause, Frame, Shot, TimeSource
 from tests.daemon.fakes import FakeCamera, no_pose

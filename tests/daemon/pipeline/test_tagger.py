@@ -5,7 +5,7 @@ from __future__ import annotations
 from dappled.daemon.navigation import BodyLatency
 from dappled.daemon.navigation.clocks import mid_exposure
 from dappled.daemon.pipeline import tagging
-from dappled.drivers.raw.raw_file import ExposureSettings
+from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.flight import Frame
 from tests.daemon.fakes import no_pose
 

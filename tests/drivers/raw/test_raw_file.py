@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from dappled.drivers.raw.raw_file import STEPS, ExposureSettings, RawFile, exposure, read_exif
+from dappled.drivers.raw.exposure_settings import ExposureSettings
+from dappled.drivers.raw.raw_file import STEPS, RawFile, exposure, read_exif
 
 WHITE, BLACK = 4095, 128
 

@@ -290,7 +290,9 @@ class DecodeProcess:
                 f"the decoder keeps crashing: it starts again in {wait_ns / 1e9:.0f} s; frames stay in the record"
             )
         self._budget.spend(self._clock.monotonic_ns())
-        self._process, self._channel = start_child("dappled.daemon.pipeline.decode_worker", goes_first=self._goes_first)
+        self._process, self._channel = start_child(
+            "dappled.daemon.pipeline.decode_worker", goes_first=self._goes_first, niceness=NICENESS
+        )
         self._channel.send({"do": "set up", "recipe": codec.plain(self._recipe), "preview_px": self._preview_px})
         return self._channel
 

@@ -21,7 +21,7 @@ from PIL import Image
 from dappled import codec
 from dappled.config import profiles
 from dappled.config.profiles import VerdictBounds
-from dappled.daemon.pipeline.decode_process import NICENESS, serve
+from dappled.daemon.pipeline.decode_process import serve
 from dappled.daemon.pipeline.picture_facts import FineDetail, PictureFacts, detail, fine_detail, noise_of
 from dappled.daemon.stream import wire
 from dappled.decode import DecodeError
@@ -378,7 +378,6 @@ def main() -> None:
     end_with_parent(parent)
     guard_output()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # a ^C is the parent's to act on
-    os.nice(NICENESS)
     serve(socket.socket(fileno=fd), DecodeWorker())
 
 

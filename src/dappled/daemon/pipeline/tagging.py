@@ -11,8 +11,7 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.stream.publisher import Stream
 from dappled.daemon.stream.wire import frame_header
 from dappled.decode.geometry import Pose, Vector3
-from dappled.drivers.raw import reading
-from dappled.drivers.raw.raw_file import ExposureSettings
+from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.drivers.raw.recipe import camera_name
 from dappled.errors import DappledError, report, sentence
 from dappled.findings import FRAME, Code, Finding, Subject, finding, told
@@ -157,6 +156,8 @@ class Tagging:
             return None
 
     def _settings(self, frame: Frame) -> ExposureSettings:
+        from dappled.drivers.raw import reading  # noqa: PLC0415  # see `after_ready`
+
         try:
             return reading.read_metadata(self._ends.writer.path(frame))
         except DappledError as error:

@@ -18,7 +18,6 @@ from typing import Any
 
 from dappled import codec, durable
 from dappled.clock import Clock, SystemClock
-from dappled.drivers import usb_bus
 from dappled.drivers.attribution import Claim
 from dappled.drivers.camera import (
     Arrival,
@@ -293,6 +292,8 @@ class GPhoto2Camera(QueuedCamera):
         """Reset a silent body on USB, as if its cable had been pulled; return words on the result."""
         if self._identity is None or not self._identity.port.startswith("usb:"):
             return ""
+        from dappled.drivers import usb_bus  # noqa: PLC0415  # see `daemon.after_ready`
+
         try:
             usb_bus.reset(self._identity.port)
         except CameraError as error:

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dappled.bounds.parsing import MOST_BYTES, parse_json, read_bytes
-from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, RawSource
+from dappled.drivers.raw.exposure_settings import ExposureSettings
+from dappled.drivers.raw.raw_file import RawFile, RawSource
 
 START = b"\x89LFP\r\n\x1a\n"
 _PART = re.compile(rb"\x89LF[A-Z]\r\n\x1a\n")

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dappled.bounds.pictures import open_picture
+from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 
 RawSource = Path | str | bytes | memoryview | mmap.mmap
@@ -39,25 +40,6 @@ _BAD = (
     OSError, ValueError, SyntaxError, KeyError, TypeError, IndexError, struct.error, EOFError, ArithmeticError,
     AttributeError, MemoryError, RecursionError,
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class ExposureSettings:
-    """Camera and exposure as recorded in the file; None where they are not.
-
-    `taken` is local time without a zone, ISO 8601 ("2008-04-15T13:11:23" or with a fraction). `focal_sigma_mm` is half
-    of what the focal length is rounded to; `temperature_c` is the body's, of Canon EOS bodies.
-    """
-
-    make: str | None = None
-    model: str | None = None
-    focal_length_mm: float | None = None
-    f_number: float | None = None
-    exposure_s: float | None = None
-    iso: float | None = None
-    taken: str | None = None
-    focal_sigma_mm: float | None = None
-    temperature_c: float | None = None
 
 
 def _values(settings: ExposureSettings) -> dict[str, Any]:

@@ -29,7 +29,8 @@ from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import check_stored
 from dappled.bounds.pictures import FREE_PIXELS, check_pixels, check_tiff_page, open_picture
 from dappled.drivers.raw import lytro
-from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, RawSource, positive, read_exif
+from dappled.drivers.raw.exposure_settings import ExposureSettings
+from dappled.drivers.raw.raw_file import RawFile, RawSource, positive, read_exif
 from dappled.durable import plain_file
 from dappled.errors import DappledError
 

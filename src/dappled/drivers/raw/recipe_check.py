@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dappled.config import profiles
-from dappled.drivers.raw import calibration_files, reading
+from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import told
@@ -25,4 +25,6 @@ def check(recipe: Recipe) -> None:
         raise DappledError(f"the taper is {recipe.taper:g}: it must be a share of the band, from 0 to 1")
     for path in (recipe.white, recipe.dark):
         if path:
+            from dappled.drivers.raw import reading  # noqa: PLC0415  # see `daemon.after_ready`
+
             reading.read_metadata(Path(path))

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, runtime_checkable
-
-import gpiod
-from gpiod.line import Direction, Value
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from dappled.drivers.camera import CameraError, text_option
+
+if TYPE_CHECKING:
+    from gpiod.line import Value
 
 HOLD_S = 0.2
 HALF_PRESS_S = 0.5
@@ -61,9 +61,19 @@ OutputRequest = Callable[[str, int, bool], TriggerOutput]
 
 def request_output(chip: str, line: int, active_low: bool) -> TriggerOutput:
     """Request the line as an output, inactive at first. Raises OSError."""
-    settings = gpiod.LineSettings(direction=Direction.OUTPUT, active_low=active_low, output_value=Value.INACTIVE)
+    import gpiod  # noqa: PLC0415  # by whom such a line is named, and nobody else
+    from gpiod.line import Direction  # noqa: PLC0415  # as above
+
+    off = _level(active=False)
+    settings = gpiod.LineSettings(direction=Direction.OUTPUT, active_low=active_low, output_value=off)
     requested: TriggerOutput = gpiod.request_lines(chip, consumer="dappled shutter", config={line: settings})
     return requested
+
+
+def _level(*, active: bool) -> Value:
+    from gpiod.line import Value  # noqa: PLC0415  # as above
+
+    return Value.ACTIVE if active else Value.INACTIVE
 
 
 class GpioLine:
@@ -86,17 +96,17 @@ class GpioLine:
 
     def press(self) -> None:
         """Press the shutter, now."""
-        self._set(Value.ACTIVE)
+        self._set(active=True)
 
     def let_go(self) -> None:
         """Release the shutter after it was held long enough."""
-        self._set(Value.INACTIVE)
+        self._set(active=False)
 
-    def _set(self, value: Value) -> None:
+    def _set(self, *, active: bool) -> None:
         if self._output is None:
             raise CameraError(f"the shutter line {self._line} of {self._chip} is not open")
         try:
-            self._output.set_value(self._line, value)
+            self._output.set_value(self._line, _level(active=active))
         except OSError as error:
             raise CameraError(f"the shutter line {self._line} of {self._chip} can't be set: {error.strerror}") from None
 
@@ -104,7 +114,7 @@ class GpioLine:
         output, self._output = self._output, None
         if output is not None:
             try:
-                output.set_value(self._line, Value.INACTIVE)
+                output.set_value(self._line, _level(active=False))
             except OSError:
                 return  # the chip is gone, and the line with it
             finally:
