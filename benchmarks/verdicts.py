@@ -30,7 +30,8 @@ from dappled.daemon.navigation import Telemetry
 from dappled.daemon.pipeline.picture_facts import PictureFacts, detail, noise_of
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.drivers.mavlink import MavlinkMessage, mavlink
-from dappled.drivers.raw.raw_file import ExposureSettings, RawFile, exposure
+from dappled.drivers.raw.exposure_settings import ExposureSettings
+from dappled.drivers.raw.raw_file import RawFile, exposure
 from dappled.flight import Tag, TimeSource
 from dappled.mocks.autopilot.autopilot import telemetry_message
 from dappled.mocks.autopilot.path import FlightPath, TruePose
