@@ -29,13 +29,12 @@ _TURN_S = 0.2
 class ChildProgram:
     """A module that is run as a process, see `start_child`. `title` is what the log calls it.
 
-    It inherits `descriptors`, and `environment` in addition to the daemon's own. Others run before it by `niceness`. It
-    ends by itself when its channel is closed, and is killed `end_s` later.
+    It inherits `descriptors`, and `environment` in addition to the daemon's own. It ends by itself when its channel is
+    closed, and is killed `end_s` later.
     """
 
     title: str
     module: str
-    niceness: int
     arguments: tuple[str, ...] = ()
     descriptors: tuple[int, ...] = ()
     environment: Mapping[str, str] = field(default_factory=dict)
@@ -93,7 +92,6 @@ class SupervisedProcess(OneThread):
             descriptors=one.descriptors,
             environment=one.environment,
             goes_first=VIEWERS_GO,
-            niceness=one.niceness,
         )
         try:
             self._peer.begun(channel)

@@ -33,6 +33,7 @@ from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
 from dappled.shown import guard_output
 
+NICENESS = 15  # below the decoder's 10
 log = logging.getLogger(__name__)
 
 
@@ -41,6 +42,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
     guard_output()
     logging.basicConfig(level=logging.WARNING, handlers=[systemd.handler()])
+    os.nice(NICENESS)
     reuse_large_blocks()
     channel = ProcessChannel(socket.socket(fileno=int(sys.argv[1])))
     listener = socket.socket(fileno=int(sys.argv[3]))

@@ -25,7 +25,6 @@ from dappled.errors import DappledError
 
 log = logging.getLogger(__name__)
 _BACKLOG = 32
-_NICENESS = 15  # below the decoder's 10
 _TOKEN_CHARACTERS = 12
 _ANSWER_S = 3.0
 
@@ -104,7 +103,6 @@ class Console(SupervisedProcess):
         program = ChildProgram(
             "the console's process",
             "dappled.daemon.console",
-            _NICENESS,
             (str(listener.fileno()),),
             (listener.fileno(),),
             # One thread for its arithmetic: the other cores are for the flight.

@@ -24,7 +24,6 @@ from dappled.findings import Code, Subject, finding
 from dappled.refusals import RefusalLog
 
 _BACKLOG = 128
-_NICENESS = 12  # as ZeroMQ's own thread in the daemon
 _END_S = 3.0  # the process itself waits 2 s for viewers to read what it has
 _STOP_S = 6.0
 
@@ -51,7 +50,6 @@ class TcpRelay:
         program = ChildProgram(
             "the process for TCP viewers",
             "dappled.daemon.stream.relay_process",
-            _NICENESS,
             tuple(str(part) for path, listener in self._routes.items() for part in (listener.fileno(), path)),
             tuple(listener.fileno() for listener in self._routes.values()),
             end_s=_END_S,

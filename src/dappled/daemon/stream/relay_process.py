@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import selectors
 import signal
 import socket
@@ -24,6 +25,7 @@ from dappled.drivers.child_process import ChannelError, ProcessChannel
 from dappled.findings import Code
 from dappled.shown import guard_output
 
+NICENESS = 12  # as ZeroMQ's own thread in the daemon
 _CHUNK_BYTES = 1 << 18
 _CHUNKS = 8  # of one connection, before the others have their turn
 _ACCEPTED = 64
@@ -291,6 +293,7 @@ def main() -> int:
     """Relay until the daemon ends or closes the channel; then let open connections read what they have."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the daemon handles ^C
     guard_output()
+    os.nice(NICENESS)
     near = socket.socket(fileno=int(sys.argv[1]))
     given = iter(sys.argv[3:])  # after the parent's process id
     relay = Relay({socket.socket(fileno=int(fd)): path for fd, path in zip(given, given, strict=True)})
