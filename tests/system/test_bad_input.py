@@ -624,9 +624,10 @@ def kill_decoders() -> None:
 
 
 def has_ended(process: int) -> bool:
-    """Whether the kernel has ended it; its parent may still have to take notice."""
+    """Whether the kernel has ended it with all of its threads; its parent may still have to take notice."""
     try:
-        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        first = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        return first and len(list(Path(f"/proc/{process}/task").iterdir())) == 1  # the others end after it
     except OSError:
         return True
 
