@@ -57,9 +57,9 @@ class BandShape:
 def extract(spectrum: Spectrum, carriers: Sequence[Carrier], form: BandShape, workers: int = 1) -> Slices:
     """The slices of these carriers.
 
-    The scale makes the DC slice the
-    plane's local mean. Phases are those at pixel (0, 0), with the fraction of a bin compensated exactly. The slices end
-    where the frame ends. Raises DecodeError for a size, a taper or columns out of range.
+    The scale makes the DC slice the plane's local mean. Phases are those at pixel (0, 0), with the fraction of a bin
+    compensated exactly. The slices end where the frame ends. Raises DecodeError for a size, a taper or columns out of
+    range.
     """
     bands = _bands(spectrum.shape, spectrum.padded, tuple(carriers), form)
     for band in bands:
