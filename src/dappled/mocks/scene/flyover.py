@@ -95,15 +95,19 @@ class _Surface:
     @classmethod
     def under(cls, ground: Landscape, hits: _Hits) -> _Surface:
         finer = round(TEXEL_M / ground.detail_texel_m)
-        corner, indices = [], []
+        corner, texels = [], []
         for place in (hits.row, hits.column):
             first, last = math.floor(float(place.min())) - 2, math.ceil(float(place.max())) + 2
             corner.append(first)
-            indices.append(np.arange(first * finer, last * finer))
-        at = np.stack(np.meshgrid(*(i.astype(np.float32) / finer for i in indices), indexing="ij"))
-        detail = ground.detail[np.ix_(*(i % n for i, n in zip(indices, ground.detail.shape, strict=True)))]
-        texture = 1 + _look(ground.roughness, at) * detail
-        colours = np.stack([_look(albedo, at) * texture for albedo in ground.albedo])
+            texels.append(np.arange(first, last + 1) % len(ground.relief))
+        part = np.ix_(*texels)
+        fine = (np.arange(at * finer, (at + len(along) - 1) * finer) for at, along in zip(corner, texels, strict=True))
+        detail = ground.detail[np.ix_(*(i % len(ground.detail) for i in fine))]
+        texture = _finer(ground.roughness[part], finer)
+        texture *= detail
+        texture += 1
+        colours = np.stack([_finer(albedo[part], finer) for albedo in ground.albedo])
+        colours *= texture
         return cls(colours, (corner[0], corner[1]), finer)
 
     def look(self, at: Singles, out: Singles) -> None:
@@ -227,6 +231,17 @@ def _relief_range(
         spans.append(np.arange(math.floor(min(edges)) - 1, math.ceil(max(edges)) + 2) + n // 2)
     shown = ground.relief if max(map(len, spans)) >= n else ground.relief[np.ix_(spans[0] % n, spans[1] % n)]
     return float(shown.min()) - 0.05, float(shown.max()) + 0.05
+
+
+def _finer(plane: Singles, times: int) -> Singles:
+    """(h·times, w·times): the values of (h + 1, w + 1), and what lies evenly between them."""
+    for _ in range(2):  # along columns, then along rows
+        between = np.empty((plane.shape[1], len(plane) - 1, times), dtype=np.float32)
+        slope = np.diff(plane, axis=0).T
+        for count in range(times):
+            between[..., count] = plane[:-1].T + np.float32(count / times) * slope
+        plane = between.reshape(len(between), -1)
+    return plane
 
 
 def _look(plane: Singles, at: NDArray[np.floating]) -> Singles:

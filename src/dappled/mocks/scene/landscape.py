@@ -117,11 +117,14 @@ def noise(rng: np.random.Generator, n: int, texel_m: float, *, slope: float, fin
     """(n, n) cyclic noise of unit variance, clipped at ±2.2; amplitude falls as frequency^−slope to nothing finer than
     `finest_m` (metres a cycle)."""
     fy, fx = fft.fftfreq(n, texel_m), fft.rfftfreq(n, texel_m)
-    radius = np.hypot(fy[:, None], fx[None, :])
+    white = rng.standard_normal((2, n, len(fx)), dtype=np.float32)
+    spectrum = np.zeros(white.shape[1:], dtype=np.complex64)
+    some = np.ix_(np.abs(fy) * finest_m < 1, fx * finest_m < 1)  # beyond them there is nothing
+    radius = np.hypot(fy[:, None], fx[None, :])[some]
     radius[0, 0] = np.inf
     amplitude = radius**-slope * (0.5 + 0.5 * np.cos(np.pi * np.clip((radius * finest_m - 0.8) / 0.2, 0, 1)))
-    white = rng.standard_normal((2, *amplitude.shape), dtype=np.float32)
-    field = fft.irfft2((amplitude * (white[0] + 1j * white[1])).astype(np.complex64), s=(n, n))
+    spectrum[some] = amplitude * (white[0][some] + 1j * white[1][some])
+    field = fft.irfft2(spectrum, s=(n, n), overwrite_x=True)
     return np.asarray(np.clip(field / field.std(), -2.2, 2.2), dtype=np.float32)
 
 
