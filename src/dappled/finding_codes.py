@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import re
 from enum import StrEnum
-from importlib import resources
+from pathlib import Path
 
-LIST = resources.files("dappled").joinpath("findings.toml").read_text("utf-8")
+LIST = Path(__file__).with_name("findings.toml").read_text("utf-8")
 # Codes alone: most starts of a command tell nothing, and reading the whole list takes 20 ms.
 _CODES = re.findall(r'^\["(.+)"\]$', LIST, re.MULTILINE)
 Code = StrEnum("Code", {code.replace(".", "_").upper(): code for code in _CODES}, module=__name__)

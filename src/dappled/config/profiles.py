@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import tomllib
 from dataclasses import MISSING, dataclass, field
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from dappled import codec
 from dappled.config.schema import ConfigError, TomlSource, build, read_toml, setting
 from dappled.decode.optics import LAWS, Mask, Sensor
 
+_SHIPPED = Path(__file__).with_name("profiles")
 LENSLET = "lenslet"  # not a profile: the lattice is found in the frame itself
 
 
@@ -226,8 +226,7 @@ def mask(name: str) -> MaskProfile:
 
 def shipped(kind: str) -> list[str]:
     """Names of the shipped profiles; `kind` is "cameras" or "masks"."""
-    folder = resources.files("dappled.config") / "profiles" / kind
-    return sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    return sorted(path.stem for path in (_SHIPPED / kind).glob("*.toml"))
 
 
 def camera_for_model(model: str) -> CameraProfile | None:
@@ -256,5 +255,5 @@ def _read(name: str, kind: str) -> tuple[dict[str, Any], TomlSource]:
         near = codec.nearest(name, names)
         hint = f"did you mean {near}?" if near else f"shipped: {', '.join(names)}"
         raise ConfigError(f"no {kind[:-1]} profile {name!r}; {hint} A profile of your own is named by its .toml file")
-    text = (resources.files("dappled.config") / "profiles" / kind / f"{name}.toml").read_text(encoding="utf-8")
+    text = (_SHIPPED / kind / f"{name}.toml").read_text(encoding="utf-8")
     return tomllib.loads(text), TomlSource(f"profile {name}", text)

@@ -6,7 +6,6 @@ import asyncio
 import json
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ _FRAME_DIGITS = 10
 _MAP_PX, _GLOBE_BOUNDS_PX, _GLOBE_PICTURE_PX = 320, 320, 1024
 _LOG_EVERY_S = 0.7
 _TOKEN_CHARACTERS, _SETTING_CHARACTERS = 40, 200
-_STATIC = Path(str(resources.files("dappled.daemon.console") / "static"))
+_STATIC = Path(__file__).with_name("static")
 
 
 class ConsoleApp:
