@@ -78,12 +78,21 @@ class FlightFolder:
     def frames(self) -> Path:
         return self.path / "frames"
 
-    def files(self) -> Iterator[Path]:
-        """Every plain file below, in order; links are not followed. Raises OSError."""
-        for root, folders, names in os.walk(self.path, onerror=_raise):
-            folders.sort()
-            paths = (Path(root, name) for name in sorted(names))
-            yield from (path for path in paths if path.is_file() and not path.is_symlink())
+    def entries(self) -> Iterator[tuple[str, os.DirEntry[str]]]:
+        """Everything below with its name relative to the flight, folders before what is in them; no link is followed.
+        Raises OSError."""
+        todo = [""]
+        while todo:
+            place = todo.pop()
+            with os.scandir(self.path / place) as scan:
+                entries = sorted(scan, key=lambda entry: entry.name)
+            yield from ((f"{place}{entry.name}", entry) for entry in entries)
+            todo += [f"{place}{entry.name}/" for entry in reversed(entries) if entry.is_dir(follow_symlinks=False)]
+
+    def files(self) -> dict[str, Path]:
+        """Every plain file below, by its name relative to the flight; links are not followed. Raises OSError."""
+        plain = (name for name, entry in self.entries() if entry.is_file(follow_symlinks=False))
+        return {name: self.path / name for name in plain}
 
     def file(self, name: str) -> Path:
         """The path of a file that the ledger names, inside the flight. Raises OutsideError for a name that isn't."""
@@ -339,7 +348,7 @@ def refuse_unfinished(folder: FlightFolder) -> None:
 def remove_parts(folder: FlightFolder) -> list[str]:
     """Remove what was left half-written when recording or work was killed, durably, and name it. Raises FlightError."""
     with disk_errors("remove what was left half-written in", folder.path):
-        parts = [path for path in folder.files() if durable.is_temporary(path.name)]
+        parts = [path for path in folder.files().values() if durable.is_temporary(path.name)]
         for path in parts:
             path.unlink()
         for place in {path.parent for path in parts}:
@@ -372,7 +381,3 @@ def is_locked(root: Path) -> bool:
         except BlockingIOError:
             return True
     return False
-
-
-def _raise(error: OSError) -> None:
-    raise error

@@ -184,11 +184,11 @@ class _Copying:
                     f"{self._there.path / name} changed while it was checked: nothing was removed; try again"
                 )
         both = [self._folder, *([FlightFolder(self._there.path)] if added else [])]
-        signs = key if key is not None and all(seals.is_signed(one, key) for one in both) else None
+        signs = key if key is not None and all(seals.standing(one).signed_by(key) for one in both) else None
         if added:
             added.bring_home(self._folder, self._source, self._there, clock)
         known = {**self._proved, **self._acknowledged()}
-        with seals.opened_again(self._folder, clock, seals.Occasion.PRUNE, signs):
+        with seals.reopened(self._folder, clock, seals.Occasion.PRUNE, signs, judged=True):
             pruning.note(self._folder, self._there.path, sure, added.frames, clock)
         if self._acknowledged().keys() <= known.keys():  # else a file came meanwhile: the next offload brings both
             self._bring_ledger()

@@ -37,7 +37,8 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
             )
         if found.vouched == "signed":
             return found
-        with seals.opened_again(folder, clock, seals.Occasion.OWNER, key), Ledger(folder.ledger, clock) as ledger:
+        opened = seals.reopened(folder, clock, seals.Occasion.OWNER, key, judged=True)
+        with opened, Ledger(folder.ledger, clock) as ledger:
             known = [event.finding for event in ledger.events() if event.kind == seals.CHANGED]
             for one in found.notes:
                 if one not in known:

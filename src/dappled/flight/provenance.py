@@ -1,16 +1,18 @@
-"""Keep the hashes of flight.toml and inputs/, which say what a flight was flown and decoded with, in the ledger."""
+"""Say what the ledger holds of each file, and keep the hashes of flight.toml and inputs/ in it: what a flight was flown
+and decoded with."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from dappled import durable
 from dappled.flight import layout
 from dappled.flight.errors import disk_errors
 from dappled.flight.layout import FlightFolder
-from dappled.flight.ledger import Ledger
+from dappled.flight.ledger import Ledger, LedgerReader
 
 _FACT = "sha256:"  # and the name relative to the flight; the value lists every hash that is right
 
@@ -37,10 +39,28 @@ def write_facts(folder: FlightFolder, ledger: Ledger, facts: Mapping[str, Any]) 
         ledger.set_fact(key, [sha256])
 
 
-def noted(facts: Mapping[str, Any]) -> dict[str, list[str]]:
-    """From the ledger's facts: every hash that is right, by the name of the file."""
-    return {
-        key.removeprefix(_FACT): value if isinstance(value, list) else []
-        for key, value in sorted(facts.items())
+@dataclass(frozen=True, slots=True)
+class HeldDigests:
+    """What the ledger holds of a file: its `size` (None: it holds none), and every SHA-256 (hex) that is right."""
+
+    size: int | None
+    right: tuple[str, ...]
+
+    @property
+    def whole(self) -> tuple[int, str] | None:
+        """Size and SHA-256, where it holds both."""
+        return None if self.size is None else (self.size, self.right[0])
+
+
+def held(ledger: LedgerReader) -> dict[str, HeldDigests]:
+    """What the ledger holds of each file, by name: frames, companions, strays, telemetry, and those that were noted.
+    Raises FlightError."""
+    facts = ledger.facts()
+    files = {
+        key.removeprefix(_FACT): HeldDigests(None, tuple(value) if isinstance(value, list) else ())
+        for key, value in facts.items()
         if key.startswith(_FACT)
     }
+    if "telemetry_sha256" in facts:
+        files["telemetry.tlog"] = HeldDigests(facts.get("telemetry_bytes"), (facts["telemetry_sha256"],))
+    return files | {row.name: HeldDigests(row.size, (row.sha256,)) for row in ledger.files()}

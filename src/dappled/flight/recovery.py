@@ -47,14 +47,20 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
         try:
             layout.refuse_unfinished(folder)
             cut_short = not _closed(folder)
-            signs = key if key is not None and (cut_short or seals.may_sign(folder, key)) else None
+            signs = key if key is not None and (cut_short or _may_sign(folder, key)) else None
             report += [replace(one, subject=Subject("flight", folder.name)) for one in recover_flight(folder, clock)]
-            if not seals.is_sealed(folder):
+            if not seals.standing(folder).covered:
                 seals.seal(folder, clock, seals.Occasion.RECOVERED, signs)
             report += index.take_in(folder, seal=True, cut_short=cut_short)
         except (DappledError, OSError) as error:
             report.append(finding(Code.FLIGHT_UNREPAIRED, Subject("flight", folder.name), why=str(error)))
     return report
+
+
+def _may_sign(folder: FlightFolder, key: SealKey) -> bool:
+    """Whether a closed flight may be signed: it was never sealed, or this key signed all that is there."""
+    before = seals.standing(folder)
+    return (before.count == 0 and before.last is None) or before.signed_by(key)
 
 
 def _closed(folder: FlightFolder) -> bool:

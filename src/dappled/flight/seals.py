@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,10 +21,11 @@ from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.codec import canonical
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.flight import layout, pruning
+from dappled.flight import layout, provenance, pruning
 from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger, LedgerReader, is_closed
+from dappled.flight.provenance import HeldDigests
 from dappled.flight.seal_key import SealKey
 from dappled.shown import printable
 
@@ -110,14 +111,9 @@ def seal(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None 
             missing = sorted(set(range(1, count)) - known.seals.keys())
             ledger.set_fact(FACT, {"count": count, "missing": missing})
             ledger.fold()
-            head, recorded = ledger.last_link(), recorded_files(ledger)
+            head, held = ledger.last_link(), provenance.held(ledger)
         assert head is not None, "a ledger that is open for writing has a chain"
-        files = {
-            str(path.relative_to(folder.path)): recorded.get(str(path.relative_to(folder.path)))
-            or (path.stat().st_size, durable.hash_file(path))
-            for path in sealed_paths(folder)
-        }
-        chain = (head.number, head.link, files, _last_digest(before))
+        chain = (head.number, head.link, digests(folder, held), _last_digest(before))
         values = (count, of_flight(facts), clock.utc_ns(), why.value, *chain)
         made = Seal(*values, key=None if key is None else key.name)
         if key is not None:
@@ -134,112 +130,83 @@ def work(folder: FlightFolder, clock: Clock, why: Occasion, doing: str, key: Sea
 
 
 @contextmanager
-def reopened(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None = None) -> Iterator[None]:
+def reopened(
+    folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None = None, *, judged: bool = False
+) -> Iterator[None]:
     """Work on a closed flight: the ledger says so first, and the flight is sealed again after the work, also where that
     raised. Should the work be killed, `flight check` says what is not sealed. A flight that is still open is left to
     the daemon.
 
     `key` signs the seal only where it had signed all that was there before: otherwise its signature would cover what
-    somebody else did in between. Raises FlightError."""
+    somebody else did in between. `judged`: the caller has made sure of that. Raises FlightError."""
     if not is_closed(folder.ledger):
         yield
         return
-    signs = key if key is not None and is_signed(folder, key) else None
-    with opened_again(folder, clock, why, signs):
-        yield
-
-
-@contextmanager
-def opened_again(folder: FlightFolder, clock: Clock, why: Occasion, key: SealKey | None) -> Iterator[None]:
-    """Work on a closed flight as `reopened` does, where the caller has judged whether `key` may sign. Raises
-    FlightError."""
+    before = standing(folder)
+    changed = before.changed()
+    signs = key if key is not None and (judged or before.signed_by(key)) else None
     layout.refuse_unfinished(folder)
     layout.remove_parts(folder)
-    last, changed = read(folder).last, changed_since(folder)
     with Ledger(folder.ledger, clock) as ledger:
         ledger.add_event(OPENED, finding(Code.FLIGHT_OPENED_AGAIN, Subject("flight"), work=why.value))
-        if last is not None and changed:
+        if before.last is not None and changed:
             names, more = printable(", ".join(changed[:_NAMED])), max(0, len(changed) - _NAMED)
-            found = finding(Code.SEAL_CHANGED, SEAL, seal=last.seal, names=names, more=f"{more} more" if more else "")
-            ledger.add_event(CHANGED, found)
+            also = f"{more} more" if more else ""
+            ledger.add_event(CHANGED, finding(Code.SEAL_CHANGED, SEAL, seal=before.last.seal, names=names, more=also))
     try:
         yield
     finally:
-        seal(folder, clock, why, key)
+        seal(folder, clock, why, signs)
 
 
-def may_sign(folder: FlightFolder, key: SealKey) -> bool:
-    """Whether a closed flight may be signed: it was never sealed, or this key signed all that is there. Raises
-    FlightError."""
-    with LedgerReader.open(folder.ledger) as ledger:
-        count, _ = announced(ledger.facts())
-    return (count == 0 and read(folder).last is None) or is_signed(folder, key)
+@dataclass(frozen=True, slots=True)
+class SealStanding:
+    """How a flight stands to its newest seal, None where there is none: how many the ledger tells of (`count`), whether
+    it covers all links of the chain, and what the ledger holds of the files."""
 
+    folder: FlightFolder
+    last: Seal | None
+    count: int
+    covered: bool
+    held: Mapping[str, HeldDigests]
 
-def is_signed(folder: FlightFolder, key: SealKey) -> bool:
-    """Whether the newest seal is signed by this key and covers all links of the chain, and nothing that it covers was
-    changed since. Raises FlightError."""
-    last = read(folder).last
-    if last is None or last.key != key.name or not key.signed(last.signed_part(), last.mac or ""):
-        return False
-    return is_sealed(folder) and not changed_since(folder)
+    def changed(self) -> list[str]:
+        """The files that something other than dappled changed since, by name: also the ledger, down to the bytes that
+        no row uses. None where rows were written since, or there is no seal: then the files may be newer too.
 
-
-def changed_since(folder: FlightFolder) -> list[str]:
-    """The files that something other than dappled changed since the newest seal, by name: also the ledger, down to the
-    bytes that no row uses. None where rows were written since, or there is no seal: then the files may be newer too.
-
-    Frames and telemetry are compared with the ledger by `flight check`, and with its digests here only by their names.
-    Raises FlightError.
-    """
-    last = read(folder).last
-    if last is None or not is_sealed(folder):
-        return []
-    with LedgerReader.open(folder.ledger) as ledger:
-        recorded = recorded_files(ledger)
-    found = set()
-    with disk_errors("read the files of", folder.path):
-        for name, what in differing(folder, last, recorded.keys()):
-            if isinstance(what, OSError):
-                raise what
-            found.add(name)
-        wal = folder.ledger.with_name(folder.ledger.name + "-wal")
-        if wal.is_file() and wal.stat().st_size:
-            found.add(folder.ledger.name)
-    try:
-        found -= pruning.removed(folder).keys()
-    except FlightError:  # `flight check` says what is wrong with it
-        found.add(pruning.RECORD)
-    return sorted(found)
-
-
-def differing(folder: FlightFolder, last: Seal, known: Collection[str]) -> Iterator[tuple[str, str | OSError]]:
-    """Each file that is not as a seal covers it: its name, and whether it is "missing", "changed" or "added", or why it
-    can't be read. Those of `known` are not read: something else has their digests. Raises OSError."""
-    present = {path.relative_to(folder.path).as_posix(): path for path in sealed_paths(folder)}
-    for name in sorted(last.files.keys() | present.keys()):
-        if name not in present:
-            yield name, "missing"
-            continue
-        if name in known:
-            continue
+        Frames and telemetry are compared with the ledger by `flight check`, and with its digests here only by their
+        names. Raises FlightError.
+        """
+        if self.last is None or not self.covered:
+            return []
+        ledger = self.folder.ledger
+        with disk_errors("read the files of", self.folder.path):
+            now, sealed = digests(self.folder, self.held), self.last.files
+            found = {name for name in now.keys() | sealed.keys() if now.get(name) != sealed.get(name)}
+            wal = ledger.with_name(f"{ledger.name}-wal")
+            found |= {ledger.name} if wal.is_file() and wal.stat().st_size else set()
         try:
-            if name not in last.files:
-                yield name, "added"
-            elif last.files[name] != (present[name].stat().st_size, durable.hash_file(present[name])):
-                yield name, "changed"
-        except OSError as error:
-            yield name, error
+            found -= pruning.removed(self.folder).keys()
+        except FlightError:  # `flight check` says what is wrong with it
+            found.add(pruning.RECORD)
+        return sorted(found)
+
+    def signed_by(self, key: SealKey) -> bool:
+        """Whether this key signed all that is there: the newest seal, which covers the whole chain, and nothing that it
+        covers was changed since. Raises FlightError."""
+        last = self.last
+        signed = last is not None and last.key == key.name and key.signed(last.signed_part(), last.mac or "")
+        return signed and self.covered and not self.changed()
 
 
-def is_sealed(folder: FlightFolder) -> bool:
-    """Whether the newest seal covers all of the chain. Raises FlightError."""
+def standing(folder: FlightFolder) -> SealStanding:
+    """How a closed flight stands to its newest seal. Raises FlightError."""
     last = read(folder).last
     with LedgerReader.open(folder.ledger) as ledger:
-        if "chain" not in ledger.facts():
-            return False
-        head = ledger.last_link()
-    return last is not None and head is not None and last.head == head.link
+        facts = ledger.facts()
+        head = ledger.last_link() if "chain" in facts else None
+        covered = last is not None and head is not None and last.head == head.link
+        return SealStanding(folder, last, announced(facts)[0], covered, provenance.held(ledger))
 
 
 def read(folder: FlightFolder) -> SealFile:
@@ -274,25 +241,27 @@ def parse(content: bytes, name: str) -> SealFile:
     return SealFile(seals, tuple(problems))
 
 
-def recorded_files(ledger: LedgerReader) -> dict[str, tuple[int, str]]:
-    """Size and SHA-256 of frames, companions, strays and telemetry as the ledger holds them. Raises FlightError."""
-    files = {row.name: (row.size, row.sha256) for row in ledger.files()}
-    facts = ledger.facts()
-    if "telemetry_sha256" in facts:
-        files["telemetry.tlog"] = (facts["telemetry_bytes"], facts["telemetry_sha256"])
-    return files
+def digests(folder: FlightFolder, held: Mapping[str, HeldDigests]) -> dict[str, tuple[int, str]]:
+    """Size and SHA-256 of each file that a seal covers, by name: as the ledger holds them of frames and telemetry, of
+    the others as they are now. Raises OSError."""
+    known = {name: one.whole for name, one in held.items()}
+    return {name: known.get(name) or digest(path) for name, path in sealed_paths(folder).items()}
 
 
-def sealed_paths(folder: FlightFolder) -> Iterator[Path]:
-    """Every file of a flight that a seal covers, in order: all but seals.jsonl, the record of what was removed (the
+def digest(path: Path) -> tuple[int, str]:
+    """Size and SHA-256 of a file. Raises OSError."""
+    return path.stat().st_size, durable.hash_file(path)
+
+
+def sealed_paths(folder: FlightFolder) -> dict[str, Path]:
+    """Every file of a flight that a seal covers, by name: all but seals.jsonl, the record of what was removed (the
     ledger has its digest, and a copy lacks it), SQLite's files beside the ledger, and half-written ones. Links are not
     followed.
 
     Raises OSError."""
-    ledger = folder.ledger
-    beside = {ledger.with_name(ledger.name + suffix) for suffix in _BESIDE_LEDGER}
-    beside |= {folder.seals, folder.path / pruning.RECORD}
-    return (path for path in folder.files() if path not in beside and not durable.is_temporary(path.name))
+    left_out = {folder.seals.name, pruning.RECORD, *(folder.ledger.name + suffix for suffix in _BESIDE_LEDGER)}
+    files = folder.files().items()
+    return {name: path for name, path in files if name not in left_out and not durable.is_temporary(path.name)}
 
 
 def of_flight(facts: Mapping[str, object]) -> str:

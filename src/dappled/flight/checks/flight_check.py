@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from dappled import durable
 from dappled.confined import OutsideError
@@ -22,6 +20,7 @@ from dappled.flight.checks.place_check import PlaceFindings
 from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.provenance import HeldDigests
 from dappled.flight.pruning import Removed
 from dappled.flight.seal_key import SealKey
 from dappled.flight.seals import SEAL
@@ -69,7 +68,7 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
     with _examining("flight.toml", found):
         layout.read_facts(folder)
     place = PlaceFindings()
-    closed, recorded_as = False, ""
+    closed, recorded_as, known = False, "", frozenset[str]()
     with _examining("the folder", found):
         place = place_check.look(folder)
     if place.rollback is not None:
@@ -80,13 +79,14 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
             chained = _chained(folder, found)
             with _examining("the flight", found), LedgerReader.open(folder.ledger) as ledger:
                 closed, recorded_as = "closed_utc_ns" in ledger.facts(), seals.of_flight(ledger.facts())
+                known = frozenset(row.name for row in ledger.files())
                 _compare(folder, ledger, counts, found)
                 with _examining("the telemetry", found):
                     found += telemetry_check.compare(folder.telemetry, chained.links)
                 with _examining("the seals", found):
                     sealed = seal_check.compare(folder, ledger, chained.links, before, key)
     found += [*sealed.problems, *sealed.notes]
-    found += place_check.compare(place, folder, recorded_as, closed=closed, at_work=sealed.unsealed > 0)
+    found += place_check.compare(place, folder, recorded_as, known, closed=closed, at_work=sealed.unsealed > 0)
     return CheckReport(
         flight=folder.name,
         files=counts.files,
@@ -116,12 +116,7 @@ def _compare(
         counts.elsewhere = _elsewhere(folder, ledger)
         found += _where(counts.elsewhere)
     with _examining("the files", found):
-        for size, problem in _files(folder, ledger, counts.elsewhere):
-            counts.files, counts.size = counts.files + 1, counts.size + size
-            found += [problem] if problem else []
-        found += _names(folder, ledger, closed)
-    with _examining("the inputs", found):
-        found += _inputs(folder, facts)
+        found += _files(folder, ledger, counts)
     with _examining("the shot journal", found):
         found += _shots(folder, ledger)
     with _examining("the telemetry", found):
@@ -179,59 +174,33 @@ def _where(elsewhere: Mapping[str, Removed]) -> Iterator[Finding]:
         yield Finding(Code.FLIGHT_OFFLOADED, Subject("folder", destination), facts)
 
 
-def _files(
-    folder: FlightFolder, ledger: LedgerReader, elsewhere: Collection[str]
-) -> Iterator[tuple[int, Finding | None]]:
-    """(bytes read, problem) for every file that the ledger acknowledges and that was not offloaded `elsewhere`."""
-    for row in ledger.files():
-        if row.name not in elsewhere:
-            yield _read(folder, row.name, row.size, [row.sha256])
+def _files(folder: FlightFolder, ledger: LedgerReader, counts: _Counts) -> Iterator[Finding]:
+    """What is wrong with files that the ledger holds digests of, but the telemetry. Those with a row are counted."""
+    for name, one in provenance.held(ledger).items():
+        if name in counts.elsewhere or name == folder.telemetry.name:
+            continue
+        size, problem = _read(folder, name, one)
+        if one.size is not None:
+            counts.files, counts.size = counts.files + 1, counts.size + size
+        yield from [problem] if problem else []
 
 
-def _inputs(folder: FlightFolder, facts: Mapping[str, Any]) -> Iterator[Finding]:
-    """The inputs that differ from their hashes. `read_facts` tells of a missing flight.toml."""
-    for name, hashes in provenance.noted(facts).items():
-        _, problem = _read(folder, name, None, hashes)
-        if problem is not None and (name != folder.settings.name or folder.settings.exists()):
-            yield problem
-
-
-def _read(folder: FlightFolder, name: str, size: int | None, hashes: Sequence[str]) -> tuple[int, Finding | None]:
-    """(bytes read, problem) of one file that the ledger holds hashes of, any of which is right."""
+def _read(folder: FlightFolder, name: str, held: HeldDigests) -> tuple[int, Finding | None]:
+    """(bytes read, problem) of one file."""
     about = Subject("file", name)
     try:
         path = folder.file(name)
         found = path.stat().st_size
-        if size not in (found, None):
-            return found, finding(Code.FILE_OTHER_SIZE, about, name=name, bytes=found, noted=size)
-        right = durable.hash_file(path) in hashes
-        return found, None if right else _of_file(Code.FILE_CHANGED, name)
+        if held.size not in (found, None):
+            return found, finding(Code.FILE_OTHER_SIZE, about, name=name, bytes=found, noted=held.size)
+        right = durable.hash_file(path) in held.right
+        return found, None if right else finding(Code.FILE_CHANGED, about, name=name)
     except OutsideError as error:
         return 0, finding(Code.FILE_OUTSIDE, about, why=str(error))
     except FileNotFoundError:
-        return 0, _of_file(Code.FILE_MISSING, name)
+        return 0, finding(Code.FILE_MISSING, about, name=name)
     except OSError as error:
         return 0, finding(Code.FILE_UNREADABLE, about, name=name, why=error.strerror)
-
-
-def _names(folder: FlightFolder, ledger: LedgerReader, closed: bool) -> Iterator[Finding]:
-    """Files that no row acknowledges. While a flight is recorded, one may be on its way."""
-    known = {row.name for row in ledger.files()}
-    try:
-        names = sorted(os.listdir(folder.frames))
-    except OSError as error:
-        yield finding(Code.FILE_UNREADABLE, Subject("folder", "frames"), name="the folder frames", why=error.strerror)
-        return
-    for name in names:
-        if durable.is_temporary(name):
-            if closed:
-                yield _of_file(Code.FILE_HALF_WRITTEN, f"frames/{name}")
-        elif f"frames/{name}" not in known and not name.endswith(layout.SIDECAR) and closed:
-            yield _of_file(Code.FILE_UNLISTED, f"frames/{name}")
-
-
-def _of_file(code: Code, name: str) -> Finding:
-    return finding(code, Subject("file", name), name=name)
 
 
 def _shots(folder: FlightFolder, ledger: LedgerReader) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ from dappled.flight import layout, provenance, seals
 from dappled.flight.chain import ChainLink
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
+from dappled.flight.provenance import HeldDigests
 from dappled.flight.seal_key import SealKey
 from dappled.flight.seals import SEAL, Seal
 
@@ -73,7 +74,7 @@ def compare(
     unsealed = max(0, len(links) - last.links)
     if unsealed:
         notes.append(finding(Code.SEAL_UNSEALED, SEAL, seal=last.seal, work=last.why, links=unsealed))
-    for wrong, found in _files(folder, last, _vouched_by_ledger(ledger, facts), unsealed=unsealed > 0):
+    for wrong, found in _files(folder, last, provenance.held(ledger), unsealed=unsealed > 0):
         (problems if wrong else notes).append(replace(found, level=Level.STOP if wrong else Level.NOTE))
     if not unsealed:
         problems += _ledger_file(last, before)
@@ -123,37 +124,31 @@ def _rewritten(found: Mapping[int, Seal]) -> Iterator[Finding]:
                 yield finding(Code.SEAL_REWRITTEN, SEAL, seal=number, before=before, file=name)
 
 
-def _vouched_by_ledger(ledger: LedgerReader, facts: Mapping[str, Any]) -> dict[str, tuple[int | None, str]]:
-    """Digests of the files that are compared with the ledger elsewhere; the ledger has no size of some."""
-    known: dict[str, tuple[int | None, str]] = dict(seals.recorded_files(ledger))
-    return known | {name: (None, hashes[0]) for name, hashes in provenance.noted(facts).items() if len(hashes) == 1}
-
-
 def _files(
-    folder: FlightFolder, last: Seal, known: Mapping[str, tuple[int | None, str]], *, unsealed: bool
+    folder: FlightFolder, last: Seal, held: Mapping[str, HeldDigests], *, unsealed: bool
 ) -> Iterator[tuple[bool, Finding]]:
     """(whether that is wrong, what it is) of files that are not those which the newest seal covers. Where work was not
-    sealed, only what was recorded can't be the work's."""
-    for name, (size, sha256) in last.files.items():
-        if name in known and known[name] not in ((size, sha256), (None, sha256)):
-            yield (
-                not unsealed or seals.never_changes(name),
-                finding(Code.SEAL_DIGESTS_DIFFER, SEAL, seal=last.seal, file=name),
-            )
-    for name, what in seals.differing(folder, last, {*known, folder.ledger.name}):
-        if name in known or name == folder.ledger.name:
-            continue
+    sealed, only what was recorded can't be the work's. Those that the ledger holds are compared with it elsewhere."""
+    present = seals.sealed_paths(folder)
+    for name in sorted((last.files.keys() | present.keys()) - {folder.ledger.name}):
+        noted, known, code = last.files.get(name), held.get(name), None
         wrong = not unsealed or seals.never_changes(name)
-        if isinstance(what, OSError):
-            yield wrong, finding(Code.SEAL_FILE_UNREADABLE, SEAL, file=name, why=what.strerror)
-        elif what == "missing":
-            yield wrong, finding(Code.SEAL_FILE_MISSING, SEAL, file=name, seal=last.seal)
-        elif what == "changed":
-            yield wrong, finding(Code.SEAL_FILE_CHANGED, SEAL, file=name, seal=last.seal)
-        elif name.startswith("inputs/"):
-            yield not unsealed, finding(Code.SEAL_INPUT_ADDED, SEAL, file=name, seal=last.seal)
-        elif not name.startswith("frames/") or name.endswith(layout.SIDECAR):  # other frames are missed in the ledger
-            yield False, finding(Code.SEAL_FILE_ADDED, SEAL, file=name, seal=last.seal)
+        try:
+            if known is not None and len(known.right) == 1:
+                if noted is not None and (known.size not in (noted[0], None) or known.right[0] != noted[1]):
+                    code = Code.SEAL_DIGESTS_DIFFER
+            elif name not in present:
+                code = Code.SEAL_FILE_MISSING
+            elif noted is not None:
+                code = None if seals.digest(present[name]) == noted else Code.SEAL_FILE_CHANGED
+            elif name.startswith("inputs/"):
+                code, wrong = Code.SEAL_INPUT_ADDED, not unsealed
+            elif not name.startswith("frames/") or name.endswith(layout.SIDECAR):  # others are missed in the ledger
+                code, wrong = Code.SEAL_FILE_ADDED, False
+        except OSError as error:
+            yield wrong, finding(Code.SEAL_FILE_UNREADABLE, SEAL, file=name, why=error.strerror)
+        if code is not None:
+            yield wrong, finding(code, SEAL, seal=last.seal, file=name)
 
 
 def _ledger_file(last: Seal, before: LedgerBytes) -> Iterator[Finding]:
