@@ -131,14 +131,16 @@ def mosaic(
         shifted *= ramp
         spectrum = fft.fft2(shifted, norm="forward", overwrite_x=True, workers=WORKERS)
         at = [_Band.of(grid, axis, bins[axis], rest[axis]) for axis in (0, 1)]
-        for channel in range(3):
+        for channel in {channel for _, channel in sites}:
             box = spectrum[channel][np.ix_(at[0].source, at[1].source)]
-            for parity_y in (0, 1):
-                line = box * at[0].response[parity_y][:, None]
-                for parity_x in (0, 1):
-                    site = 2 * parity_y + parity_x
-                    if sites[site][1] == channel:
-                        _add(spectra[site], line * at[1].response[parity_x], at)
+            for target, ((parity_y, parity_x), seen) in zip(spectra, sites, strict=True):
+                if seen == channel:
+                    part = box
+                    if (response := at[0].response[parity_y]) is not None:
+                        part = part * response[:, None]
+                    if (response := at[1].response[parity_x]) is not None:
+                        part = part * response
+                    _add(target, part, at)
     planes = fft.ifft2(spectra, norm="forward", overwrite_x=True, workers=WORKERS).real
     frame = np.empty(grid.fine, dtype=np.float32)
     for ((parity_y, parity_x), _), plane in zip(sites, planes, strict=True):
@@ -166,11 +168,11 @@ def band_limited(radiance: NDArray[np.float32], grid: Grid) -> NDArray[np.float3
 @dataclass(frozen=True, slots=True)
 class _Band:
     """One axis of a slice's band: its bins in the coarse FFT, where they begin in the half-size FFT of one mosaic
-    site, and what they are multiplied by for sites of even and of odd rows (or columns)."""
+    site, and what they are multiplied by for sites of even and of odd rows (or columns); None: by one."""
 
     source: NDArray[np.intp]
     first: int
-    response: tuple[NDArray[np.complex64], NDArray[np.complex64]]
+    response: tuple[NDArray[np.complex64] | None, NDArray[np.complex64]]
 
     @classmethod
     def of(cls, grid: Grid, axis: int, carrier_bin: int, rest: float) -> _Band:
@@ -184,7 +186,7 @@ class _Band:
         return cls(
             source=bins % n,
             first=(carrier_bin - reach) % (fine // 2),
-            response=(response.astype(np.complex64), odd.astype(np.complex64)),
+            response=(None if grid.sharp else response.astype(np.complex64), odd.astype(np.complex64)),
         )
 
 
