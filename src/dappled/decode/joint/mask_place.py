@@ -400,7 +400,7 @@ class _Likelihood:
     def place(self, *, moved: bool) -> MaskPlace:
         """The most probable place: the calibrated one where no other is surer, unless the mask has `moved`."""
         found, nats = np.zeros(4), self.nats(np.zeros(4))
-        still = self._best(np.zeros((1, 4)))
+        still = self._best(np.zeros((1, 1, 4)))
         for one in (still, self.anywhere()):
             if (more := self.nats(one)) > nats + SEEN_NATS:
                 found, nats = one, more
@@ -445,23 +445,31 @@ class _Likelihood:
         return np.asarray(self._waves(move).real.sum(axis=1))
 
     def _waves(self, move: Floats) -> NDArray[np.complex128]:
+        return np.asarray(self.terms * self._turned(move))
+
+    def _turned(self, move: Floats) -> NDArray[np.complex128]:
         at = move[:2] + np.tensordot(move[2:], self.changed[:2], axes=1)
-        return np.asarray(self.terms * np.exp(2j * np.pi * at @ self.differences.T))
+        return np.asarray(np.exp(2j * np.pi * at @ self.differences.T))
 
     def anywhere(self) -> Floats:
         """The most probable move with a turn and another scale."""
         along = np.linspace(-_MOST, _MOST, _CHANGES)[:, None]
         turns, scales = along * np.eye(4)[2], along * np.eye(4)[3]
-        first = self._best(np.concatenate([turns, scales]))
+        first = self._best(np.stack([turns, scales]))
         scaled = abs(first[3]) > abs(first[2])
-        return self._best(turns + first * (0, 0, 0, 1) if scaled else scales + first * (0, 0, 1, 0))
+        return self._best((turns + first * (0, 0, 0, 1) if scaled else scales + first * (0, 0, 1, 0))[None])
 
-    def _best(self, changes: Floats) -> Floats:
-        """The most probable move (4,) with one of these turns and scales (T, 4), or near it; where one of these is 0 in
-        all, it stays so."""
-        tried = _tried()
-        sums = np.stack([self._waves(one * (0, 0, 1, 1)).sum(axis=0) for one in changes], axis=1)
-        found = (np.exp(2j * np.pi * tried @ self.differences.T) @ sums).real
+    def _best(self, lines: Floats) -> Floats:
+        """The most probable move (4,) with one of the turns and scales of lines (L, T, 4), evenly spaced along each, or
+        near it; where one of these is 0 in all, it stays so."""
+        tried, sums = _tried(), []
+        for line in lines * (0, 0, 1, 1):
+            waves, further = self._waves(line[0]), self._turned(np.diff(line[:2], axis=0).sum(axis=0))
+            for _ in line:  # a product takes a thirtieth of an exponential's time
+                sums.append(waves.sum(axis=0))
+                waves *= further
+        found = (np.exp(2j * np.pi * tried @ self.differences.T) @ np.stack(sums, axis=1)).real
+        changes = lines.reshape(-1, 4)
         shift, change = np.unravel_index(int(found.argmax()), found.shape)
         move = np.array([*tried[shift], *changes[change, 2:]])
         return self._risen(move, np.flatnonzero(np.append([True, True], changes[:, 2:].any(axis=0))))
