@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from dappled.decode.array_types import Floats, Singles
 
 EMPTY = -1  # in a pattern: no sample there, as on the spread plane of a staggered chip
 _PASSES = 3  # of a running mean as long as the carriers' period: what is left of them is its cube
+_AT_ONCE = 64  # samples of a line that are averaged by one product
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,10 +106,29 @@ def _smooth(values: Singles, sizes: list[int]) -> Singles:
     made = values
     for axis, size in enumerate(sizes):
         if size > 1:
-            for turn in range(_PASSES):  # an even number of samples to either side by turns
-                origin = -1 if size % 2 == 0 and turn != 1 else 0
-                made = ndimage.uniform_filter1d(made, size, axis, mode="nearest", origin=origin)
+            made, one = np.empty(values.shape, dtype=np.float32), made
+            for own, near, shares in _averages(values.shape[axis], size):
+                if axis == 0:
+                    np.matmul(shares, one[near], out=made[own])
+                else:
+                    np.matmul(one[:, near], shares.T, out=made[:, own])
     return made
+
+
+@lru_cache(maxsize=32)
+def _averages(side: int, size: int) -> tuple[tuple[slice, slice, Singles], ...]:
+    """Running means of `size` samples, `_PASSES` times over, as products of matrices: which samples of a line each is
+    for, of which ones, and their shares."""
+    made, beside = [], _PASSES * size
+    for start in range(0, side, _AT_ONCE):
+        end = min(side, start + _AT_ONCE)
+        first, last = max(0, start - beside), min(side, end + beside)
+        shares = np.eye(last - first)
+        for turn in range(_PASSES):  # an even number of samples to either side by turns
+            origin = -1 if size % 2 == 0 and turn != 1 else 0
+            shares = ndimage.uniform_filter1d(shares, size, 0, mode="nearest", origin=origin)
+        made.append((slice(start, end), slice(first, last), shares[start - first : end - first].astype(np.float32)))
+    return tuple(made)
 
 
 def block_sums(values: Singles, down: NDArray[np.intp], across: NDArray[np.intp]) -> Floats:

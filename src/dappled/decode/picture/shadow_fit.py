@@ -266,6 +266,27 @@ def _products(one: NDArray[np.complexfloating], other: NDArray[np.complexfloatin
     return np.asarray(2 * each.sum(axis=1) - each[:, 0])
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class _Normal:
+    """Normal equations of least squares: `matrix` (n, n), `right` (n,)."""
+
+    matrix: Floats
+    right: Floats
+
+    def ridged(self) -> Floats:
+        """The matrix with a little on its diagonal."""
+        count = len(self.matrix)
+        return np.asarray(self.matrix + np.eye(count) * max(_RIDGE * float(np.trace(self.matrix)) / count, 1e-30))
+
+    def solution(self) -> Floats:
+        """(n,)."""
+        return np.asarray(np.linalg.solve(self.ridged(), self.right), dtype=np.float64)
+
+    def gain(self, values: Floats) -> float:
+        """The sum of squares that these values (n,) explain."""
+        return float(values @ (2 * self.right - self.matrix @ values))
+
+
 @dataclass(frozen=True, eq=False)
 class _Equations:
     """Normal equations of the coefficients, block by block: `sums` (colours, blocks, differences) of L² over waves of
@@ -357,9 +378,9 @@ class _Equations:
         sums = self.moved(lattice).sums if means.mosaic.valid is None else None
         return _Equations.of(means, lattice, self.sought, self.like, sums)
 
-    def _image(self, colour: int, c: Coefficients, degree: int, blocks: _Blocks = _EVERY) -> Coefficients:
+    def _image(self, colour: int, c: Coefficients, terms: Floats) -> Coefficients:
         """(blocks, half) each block's matrix times its coefficients, of c (half, terms)."""
-        pairs, own, terms = _pairs(self.sought.orders), self.sums[colour][blocks], self._terms(degree)[blocks]
+        pairs, own = _pairs(self.sought.orders), self.sums[colour]
         every = np.concatenate([c, c[1:].conj()]).T
         made = np.zeros((len(own), len(c)), dtype=np.complex128)
         ahead, behind = np.zeros((2, len(every), len(pairs.apart), len(c)), dtype=np.complex64)
@@ -380,8 +401,10 @@ class _Equations:
         made = []
         for colour in range(len(self.right)):
             plain = np.where(self.count[colour] > 0, 1.0, 0.0)
-            c = self._solved(colour, plain, 0)
-            left = self.energy[colour] - self._gains(colour, c, 0)
+            flat = self._terms(0)
+            c = self._solved(colour, plain, flat)
+            gains = _products(flat @ c.T, 2 * self.right[colour] - self._image(colour, c, flat))
+            left = self.energy[colour] - gains
             spread = np.maximum(left, 0) / np.maximum(self.count[colour], 1)
             usual = float(np.median(spread[self.count[colour] > 0])) if plain.any() else 1.0
             made.append(plain / np.maximum(spread + 0.05 * usual, 1e-12))
@@ -395,51 +418,33 @@ class _Equations:
     def _terms(self, degree: int) -> Floats:
         return terms_at(self.centres, self.shape, degree)
 
-    def _gains(self, colour: int, c: Coefficients, degree: int, blocks: _Blocks = _EVERY) -> Floats:
-        """(blocks,) how much of a block's energy coefficients (half, terms) explain."""
-        image = self._image(colour, c, degree, blocks)
-        return _products(self._terms(degree)[blocks] @ c.T, 2 * self.right[colour][blocks] - image)
-
-    def _solved(self, colour: int, weights: Floats, degree: int) -> Coefficients:
+    def _solved(self, colour: int, weights: Floats, terms: Floats) -> Coefficients:
         """Coefficients (half, terms)."""
-        whole, right = self._normal(colour, weights, degree)
-        found: Floats = np.asarray(np.linalg.solve(whole, right), dtype=np.float64)
-        return _complex(found.reshape(-1, self._terms(degree).shape[1]))
+        return _complex(self._normal(colour, weights, terms).solution().reshape(-1, terms.shape[1]))
 
-    def _normal(self, colour: int, weights: Floats, degree: int) -> tuple[Floats, Floats]:
-        """The normal equations of `_real` coefficients (n, terms): matrix and right side."""
-        terms, known, h = self._terms(degree), _pairs(self.sought.orders), self.right.shape[2]
+    def _normal(self, colour: int, weights: Floats, terms: Floats, blocks: _Blocks = _EVERY) -> _Normal:
+        """The normal equations of `_real` coefficients (n, terms), of some blocks."""
+        known, h = _pairs(self.sought.orders), self.right.shape[2]
+        terms, weights = terms[blocks], weights[blocks]
         count, n = terms.shape[1], 2 * h - 1
         first, second = np.triu_indices(count)
         pairs = weights[:, None] * terms[:, first] * terms[:, second]
-        parts = self.sums[colour].view(np.float32).astype(np.float64)
+        parts = self.sums[colour][blocks].view(np.float32).astype(np.float64)
         every = (pairs.T @ parts).view(np.complex128)[:, known.index]
         np.conjugate(every, out=every, where=known.turned)
         less, more = every[..., :h], every[..., [0, *range(h, n)]]  # of an order and another, of it and the opposite
-        blocks = np.empty((len(pairs.T), n, n))
-        blocks[:, :h, :h] = (less + more).real
-        blocks[:, :h, h:] = (more - less)[..., 1:].imag
-        blocks[:, h:, :h] = (more + less)[:, 1:].imag
-        blocks[:, h:, h:] = (less - more)[:, 1:, 1:].real
-        blocks[:, 0] /= math.sqrt(2)
-        blocks[:, :, 0] /= math.sqrt(2)
+        each = np.empty((len(pairs.T), n, n))
+        each[:, :h, :h] = (less + more).real
+        each[:, :h, h:] = (more - less)[..., 1:].imag
+        each[:, h:, :h] = (more + less)[:, 1:].imag
+        each[:, h:, h:] = (less - more)[:, 1:, 1:].real
+        each[:, 0] /= math.sqrt(2)
+        each[:, :, 0] /= math.sqrt(2)
         gram = np.empty((count, count, n, n))
-        gram[first, second] = gram[second, first] = blocks
+        gram[first, second] = gram[second, first] = each
         whole = gram.transpose(2, 0, 3, 1).reshape(n * count, n * count)
-        right = _real(self.right[colour]).T @ (weights[:, None] * terms)
-        whole += np.eye(len(whole)) * max(_RIDGE * float(np.trace(whole)) / len(whole), 1e-30)
-        return whole, right.reshape(n * count)
-
-    def held_out(self, degree: int) -> float:
-        """Log likelihood that coefficients gain over the mean alone, on the blocks that they were not fitted to."""
-        total = -self.unexplained
-        for colour, weights in enumerate(self.weights):
-            for fold in (self.odd, ~self.odd):
-                if not fold.any() or fold.all():
-                    continue
-                c = self._solved(colour, np.where(fold, 0.0, weights), degree)
-                total += float(weights[fold] @ self._gains(colour, c, degree, fold)) / 2
-        return total
+        right = _real(self.right[colour][blocks]).T @ (weights[:, None] * terms)
+        return _Normal(whole, right.reshape(n * count))
 
     @cached_property
     def unexplained(self) -> float:
@@ -450,20 +455,17 @@ class _Equations:
         """Log likelihood that local means, brighter or darker all over, gain behind another frame's shadow, or none.
         (Those of several shadows compare where blocks weigh the same.)"""
         total, half = 0.0, self.right.shape[2]
+        terms = self._terms(0 if other is None else other.degree)
         for colour, weights in enumerate(self.weights if weights_of_blocks is None else weights_of_blocks):
-            degree = 0 if other is None else other.degree
-            c = np.zeros((half, len(terms_at(self.centres[:1], self.shape, degree)[0])), dtype=np.complex128)
+            c = np.zeros((half, terms.shape[1]), dtype=np.complex128)
             c[0, 0] = 1
             if other is not None:
                 c[1:] = other.coefficients[min(colour, len(other.coefficients) - 1)]
-            local, image = self._terms(degree) @ c.T, self._image(colour, c, degree)
-            base = np.zeros_like(c[:, :1])
-            base[0] = 1
-            found = _products(local, self.right[colour] + self._image(colour, base, 0))
-            whole = _products(local, image)
-            c *= (weights @ found) / max(float(weights @ whole), 1e-30)
-            c[0, 0] -= 1
-            total += float((weights * self._gains(colour, c, degree)).sum()) / 2
+            values, known = _real(c.T).T.ravel(), self._normal(colour, weights, terms)
+            image = known.matrix @ values
+            values *= float(values @ known.right + image[0]) / max(float(values @ image), 1e-30)
+            values[0] -= 1
+            total += known.gain(values) / 2
         return total
 
     def evidence(self, degrees: Sequence[int] = _DEGREES) -> ShadowEvidence:
@@ -483,21 +485,25 @@ class _Equations:
         return np.asarray(np.maximum(1 - pull, _UNPULLED))
 
     def _fitted(self, degree: int) -> Fit:
-        """Coefficients, and their errors by the scatter between blocks."""
-        found, spread = [], []
+        """Coefficients, their errors by the scatter between blocks, and the log likelihood that they gain over the mean
+        alone on the half of the blocks that they were not fitted to."""
+        found, spread, held = [], [], -self.unexplained
         terms = self._terms(degree)
         for colour, weights in enumerate(self.weights):
-            whole, right = self._normal(colour, weights, degree)
-            inverse = np.linalg.inv(whole)
-            c = _complex((inverse @ right).reshape(-1, terms.shape[1]))
-            left = weights[:, None] * _real(self.right[colour] - self._image(colour, c, degree))
+            one, other = (self._normal(colour, weights, terms, fold) for fold in (self.odd, ~self.odd))
+            if self.odd.any() and not self.odd.all():
+                held += (one.gain(other.solution()) + other.gain(one.solution())) / 2
+            whole = _Normal(one.matrix + other.matrix, one.right + other.right)
+            inverse = np.linalg.inv(whole.ridged())
+            c = _complex((inverse @ whole.right).reshape(-1, terms.shape[1]))
+            left = weights[:, None] * _real(self.right[colour] - self._image(colour, c, terms))
             scores = (left[:, :, None] * terms[:, None, :]).reshape(len(terms), -1)
             errors = scores @ inverse / self._unpulled(colour, weights, terms)[:, None]
             both = (errors**2).sum(axis=0).reshape(-1, terms.shape[1])[1:] / 2  # real and imaginary parts
             # Where pixels are clipped dark places alone are left, which err alike.
             spread.append(both.reshape(2, len(c) - 1, -1).sum(axis=0) / max(self.sound, _LEAST) ** 2)
             found.append(c[1:] / (1 + c[0, 0].real))  # S·L over L·L, where S is finer than L
-        return Fit(degree, np.array(found), np.array(spread), self.held_out(degree))
+        return Fit(degree, np.array(found), np.array(spread), held)
 
     def lattice(self) -> Lattice | None:
         """The lattice that the phases of the blocks agree on best, by one Gauss–Newton step; None where it is so near
@@ -523,7 +529,7 @@ class _Equations:
         levers = levers.reshape(len(self.centres), count, 4)
         parts = []
         for colour, weights in enumerate(self.weights):
-            c = self._solved(colour, weights, 0)[1:, 0]
+            c = self._solved(colour, weights, self._terms(0))[1:, 0]
             turned = weights[:, None] * (c.conj() * self.right[colour][:, 1:]).imag
             sure = (weights * self._lights[colour])[:, None] * np.abs(c) ** 2
             parts.append(sure)
