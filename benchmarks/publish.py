@@ -32,8 +32,9 @@ from dappled.clock import TimeOfDayClock
 from dappled.config.settings import PublishSettings, RecordSettings, Settings
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Publisher
-from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
+from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import Message
+from dappled.large_blocks import reuse_large_blocks
 
 SHAPE = (13, 572, 566)
 HUNG = 3

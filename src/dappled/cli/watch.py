@@ -16,8 +16,9 @@ if not words_only:
     from dappled.cli.terminal import waiting_for
     from dappled.daemon.stream import watch
     from dappled.daemon.stream.curve import ClientKeys, load_own, load_public
-    from dappled.daemon.stream.subscriber import Subscriber, reuse_large_blocks
+    from dappled.daemon.stream.subscriber import Subscriber
     from dappled.daemon.stream.wire import Message
+    from dappled.large_blocks import reuse_large_blocks
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from dappled.closing import Closing
+from dappled.large_blocks import reuse_large_blocks
 from dappled.shown import guard_output
 
 ATTEMPTS = 3  # a job that kills this many workers is given up
@@ -65,6 +66,7 @@ class Crew(Closing):
     ) -> Generator[Answer]:
         """The answers in the order of the jobs; of one worker's jobs, from this process."""
         if self.workers == 1:
+            reuse_large_blocks()
             yield from map(make, jobs)
             return
         early: dict[int, Answer] = {}
@@ -163,6 +165,7 @@ def _work(channel: Connection) -> None:
     closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that hands out the jobs
     guard_output()
+    reuse_large_blocks()
     single_threaded()
     make: Callable[[Any], Any] | None = None
     while True:

@@ -9,7 +9,7 @@ import pytest
 
 PROGRAM = """
 import resource, sys
-from dappled.daemon.stream.subscriber import reuse_large_blocks
+from dappled.large_blocks import reuse_large_blocks
 if sys.argv[1] == "reuse" and not reuse_large_blocks():
     sys.exit("no mallopt")
 bytearray(48 << 20)

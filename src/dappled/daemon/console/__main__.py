@@ -26,11 +26,11 @@ from dappled.daemon.console.process import DaemonChannel
 from dappled.daemon.console.seen_ground import SeenGround
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import systemd
-from dappled.daemon.stream.subscriber import reuse_large_blocks
 from dappled.decode.geometry import area
 from dappled.drivers.child_process import ProcessChannel
 from dappled.drivers.raw.darkroom import Recipe
 from dappled.errors import DappledError, report
+from dappled.large_blocks import reuse_large_blocks
 from dappled.shown import guard_output
 
 NICENESS = 15  # below the decoder's 10

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import json
 import time
 from collections import deque
@@ -22,8 +21,6 @@ from dappled.errors import DappledError
 MOST_MISSING = 2**16  # as many as a publisher remembers; a header that claims more is not believed
 AT_ONCE = 4  # questions under way; the others wait
 _LOOK_S = 0.5
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # <malloc.h>
-_LARGE_BYTES = 1 << 30
 
 _Key = tuple[str, int]  # flight, seq of its slices
 _Steps = Generator[Any, Any, Message | None]
@@ -355,18 +352,3 @@ def _connect(one: zmq.Socket[Any], endpoint: str, keys: ClientKeys | None) -> No
         one.connect(endpoint)
     except zmq.ZMQError as error:
         raise WireError(f"{endpoint}: not a ZeroMQ endpoint ({error.strerror})") from None
-
-
-def reuse_large_blocks() -> bool:
-    """Have this process' malloc keep blocks up to 1 GiB. False where its libc has no such settings.
-
-    glibc gives every block above 32 MiB back at once, and those of other threads than the first when they outgrow
-    64 MiB together; the next one then comes page by page anew, which for slices of that size takes longer than
-    receiving them. For programs, not for libraries: it holds for the whole process.
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    if mallopt is None:
-        return False
-    wanted = ((_M_MMAP_THRESHOLD, _LARGE_BYTES), (_M_TRIM_THRESHOLD, _LARGE_BYTES), (_M_ARENA_MAX, 1))
-    taken = [mallopt(*one) for one in wanted]
-    return all(taken)

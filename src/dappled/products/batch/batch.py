@@ -7,14 +7,12 @@ of JSON for each job, appended and synced, so that a batch that is started again
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import os
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
@@ -27,6 +25,7 @@ from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
 from dappled.errors import DappledError, sentence
 from dappled.findings import Finding
 from dappled.flight import Frame, Tag
+from dappled.large_blocks import reuse_large_blocks
 from dappled.products.exports import light_files
 from dappled.products.extras import need
 from dappled.products.geotags.geotags import Placed
@@ -42,7 +41,6 @@ MAPS = ("cog", "kmz")
 PLACED = (*MAPS, "photos", *FORMS)  # what needs a full pose
 MANIFEST = "manifest.jsonl"
 _LINE_BYTES = 1 << 20  # of a manifest
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # mallopt(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +175,7 @@ def plan(
 
 def make(job: Job) -> Done:
     """Run a job. A failure of this frame is an error in the result and never stops the others."""
-    _settle_memory()
+    reuse_large_blocks()
     began, cpu = time.monotonic(), time.process_time()
     outputs: list[BatchOutput] = []
     refused: dict[str, str] = {}
@@ -337,21 +335,6 @@ def _peak_mb() -> float:
         if line.startswith("VmHWM:"):
             return round(int(line.split()[1]) / 1024, 1)
     return 0.0
-
-
-@cache
-def _settle_memory() -> None:
-    """Keep freed memory in this process for the next frame.
-
-    glibc returns it to the system and fetches it again, page by page, for every array; in a Dask worker
-    (MALLOC_TRIM_THRESHOLD_) even from 64 KiB on, which doubles a frame's time. Without glibc nothing happens.
-    """
-    try:
-        mallopt = ctypes.CDLL("libc.so.6").mallopt
-    except (OSError, AttributeError):
-        return
-    mallopt(_TRIM_THRESHOLD, 1 << 30)
-    mallopt(_MMAP_THRESHOLD, 1 << 25)
 
 
 class Manifest(Closing):
