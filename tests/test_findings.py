@@ -8,7 +8,8 @@ from pathlib import Path
 
 import dappled
 from dappled import codec, findings
-from dappled.findings import Code, Finding, Level, Subject, finding, words
+from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, Fault, Finding, Level, Subject, finding, words
 
 SOURCE = Path(dappled.__file__).parent
 
@@ -77,6 +78,40 @@ def test_a_number_that_is_not_finite_is_unknown_and_the_finding_survives_the_led
     back = findings.of_json_text(findings.json_text(one))
     assert back is not None
     assert back.facts == {"off_s": None, "far_s": None}
+
+
+def test_a_fact_may_be_an_error_or_a_finding_and_only_a_renderer_makes_words_of_it() -> None:
+    lost = finding(Code.FILE_UNREADABLE, FRAME, name="a.cr2", why=FileNotFoundError(2, "?", "flights/a.cr2"))
+    assert lost.facts["why"] == Fault("FileNotFoundError", 2, "flights/a.cr2")
+    assert str(findings.text(lost)) == "a.cr2 can't be read: No such file or directory"
+    misfit = finding(Code.DECODE_MISFIT, FRAME, why=lost)
+    assert str(findings.text(misfit)) == f"frames can't be decoded: {findings.text(lost)}"
+    assert findings.of_json_text(findings.json_text(misfit)) == misfit
+    assert codec.plain(misfit)["facts"]["why"]["facts"]["why"]["errno"] == 2
+
+
+def test_an_error_tells_what_led_to_it_and_its_own_finding_where_it_has_one() -> None:
+    try:
+        try:
+            raise PermissionError(13, "?", b"a.cr2")
+        except OSError as error:
+            raise DappledError("cannot read a.cr2") from error
+    except DappledError as error:
+        made = finding(Code.FRAME_UNDECODABLE, FRAME, why=error)
+    assert made.facts["why"] == Fault("DappledError", 13, "a.cr2", "cannot read a.cr2")
+    own = finding(Code.FRAME_CLIPPED, FRAME, share=0.1)
+    assert finding(Code.FRAME_UNDECODABLE, FRAME, why=DappledError(own)).facts["why"] == own
+    assert str(DappledError(own)) == str(findings.told(own, FRAME))
+    damaged = finding(Code.FLIGHT_PART_DAMAGED, FRAME, part="the tags", why=ValueError("no such orders"))
+    assert str(findings.text(damaged)).endswith("damaged: ValueError: no such orders")
+
+
+def test_findings_that_lead_to_each_other_have_an_end() -> None:
+    row = '{"code": "decode.misfit", "subject": {"kind": "a"}, "level": "note", "facts": {"why": '
+    for deep in (2, 8, 9, 200, 3000):
+        read = findings.of_json_text(row * deep + "1" + "}}" * deep)
+        assert (read is None) == (deep > 9)
+        assert read is None or findings.told(read)
 
 
 def test_a_subject_that_is_no_name_is_refused() -> None:

@@ -25,8 +25,9 @@ HEAD = """# What can be found
 Whatever a person may have to know is a finding: a code, a level, what it is about, and facts. Health record, ledger,
 wire and `--json` hold these; the console, `dappled status`, STATUSTEXT, metrics and the log show them in these words,
 worst first, then newest. A *note* needs no action. A *caution* costs something. With a *stop* no frame, or no good one,
-is made. Words in braces are facts; one with `?` is left out where it is unknown. A finding ends when the part that
-reported it sees that it is over. A code that is a link leads to the page that says more.
+is made. Words in braces are facts; one with `?` is left out where it is unknown. A fact may be what led to the finding:
+another finding, or an error `{error, errno, path, said}`. A finding ends when the part that reported it sees that it is
+over. A code that is a link leads to the page that says more.
 
 `python tools/findings_page.py` makes this page from the table in the code.
 """

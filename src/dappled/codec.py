@@ -70,7 +70,10 @@ def canonical(value: Any) -> bytes:
 
 def read(kind: type[Record], value: Any) -> Record:
     """The record that `plain` or `table` made these values of. Raises CodecError."""
-    made: Record = _reader(kind).read(value)  # type: ignore[arg-type]  # types are hashable
+    try:
+        made: Record = _reader(kind).read(value)  # type: ignore[arg-type]  # types are hashable
+    except RecursionError:
+        raise CodecError("it is nested too deep") from None
     return made
 
 

@@ -7,12 +7,15 @@ import sys
 from pathlib import Path
 from typing import ClassVar
 
+from dappled.findings import FRAME, Finding, told
+
 SERVICE_MANIFEST = "installed.json"  # which `make install` leaves in its environment
 PACKAGED = "packaged"  # which the Debian package has beside dappled's own folder
 
 
 class DappledError(Exception):
-    """Something a person can mend. The message is the whole sentence; no traceback is shown with it.
+    """Something a person can mend. The message is the whole sentence, or the finding that tells it (`finding`); no
+    traceback is shown with it.
 
     `exit_code` is what a command ends with: 1 for a failure, 2 where the call itself was wrong. `setting` is the one
     that is wrong, as "table.key", where the code that found it knows.
@@ -21,7 +24,8 @@ class DappledError(Exception):
     exit_code: ClassVar[int] = 1
 
     def __init__(self, *text: object, setting: str = "") -> None:
-        super().__init__(*text)
+        self.finding = next((one for one in text if isinstance(one, Finding)), None)
+        super().__init__(*(str(told(one, FRAME)) if isinstance(one, Finding) else one for one in text))
         self.setting = setting
 
     @property

@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import string
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cache
+from os import PathLike
 from types import MappingProxyType
 from typing import Any, Self, TypeAlias
 
 from dappled import codec
 from dappled.finding_codes import LIST
 from dappled.finding_codes import Code as Code  # noqa: PLC0414  they are imported from here
-
-Value: TypeAlias = str | int | float | bool | None
 
 
 class Text:
@@ -41,6 +41,7 @@ class Text:
 
 # What a result was made with, beside its own frames: its findings are told with its name.
 _BESIDE = frozenset({"bare frames", "calibration", "white frame"})
+_DEEPEST = 8
 _NO_FACTS: Mapping[str, Value] = MappingProxyType({})
 
 
@@ -95,18 +96,58 @@ def words() -> Mapping[Code, Wording]:
 
 
 @dataclass(frozen=True, slots=True)
+class Fault:
+    """An error as a fact: its kind (`FlightError`), the number and the file of the system's error that it is, or that
+    led to it, and what it says to people. The system's own say it by their number."""
+
+    error: str
+    errno: int | None = None
+    path: str = ""
+    said: str = ""
+
+    @classmethod
+    def of(cls, error: BaseException) -> Fault | Finding:
+        """An error's own finding, if it carries one, else itself."""
+        found = getattr(error, "finding", None)
+        if isinstance(found, Finding):
+            return found
+        system = error if isinstance(error, OSError) else error.__cause__
+        number, path = (system.errno, system.filename) if isinstance(system, OSError) else (None, None)
+        kind, named = type(error).__name__, path if isinstance(path, str | bytes | PathLike) else ""  # or a number
+        said = str(error) if hasattr(error, "finding") else f"{kind}: {error}"  # only our own tell by themselves
+        return cls(kind, number, os.fsdecode(named), "" if system is error and number else said)
+
+    def words(self, *, named: bool = True) -> Text:
+        """What it says, as a clause; of the system's errors with the file's name, where it is to be `named`."""
+        if self.said or self.errno is None:
+            return Text(self.said or self.error)
+        return Text(f"{self.path}: {os.strerror(self.errno)}" if self.path and named else os.strerror(self.errno))
+
+
+@dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing found. `facts` have their unit in the key (`sigma_ms`) and stand as JSON."""
+    """One thing found. `facts` have their unit in the key (`sigma_ms`) and stand as JSON; one may be what led to it:
+    another finding, or an error."""
 
     code: Code
     subject: Subject
     facts: Mapping[str, Value] = field(default_factory=lambda: _NO_FACTS)
     level: Level = Level.NOTE
 
+    def __post_init__(self) -> None:
+        """Raises ValueError for what no part of dappled makes: a file that is damaged, or made to be."""
+        if self.depth > _DEEPEST:
+            raise ValueError(f"more than {_DEEPEST} findings lead to each other")
+
     def __hash__(self) -> int:
         return hash((self.code, self.subject))
 
-    def with_facts(self, **more: Value) -> Self:
+    @property
+    def depth(self) -> int:
+        """How many findings led to it, one to the next."""
+        return max((1 + one.depth for one in self.facts.values() if isinstance(one, Finding)), default=0)
+
+    def with_facts(self, **more: Evidence) -> Self:
         """It with more facts, or others."""
         return replace(self, facts={**self.facts, **_known(more)})
 
@@ -119,6 +160,11 @@ class Finding:
     def kind(self) -> tuple[Code, Subject]:
         """What makes two findings the same, whatever their numbers."""
         return self.code, self.subject
+
+
+Value: TypeAlias = str | int | float | bool | Fault | Finding | None
+Evidence: TypeAlias = Value | BaseException | PathLike[str]
+"""What facts are made of: an error is its finding or a `Fault`, a path its text."""
 
 
 def json_text(one: Finding) -> str:
@@ -134,14 +180,22 @@ def of_json_text(words: str) -> Finding | None:
         return None
 
 
-def finding(code: Code, subject: Subject, level: Level | None = None, **facts: Value) -> Finding:
+def finding(code: Code, subject: Subject, level: Level | None = None, **facts: Evidence) -> Finding:
     """A finding with its code's own level, unless another is given. A number that isn't finite is unknown: None."""
     return Finding(code, subject, _known(facts), words()[code].level if level is None else level)
 
 
-def _known(facts: Mapping[str, Value]) -> dict[str, Value]:
+def _known(facts: Mapping[str, Evidence]) -> dict[str, Value]:
     """Facts as JSON has them, and the codec reads them back."""
-    return {name: None if isinstance(one, float) and not math.isfinite(one) else one for name, one in facts.items()}
+    return {name: _fact(one) for name, one in facts.items()}
+
+
+def _fact(one: Evidence) -> Value:
+    if isinstance(one, float) and not math.isfinite(one):
+        return None
+    if isinstance(one, BaseException):
+        return Fault.of(one)
+    return os.fspath(one) if isinstance(one, PathLike) else one
 
 
 def worst(found: Iterable[Finding]) -> Level:
@@ -169,13 +223,18 @@ def in_order(found: Sequence[Finding]) -> list[Finding]:
 
 class _Sentences(string.Formatter):
     """Formats facts as `str.format` does. `{reason:?: }` is empty, or ": " and the reason; `{frames:#frame}` is
-    1 frame, 2 frames. Facts may come from damaged files: one that is missing, or of another type, is shown as it is.
+    1 frame, 2 frames; `{why}` of an error or a finding is what it says, `{why:-}` without the name of a file
+    that the sentence has. Facts may come from damaged files: one that is missing, or of another type, is shown as it
+    is.
     """
 
     def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
         return kwargs.get(str(key))
 
     def format_field(self, value: Any, format_spec: str) -> str:
+        if isinstance(value, Fault | Finding):
+            value = str(value.words(named=format_spec != "-") if isinstance(value, Fault) else text(value))
+        format_spec = format_spec.removeprefix("-")
         if format_spec.startswith("?"):
             return "" if value in (None, "") else f"{format_spec[1:]}{value}"
         if format_spec.startswith("#") and isinstance(value, int):

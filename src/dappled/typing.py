@@ -5,7 +5,7 @@ from dappled.daemon.stream.wire import Message
 from dappled.decode.depth import DepthMap, DistanceMap
 from dappled.decode.geometry import Gnss, GroundHeight, Pose
 from dappled.decode.lightfield.refocus import StereoPair
-from dappled.findings import Code, Finding, Level, Subject, Value
+from dappled.findings import Code, Fault, Finding, Level, Subject, Value
 from dappled.flight import Tag, TimeSource
 from dappled.products.opened import Opened, OpenedFlight, OpenedFrame, OpenedLightField, SharpPicture
 
@@ -13,6 +13,7 @@ __all__ = [
     "Code",
     "DepthMap",
     "DistanceMap",
+    "Fault",
     "Finding",
     "Gnss",
     "GroundHeight",

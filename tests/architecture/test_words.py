@@ -13,6 +13,10 @@ from tests.architecture.walk import SOURCE, parsed
 RENDERERS = ("text", "told")
 # What a module that may do such a thing has in it: the others are not parsed and walked for it.
 RENDERS = re.compile(rf"(import ([^\n(]*|\([^)]*)\b|findings\.)({'|'.join(RENDERERS)})\b")
+MAKERS = ("finding", "with_facts", "_one")
+MAKES = re.compile(rf"\b({'|'.join(MAKERS)})\(")
+WORDERS = ("sentence", "first_line", "told", "named", "remedy", "text")
+ERRORS = re.compile(rf"error|exception|({'|'.join(WORDERS)})\(")
 DOUBTS = re.compile(r"doubts?_*\s*:")
 MODULES = sorted(path for path in SOURCE.rglob("*.py") if path.name != "findings.py")
 
@@ -68,6 +72,35 @@ def worded_doubts(source: str) -> Iterator[str]:
             yield f"line {getattr(node, 'lineno', 0)}: {title}: {annotation}"
 
 
+def worded_facts(source: str) -> Iterator[str]:
+    """The facts that are sentences: words of an error or a finding, or four words and more."""
+    for node in ast.walk(parsed(source)) if MAKES.search(source) else ():
+        if isinstance(node, ast.Call) and ast.unparse(node.func).rpartition(".")[2] in MAKERS:
+            for fact in node.keywords:
+                if any(map(_worded, _choices(fact.value))):
+                    yield f"line {fact.value.lineno}: {fact.arg}={ast.unparse(fact.value)}"
+
+
+def _choices(value: ast.expr) -> Iterator[ast.expr]:
+    """What an expression may be, one way or another."""
+    if isinstance(value, ast.IfExp | ast.BoolOp):
+        for one in value.values if isinstance(value, ast.BoolOp) else (value.body, value.orelse):
+            yield from _choices(one)
+    else:
+        yield value
+
+
+def _worded(value: ast.expr) -> bool:
+    if isinstance(value, ast.Call):
+        name, given = ast.unparse(value.func).rpartition(".")[2], ast.unparse(value).partition("(")[2]
+        return name in WORDERS or (name in {"str", "repr"} and ERRORS.search(given) is not None)
+    if isinstance(value, ast.Attribute):
+        return value.attr in {"sentence", "strerror", "words"}
+    parts = value.values if isinstance(value, ast.JoinedStr) else [value]
+    said = " x ".join(str(one.value) if isinstance(one, ast.Constant) else "" for one in parts)
+    return isinstance(value, ast.JoinedStr | ast.Constant) and len(said.split()) > 3
+
+
 @pytest.mark.parametrize(
     "source",
     [
@@ -83,6 +116,27 @@ def test_words_that_are_read_back_are_seen(source: str) -> None:
 
 def test_no_words_of_a_finding_are_read_back() -> None:
     found = {str(path.relative_to(SOURCE)): read_back(path.read_text("utf-8")) for path in MODULES}
+    assert not {path: places for path, places in found.items() if places}
+
+
+@pytest.mark.parametrize(
+    "fact",
+    [
+        "str(error)",
+        "str(text(found))",
+        "sentence(error) if error else None",
+        "found and findings.text(found)",
+        "decision.sentence",
+        "'decoding was switched off'",
+        "f'the telemetry is {age_s} s old'",
+    ],
+)
+def test_facts_that_are_sentences_are_seen(fact: str) -> None:
+    assert len(list(worded_facts(f"finding(Code.A, FRAME, path=path, why={fact})"))) == 1
+
+
+def test_no_fact_is_a_sentence() -> None:
+    found = {str(path.relative_to(SOURCE)): list(worded_facts(path.read_text("utf-8"))) for path in MODULES}
     assert not {path: places for path, places in found.items() if places}
 
 

@@ -124,7 +124,7 @@ def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoi
     try:
         tables, _ = read_toml(flown)
     except DappledError as error:
-        return [finding(Code.SETTINGS_UNREAD, _SETTINGS, file=str(file), why=str(error))]
+        return [finding(Code.SETTINGS_UNREAD, _SETTINGS, file=file, why=error)]
     live = tables.get("settings", {})
     live.get("record", {})["min_free_mb"] = report.get("min_free_bytes", 0) // 1_000_000  # it can change in flight
     ours = configuration.to_tables(wanted)
@@ -138,7 +138,7 @@ def _differences(file: Path, wanted: Settings, report: Mapping[str, Any], endpoi
         from dappled.mocks.simulation import REPLACED  # noqa: PLC0415  # a real flight doesn't load the mocks
 
         simulated = REPLACED
-        found = [finding(Code.SETTINGS_SIMULATED, _SETTINGS, file=str(file))]
+        found = [finding(Code.SETTINGS_SIMULATED, _SETTINGS, file=file)]
     of_file = {"file": str(file), "unit": status.unit(file)}
     return found + [
         finding(
@@ -185,8 +185,7 @@ def _shoot(
             pending = daemon.shoot()
             if pending.frame is None:
                 ended = pending.problem or pending.follows
-                why = None if ended is None else str(text(ended))
-                judged = [finding(Code.SHOT_WITHOUT_FRAME, Subject("test shot"), why=why)]
+                judged = [finding(Code.SHOT_WITHOUT_FRAME, Subject("test shot"), why=ended)]
                 break
             latencies.append(test_shot.latency(pending))
             frame = frame or daemon.flight / pending.frame.name
@@ -208,7 +207,7 @@ def _judged(frame: Path, recipe: Any) -> list[Finding]:
     try:
         return frame_checks.check_frame(frame, recipe)
     except DappledError as error:
-        return [finding(Code.FRAME_UNREADABLE, Subject("picture"), why=str(error))]
+        return [finding(Code.FRAME_UNREADABLE, Subject("picture"), why=error)]
 
 
 _SPANS = {

@@ -237,23 +237,25 @@ class MapFlight(Overwriting, Doubtable, Refining, Verb):
                         path = folder / f"height-difference{tail}.tif"
                         files.append(difference.write(made, other, raised[-1], path, "m"))
                 except DappledError as error:
-                    missing.append(finding(Code.MAP_NO_DIFFERENCE, _MAP, flight=str(flight), why=str(error)))
+                    missing.append(finding(Code.MAP_NO_DIFFERENCE, _MAP, flight=flight, why=error))
         kinds = [("trend.tif", pictures, "share of brightness")] if self._several else []
         kinds += [("height-trend.tif", raised, "m")] if self._several and heights is not None else []
         for name, changes, unit in kinds:
             if len(changes) < len(self.against):
-                missing.append(finding(Code.MAP_NO_TREND, _MAP, name=name, why="not every flight could be compared"))
+                missing.append(
+                    finding(Code.MAP_NO_TREND, _MAP, name=name, why=finding(Code.MAP_NOT_ALL_COMPARED, _MAP))
+                )
                 continue
             try:
                 made_trend = difference.over_time(times, changes)
                 files.append(difference.write_trend(made, made_trend, names, folder / name, unit))
             except DifferenceError as error:
-                missing.append(finding(Code.MAP_NO_TREND, _MAP, name=name, why=str(error)))
+                missing.append(finding(Code.MAP_NO_TREND, _MAP, name=name, why=error))
         return files
 
 
 def _no_heights(error: DappledError) -> Finding:
-    return finding(Code.MAP_NO_HEIGHTS, _MAP, why=str(error))
+    return finding(Code.MAP_NO_HEIGHTS, _MAP, why=error)
 
 
 def _camera_of(flight: Path) -> str:

@@ -168,7 +168,7 @@ class TagFrames(SettingsArgument, Doubtable, MarkArguments, Verb):
         except VehicleError as error:
             if self.vehicle is not None:
                 raise
-            return None, [finding(Code.FLIGHT_VEHICLE_UNDECIDED, Subject("flight"), why=str(error))]
+            return None, [finding(Code.FLIGHT_VEHICLE_UNDECIDED, Subject("flight"), why=error)]
 
 
 def _tag_late(

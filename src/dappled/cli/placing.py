@@ -226,7 +226,7 @@ class Refining(Several, Placing):
             try:
                 return self._refined(made, base, output)
             except BaseMapError as error:
-                missing.append(finding(Code.MAP_UNREFINED, Subject("map"), why=str(error)))
+                missing.append(finding(Code.MAP_UNREFINED, Subject("map"), why=error))
         if "neighbours" in self.refine or self.gcp is not None:
             return self._refined(made, None, output)
         return made

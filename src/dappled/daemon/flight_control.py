@@ -57,7 +57,7 @@ class FlightControl:
         try:
             space = layout.disk_space(self._recording.folder.path)
         except FlightError as error:
-            return finding(Code.DISK_UNREADABLE, Subject("disk"), why=str(error))
+            return finding(Code.DISK_UNREADABLE, Subject("disk"), why=error)
         return space.shortage(self._settings.now.record.min_free_mb) or self.shortage
 
     @property

@@ -68,8 +68,8 @@ from dappled.drivers.mavlink import MavlinkLinks, Transport
 from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.registry import open_camera
 from dappled.drivers.wired.shutter_line import UsesAutopilot
-from dappled.errors import DappledError, report, sentence
-from dappled.findings import Code, Finding, Level, Subject, finding
+from dappled.errors import DappledError, report
+from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import Recording, Tag, seal_key
 from dappled.flight import recording as flights
 
@@ -577,8 +577,8 @@ class PeriodicTask:
         except Exception as error:  # noqa: BLE001  # a disk that refuses, or a bug in one task: the flight goes on
             if self.failing is None or self.failing.facts["error"] != type(error).__name__:
                 report(log, self.name, error)
-            facts: dict[str, findings.Value] = {"error": type(error).__name__, "why": sentence(error)}
-            self.failing = Finding(Code.TASK_FAILING, Subject("task", self.name), facts, Level.CAUTION)
+            about = Subject("task", self.name)
+            self.failing = finding(Code.TASK_FAILING, about, error=type(error).__name__, why=error)
             self._due_ns = now_ns + AGAIN_NS
         else:
             self.failing = None

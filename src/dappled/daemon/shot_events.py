@@ -18,7 +18,7 @@ from dappled.drivers.mavlink import mavlink
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError, report
-from dappled.findings import Code, Finding, Subject, finding, text, told
+from dappled.findings import Code, Evidence, Finding, Subject, finding, text
 from dappled.flight import Recording
 
 log = logging.getLogger(__name__)
@@ -113,9 +113,9 @@ class ShotEvents(Observer):
             try:
                 found = calibration_files.misfit(self._recipe, model)
                 # the flight's own copy is read: a pilot on the field has no use for its long name
-                why = None if found is None else str(told(found.with_facts(file="the calibration")))
+                why: Evidence = None if found is None else found.with_facts(file="the calibration")
             except DappledError as error:
-                why = str(error)
+                why = error
             self.misfit = None if why is None else finding(Code.DECODE_MISFIT, Subject("decoding"), why=why)
 
     def _record_camera(self, camera: Identity) -> None:

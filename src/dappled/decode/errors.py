@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Finding, told
+from dappled.findings import Finding
 
 
 class DecodeError(DappledError, ValueError):
@@ -16,9 +16,10 @@ class NoCarriers(DecodeError):  # noqa: N818  # a finding, not a fault, as below
     `expected`: they must be visible in it, whatever shape the stop has.
     """
 
+    finding: Finding
+
     def __init__(self, finding: Finding, *, expected: bool, focal_length_mm: float, f_number: float) -> None:
-        super().__init__(str(told(finding, FRAME)))
-        self.finding = finding
+        super().__init__(finding)
         self.expected = expected
         self.focal_length_mm = focal_length_mm
         self.f_number = f_number

@@ -211,7 +211,7 @@ def _reasons(wanted: str, judged: Mapping[int, Judgement], frames: Sequence[Fram
     """Why each frame has this verdict; none where the flight's frames were not judged."""
     if not judged:
         return ()
-    none = Judgement("unknown", (finding(Code.FRAME_UNJUDGED, FRAME, why="not judged in flight"),))
+    none = Judgement("unknown", (finding(Code.FRAME_UNJUDGED, FRAME),))
     return tuple(
         replace(one, subject=Subject("frame", frame.index))
         for frame in frames
@@ -264,7 +264,7 @@ def list_flights(root: Path) -> list[ListedFlight]:
         try:
             listed.append(ListedFlight(folder.name, folder.path, balance(folder.path), None))
         except FlightError as error:
-            why = finding(Code.FLIGHT_UNREADABLE, Subject("flight", folder.name), why=str(error))
+            why = finding(Code.FLIGHT_UNREADABLE, Subject("flight", folder.name), why=error)
             listed.append(ListedFlight(folder.name, folder.path, None, why))
     return listed
 

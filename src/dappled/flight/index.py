@@ -146,7 +146,7 @@ class ImageIndex(Database):
                 try:
                     self.put(IndexEntry(index, folder.name, frames.get(index), row.state))
                 except FlightError as error:
-                    problems.append(finding(Code.INDEX_TAKEN, Subject("flight", folder.name), why=str(error)))
+                    problems.append(finding(Code.INDEX_TAKEN, Subject("flight", folder.name), why=error))
         if seal:
             self._seal(folder, reports=reports)
         return problems
@@ -207,7 +207,7 @@ def open_or_rebuild(root: Path) -> tuple[ImageIndex, list[Finding]]:
             raise
         with disk_errors("move away the damaged index", path):
             aside = moved_aside(path)
-        return ImageIndex(root), [finding(Code.INDEX_REBUILT, Subject("flights"), why=str(error), aside=aside.name)]
+        return ImageIndex(root), [finding(Code.INDEX_REBUILT, Subject("flights"), why=error, aside=aside.name)]
 
 
 def in_order(root: Path) -> list[FlightFolder]:

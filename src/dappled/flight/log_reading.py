@@ -52,13 +52,13 @@ def read_journal(path: Path) -> JournalContents:
         elif len(problems) >= _MOST_LISTED:
             unlisted += 1
         elif shot is None:
-            problems.append(finding(Code.JOURNAL_LINE_DAMAGED, about, path=str(path), line=number))
+            problems.append(finding(Code.JOURNAL_LINE_DAMAGED, about, path=path, line=number))
         else:
-            problems.append(finding(Code.JOURNAL_LINE_AGAIN, about, path=str(path), line=number, shot=shot.index))
+            problems.append(finding(Code.JOURNAL_LINE_AGAIN, about, path=path, line=number, shot=shot.index))
     if unlisted:
-        problems.append(finding(Code.JOURNAL_MORE_LINES, about, path=str(path), lines=unlisted))
+        problems.append(finding(Code.JOURNAL_MORE_LINES, about, path=path, lines=unlisted))
     if tail:
-        problems.append(finding(Code.JOURNAL_TORN, about, path=str(path), bytes=len(tail)))
+        problems.append(finding(Code.JOURNAL_TORN, about, path=path, bytes=len(tail)))
     return JournalContents(tuple(shots.values()), tuple(problems))
 
 

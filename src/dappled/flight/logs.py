@@ -70,7 +70,7 @@ class AppendedFile:
         """Why written bytes may not survive a power cut; None where they do."""
         if self._flusher.error is None:
             return None
-        why = str(disk_error(f"flush {self._what}", self.path, self._flusher.error))
+        why = disk_error(f"flush {self._what}", self.path, self._flusher.error)
         return finding(Code.LOG_UNWRITTEN, Subject("flight"), why=why)
 
     @property

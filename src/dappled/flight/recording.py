@@ -174,7 +174,7 @@ class Recorder:
 
     def _note_failure(self, index: int, error: FlightError) -> None:
         try:
-            self._ledger.failed(index, finding(Code.SHOT_UNRECORDED, Subject("shot", index), reason=str(error)))
+            self._ledger.failed(index, finding(Code.SHOT_UNRECORDED, Subject("shot", index), reason=error))
         except FlightError as second:
             raise FlightError(f"{error}; and this could not be noted either: {second}") from error
 

@@ -53,7 +53,7 @@ def recover(root: Path, index: ImageIndex, clock: Clock, key: SealKey | None) ->
                 seals.seal(folder, clock, seals.Occasion.RECOVERED, signs)
             report += index.take_in(folder, seal=True, cut_short=cut_short)
         except (DappledError, OSError) as error:
-            report.append(finding(Code.FLIGHT_UNREPAIRED, Subject("flight", folder.name), why=str(error)))
+            report.append(finding(Code.FLIGHT_UNREPAIRED, Subject("flight", folder.name), why=error))
     return report
 
 

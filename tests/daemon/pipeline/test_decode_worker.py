@@ -21,6 +21,7 @@ from dappled.drivers.child_process import ChannelMessage
 from dappled.drivers.raw import law_check
 from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.recipe import LawDecision, Recipe
+from dappled.findings import Code, Finding, text
 from dappled.products.opened import with_ranging
 from tests.cli.test_thesis_camera import PROFILE, QUARTER, dng_of
 from tests.decode.ray_frames import MASKS, Shot
@@ -143,9 +144,10 @@ def test_what_bends_the_tones_of_a_frame_is_a_doubt_about_it(flown: tuple[Recipe
     frames = [good, tmp_path / "bent.jpg", tmp_path / "bent.png", clipped, good]
     told = [ask(worker, path, n, lens=(85.0, 22.0))["doubts"] for n, path in enumerate(frames)]
     assert told[0] == told[4] == []
-    assert [(one["code"], one["facts"]["why"]) for one in told[1]] == [("frame.developed", "it is a JPEG")]
-    gamma = "its gAMA chunk says that its values have a gamma of 1/2.2"
-    assert (told[2][0]["code"], told[2][0]["facts"]["why"]) == ("frame.developed", gamma)
+    assert [(one["code"], one["facts"]["why"]["code"]) for one in told[1]] == [("frame.developed", "tones.jpeg")]
+    gamma = codec.read(Finding, told[2][0])
+    assert gamma.code is Code.FRAME_DEVELOPED
+    assert str(text(gamma)).startswith("its gAMA chunk says that its values have a gamma of 1/2.2")
     assert "frame.clipped" in [one["code"] for one in told[3]]
 
 
@@ -182,5 +184,5 @@ def test_a_search_that_fails_costs_no_frame_and_is_a_doubt_until_carriers_are_se
             found = ask(worker, frames[1], index)
             assert (found["law"], found["decision"]) == ("fd", None)
             assert found["doubts"][0]["code"] == "carriers.unsearched"
-            assert "singular matrix" in found["doubts"][0]["facts"]["why"]
+            assert "singular matrix" in found["doubts"][0]["facts"]["why"]["said"]
             assert len(found["sha256"]) == 64

@@ -59,10 +59,10 @@ def test_a_shot_is_entered_fired_and_recorded(tmp_path: Path) -> None:
 
 def test_the_law_of_a_flight_is_written_down_and_read_with_its_recipe(tmp_path: Path) -> None:
     flight = recording.begin(tmp_path, SystemClock(), {"settings": {"mask": {"profile": "mask-2"}}})
-    decision = LawDecision("geometric", (1.01, 0.02, -0.02, 1.01), 3, "decoded by the law geometric")
+    decision = LawDecision("geometric", (1.01, 0.02, -0.02, 1.01), 3, "why")
     LedgerWriter(flight, SystemClock()).law_decided(decision)
     (event,) = [event for event in flight.ledger.events() if event.kind == "law"]
-    assert (event.index, event.words) == (3, "decoded by the law geometric")
+    assert (event.index, event.words) == (3, "decoded by the law geometric from frame 3 on")
     facts = layout.read_facts(flight.folder)
     made = of_flight(flight.folder.path, facts, {})
     assert made is not None

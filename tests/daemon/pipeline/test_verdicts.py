@@ -33,14 +33,14 @@ BOUNDS = VerdictBounds()
 GOOD = FrameFacts(
     blur_px=1.5,
     blur_view_px=0.2,
-    blur_unknown="",
+    blur_unknown=None,
     height_m=60.0,
     height_source="above the take-off place",
     clipped_share=0.0,
     black_share=0.0,
     mean_share=0.2,
     defocus_view_px=0.1,
-    focus_unknown="",
+    focus_unknown=None,
     carriers_found=24,
     carriers_predicted=24,
     doubts=(),
@@ -90,7 +90,11 @@ def judged(pose: Pose, *, exposure_s: float | None = 1e-3, rates: tuple[float, f
         (replace(GOOD, picture_px=2.4), "usable", "own resolution is out of focus by 2.4 px"),
         (replace(GOOD, picture_px=1.6), "good", ""),
         (replace(GOOD, picture_px=9.0, defocus_view_px=2.0), "bad", "out of focus by 2.0"),
-        (replace(GOOD, blur_view_px=None, blur_px=None, blur_unknown="no height"), "unknown", "no height"),
+        (
+            replace(GOOD, blur_view_px=None, blur_px=None, blur_unknown=finding(Code.BLUR_NO_HEIGHT, FRAME)),
+            "unknown",
+            "no height",
+        ),
         (replace(GOOD, clipped_share=0.02), "usable", "2.0% of its pixels are clipped"),
         (replace(GOOD, clipped_share=0.06), "bad", "6.0% of its pixels are clipped"),
         (replace(GOOD, mean_share=0.005), "bad", "too dark"),
@@ -233,9 +237,10 @@ def test_an_uncertain_time_leaves_the_blur_unknown(known: dict[str, Any], word: 
 
 def test_no_gimbal_rates_no_motion() -> None:
     judge = Judge(NADIR, on_gimbal=True)
-    assert "gimbal" in str(
-        judge.judge(tag(flown()), (0, 0, 0), SEEN, carriers=(24, 24), doubts=()).reasons[0].facts["why"]
-    )
+    found = judge.judge(tag(flown()), (0, 0, 0), SEEN, carriers=(24, 24), doubts=())
+    assert found.reasons[0].facts["why"] == finding(Code.BLUR_GIMBAL_RATE, FRAME)
+    assert found.values()["facts"]["blur_unknown"] == "blur.gimbal_rate"
+    assert found.values()["facts"]["focus_unknown"] == ""
 
 
 def test_three_bad_ones_in_a_row_are_a_problem_and_a_good_one_ends_it() -> None:

@@ -166,7 +166,8 @@ def test_a_focus_that_was_told_wrong_is_doubted_and_found() -> None:
     shifted = replace(depth, inverse_per_m=depth.inverse_per_m - np.float32(1 / 200))  # the focus was at 200 m
     found = frame_terrain.of(made, {"000000": shifted}, quiet)
     _, doubt = frame_terrain.told(made, found)
-    assert doubt.code is Code.HEIGHTS_OFF_FOCUS
+    assert doubt.code is Code.HEIGHTS_OFF
+    assert doubt.facts["focus_m"] == pytest.approx(200, rel=0.03)
     assert "from the given ground as a whole" in str(text(doubt))
     assert found.focus_m == pytest.approx(200, rel=0.03)
     assert len(frame_terrain.told(made, frame_terrain.of(made, {"000000": depth}, quiet))) == 1

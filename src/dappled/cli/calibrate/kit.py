@@ -157,7 +157,7 @@ def _refused(path: Path, error: DappledError) -> Finding:
     subject, none = Subject("calibration frame", path.name), _no_carriers(error)
     if none is not None:
         return replace(none.finding, subject=subject)
-    return finding(Code.FRAME_REFUSED, subject, why=str(error))
+    return finding(Code.FRAME_REFUSED, subject, why=error)
 
 
 def _missing(name: str, shot: Sequence[tuple[float, float]], there: int, asked: dict[str, Any]) -> list[Finding]:

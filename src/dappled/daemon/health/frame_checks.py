@@ -38,7 +38,7 @@ def check_frame(frame: Path, recipe: Recipe | None) -> list[Finding]:
     try:
         made = Darkroom(recipe).decode(frame, views=False)
     except DappledError as error:
-        return [*found, finding(Code.FRAME_UNDECODABLE, CARRIERS, why=str(error))]
+        return [*found, finding(Code.FRAME_UNDECODABLE, CARRIERS, why=error)]
     picture = np.abs(made.light_field.slices[0])
     return [*found, *_carriers(made, recipe), *_doubts(made), *sharpness(picture)]
 
@@ -74,7 +74,7 @@ def _carriers(made: DecodeResult, recipe: Recipe) -> Iterator[Finding]:
         yield finding(Code.CARRIERS_CUT, CARRIERS).with_facts(**facts)
     elif made.search is not None and made.search.found is not None:
         law = made.light_field.attributes["law"]
-        yield finding(Code.CARRIERS_BY_LAW, CARRIERS, law=law, odds=made.search.sentence).with_facts(**facts)
+        yield finding(Code.CARRIERS_BY_LAW, CARRIERS, law=law).with_facts(**facts, **made.search.log10_odds)
     elif made.report.doubts:
         yield from of_subject(made.report.doubts, CARRIERS)
     elif not made.observable:

@@ -62,7 +62,7 @@ def libraries(settings: Settings, machine: Machine) -> list[Finding]:
         machine.bodies()
     except CameraError as error:
         level = Level.STOP if _wants_usb(settings) else Level.CAUTION
-        return [gphoto2, finding(Code.LIBRARY_MISSING, Subject("libusb"), level, why=str(error))]
+        return [gphoto2, finding(Code.LIBRARY_MISSING, Subject("libusb"), level, why=error)]
     return [gphoto2, _library("libusb", "pyusb", "pyusb")]
 
 
@@ -85,7 +85,7 @@ def _body(settings: Settings, machine: Machine, body: UsbBody) -> Finding:
     name = f"{body.maker} {body.name}".strip() + f" at {body.port} ({body.mode})"
     node = body.node(machine.dev / "bus" / "usb")
     if not machine.served and node.exists() and not os.access(node, os.R_OK | os.W_OK):
-        return finding(Code.USB_FORBIDDEN, USB, body=name, node=str(node))
+        return finding(Code.USB_FORBIDDEN, USB, body=name, node=node)
     if body.vendor == usb_bus.FUJIFILM:
         level = Level.NOTE if settings.camera.driver == "fujifilm" else Level.CAUTION
         return finding(Code.USB_FILES_ONLY, USB, level, body=name)
@@ -109,7 +109,7 @@ def camera(settings: Settings, machine: Machine) -> list[Finding]:
     try:
         driver = open_camera(settings.camera)
     except DappledError as error:
-        return [finding(Code.CAMERA_REFUSED, CAMERA, why=str(error))]
+        return [finding(Code.CAMERA_REFUSED, CAMERA, why=error)]
     last: StateChanged | None = None
     try:
         driver.start()
@@ -121,7 +121,7 @@ def camera(settings: Settings, machine: Machine) -> list[Finding]:
                 if event.state in ("ready", "absent"):
                     break
     except DappledError as error:
-        last = StateChanged("absent", str(error), time.monotonic_ns())
+        return [finding(Code.CAMERA_UNOPENED, CAMERA, driver=settings.camera.driver, why=error)]
     finally:
         driver.stop()
     return [_opened(settings, last)]
@@ -130,8 +130,8 @@ def camera(settings: Settings, machine: Machine) -> list[Finding]:
 def _opened(settings: Settings, last: StateChanged | None) -> Finding:
     if last is not None and last.state == "ready" and (who := last.identity) is not None:
         return finding(Code.CAMERA_READY, CAMERA, maker=who.make, model=who.model, serial=who.serial, port=who.port)
-    reason = "it did not answer in time" if last is None or not last.reason else last.reason
-    return finding(Code.CAMERA_UNOPENED, CAMERA, driver=settings.camera.driver, why=reason)
+    why = finding(Code.CAMERA_UNANSWERING, CAMERA) if last is None or not last.reason else last.reason
+    return finding(Code.CAMERA_UNOPENED, CAMERA, driver=settings.camera.driver, why=why)
 
 
 def disk(settings: Settings, machine: Machine) -> list[Finding]:
@@ -139,13 +139,13 @@ def disk(settings: Settings, machine: Machine) -> list[Finding]:
     folder = Path(settings.record.directory)
     place = layout.existing(folder)
     if not os.access(place, os.W_OK):
-        return [finding(Code.DISK_CLOSED, DISK, place=str(place), folder=str(folder))]
+        return [finding(Code.DISK_CLOSED, DISK, place=place, folder=folder)]
     space = layout.disk_space(place)
     if (short := space.shortage(settings.record.min_free_mb)) is not None:
         return [short]
     free, frame = space.available, _FRAME_BYTES
     facts = {"free_gb": free / 1e9, "frames": int(free / frame), "frame_mb": frame / 1e6}
-    return [finding(Code.DISK_ROOM, DISK, folder=str(folder)).with_facts(**facts)]
+    return [finding(Code.DISK_ROOM, DISK, folder=folder).with_facts(**facts)]
 
 
 def memory(settings: Settings, machine: Machine) -> list[Finding]:

@@ -248,7 +248,7 @@ def _disk(record: RecordSettings, folder: Path) -> tuple[dict[str, Any], list[Fi
     try:
         space = layout.disk_space(folder)
     except FlightError as error:
-        return facts, [finding(Code.DISK_UNREADABLE, Subject("disk"), why=str(error))]
+        return facts, [finding(Code.DISK_UNREADABLE, Subject("disk"), why=error)]
     facts |= {"free_bytes": space.available, "free_files": space.files}
     if (short := space.shortage(record.min_free_mb)) is not None:
         return facts, [short]

@@ -30,7 +30,7 @@ from dappled.drivers.camera import (
     StateChanged,
 )
 from dappled.errors import report, sentence
-from dappled.findings import FRAME, Code, Finding, Subject, finding
+from dappled.findings import FRAME, Code, Evidence, Finding, Subject, finding
 from dappled.flight import Frame, Shot, Tag
 from dappled.flight.records import DOUBT, LATER_DOUBT, LEFT, NOTICED
 from dappled.workers import Loop, OneThread
@@ -43,7 +43,6 @@ _WITHOUT_CAMERA = {
 }
 GIVEN_UP = 16  # failed shots that a late file can still belong to
 FOLLOWING = 4096  # the same for shots whose file stays at the camera; `geotag` tags the frames of older ones
-_DROPPED = "the queue was full, or the flight ended; the frame is in the record"
 _LOOK_S = 0.1
 _LAST_EVENTS_NS = 10**9
 
@@ -243,7 +242,7 @@ class ShotEnds:
             self.shots.add(pending)
         return pending
 
-    def leave(self, pending: PendingShot, code: Code, why: str = _DROPPED) -> None:
+    def leave(self, pending: PendingShot, code: Code, why: Evidence) -> None:
         """A safe frame is not processed further."""
         pending.problem = finding(code, _frame(pending), why=why)
         self.note(LEFT, pending.problem, pending.shot.index)
@@ -404,7 +403,7 @@ class Capture(OneThread):
             # The recorder has noted it as far as the disk lets it. A second file doesn't undo the first one.
             if pending is not None and pending.frame is None and not pending.over:
                 about = Subject("shot", pending.shot.index)
-                self._ends.fail(pending, finding(Code.SHOT_UNRECORDED, about, reason=sentence(error)))
+                self._ends.fail(pending, finding(Code.SHOT_UNRECORDED, about, reason=error))
             raise
         finally:
             arrival.blob.close()

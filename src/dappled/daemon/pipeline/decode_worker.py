@@ -199,7 +199,7 @@ class DecodeWorker:
         try:
             looked = looker.decode(path, **known)
         except Exception as error:  # noqa: BLE001  # a search that fails must not cost a good frame
-            self._laws.fail(done, sentence(error))
+            self._laws.fail(done, error)
             log.warning("frame %d was not searched near other laws: %s", index, sentence(error))
             return None
         self._laws.keep(looked, decides=not calibrated)
@@ -290,7 +290,7 @@ class LawLooks:
         if not self._settled:
             self._unseen[_lens(looked)] = looked.observable, looked.contradiction or looked.unsettled
 
-    def fail(self, done: DecodeResult, why: str) -> None:
+    def fail(self, done: DecodeResult, why: Exception) -> None:
         """Keep that the search of a frame failed: whether its carriers stand elsewhere is not known."""
         self._unseen[_lens(done)] = True, finding(Code.CARRIERS_UNSEARCHED, FRAME, why=why)
 

@@ -125,7 +125,9 @@ class LedgerWriter:
     def law_decided(self, decision: LawDecision) -> None:
         """Write the law that a frame showed into flight.toml, so that replays and products decode as the flight did."""
         self.recording.add_facts({DECISION: codec.plain(decision)})
-        self.event("law", finding(Code.DECODE_LAW_DECIDED, FRAME, why=decision.sentence), decision.first)
+        self.event(
+            "law", finding(Code.DECODE_LAW_DECIDED, FRAME, law=decision.law, frame=decision.first), decision.first
+        )
 
     def decoded(self, result: Result) -> None:
         self.recording.ledger.add_result(result)

@@ -21,8 +21,8 @@ from dappled.daemon.pipeline.verdicts import Judge, Verdict, VerdictCounts, unju
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
 from dappled.drivers.raw.recipe import LawDecision
-from dappled.errors import report, sentence
-from dappled.findings import FRAME, Code, Finding, Level, Subject, finding
+from dappled.errors import report
+from dappled.findings import FRAME, Code, Evidence, Finding, Level, Subject, finding
 from dappled.flight import Tag
 from dappled.flight.records import LEFT
 from dappled.workers import Statistics, Worker
@@ -50,7 +50,7 @@ class DecodeFailures:
             return [self.last]
         return [finding(Code.DECODE_FAILING, _DECODING, in_a_row=self.in_a_row, why=self.last.facts["why"])]
 
-    def after(self, why: str) -> DecodeFailures:
+    def after(self, why: Evidence) -> DecodeFailures:
         """With one more."""
         last = finding(Code.DECODE_FAILED, _DECODING, frames=self.count + 1, why=why)
         return replace(self, count=self.count + 1, in_a_row=self.in_a_row + 1, last=last)
@@ -145,8 +145,8 @@ class Decoding:
         elif self.ends.shots.decoding:
             self.worker.put(pending)
         else:
-            self._unjudged(pending, "it was not decoded: decoding was switched off")
-            off = finding(Code.FRAME_UNDECODED, FRAME, Level.NOTE, why="decoding was switched off")
+            off = finding(Code.FRAME_UNDECODED, FRAME, Level.NOTE, why=finding(Code.DECODE_SWITCHED_OFF, FRAME))
+            self._unjudged(pending, off)
             self.ends.note(LEFT, off, pending.shot.index)
             self.ends.finish(pending)
 
@@ -162,7 +162,7 @@ class Decoding:
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
         law = decoded.decision
-        decided = () if law is None else (finding(Code.DECODE_LAW_DECIDED, FRAME, why=law.sentence),)
+        decided = () if law is None else (finding(Code.DECODE_LAW_DECIDED, FRAME, law=law.law, frame=law.first),)
         self.failures = replace(self.failures, in_a_row=0, found=(*decoded.doubts, *decoded.about_flight, *decided))
         pending.decoded = decoded
         self._unrecorded = decoded.decision or self._unrecorded
@@ -190,23 +190,25 @@ class Decoding:
             json.dumps(found.values(), allow_nan=False)  # what the ledger can't hold is no verdict
         except Exception as error:  # noqa: BLE001  # a decoded frame must not be lost with its verdict
             report(log, "verdict", error)
-            found = unjudged(f"it could not be judged: {sentence(error)}")
+            found = unjudged(error)
         return self.judge.count(tag.index, found, (tag.focal_length_mm, tag.f_number))
 
-    def _unjudged(self, pending: PendingShot, why: str) -> None:
+    def _unjudged(self, pending: PendingShot, why: Finding) -> None:
         if pending.verdict is None:
             found = unjudged(why)
             pending.verdict = self.judge.count(pending.shot.index, found)
 
     def _failed(self, pending: PendingShot, error: Exception) -> None:
         report(log, f"decode of frame {pending.shot.index}", error)
-        self.failures = self.failures.after(sentence(error))
-        self._unjudged(pending, "it could not be decoded")
-        self.ends.leave(pending, Code.FRAME_UNDECODED, sentence(error))
+        self.failures = self.failures.after(error)
+        self._leave(pending, error)
 
     def _dropped(self, pending: PendingShot) -> None:
-        self._unjudged(pending, "it was not decoded: decoding fell behind")
-        self.ends.leave(pending, Code.FRAME_UNDECODED)
+        self._leave(pending, finding(Code.QUEUE_FULL, FRAME))
+
+    def _leave(self, pending: PendingShot, why: Evidence) -> None:
+        self._unjudged(pending, finding(Code.FRAME_UNDECODED, FRAME, why=why))
+        self.ends.leave(pending, Code.FRAME_UNDECODED, why)
 
     def _publish(self, tag: Tag, decoded: DecodedFrame, judged: Mapping[str, Any]) -> None:
         if self.publisher is None:

@@ -285,7 +285,7 @@ class Shutter(OneThread):
             try:
                 self._sink.note(shot)
             except (OSError, FlightError) as error:
-                reason = finding(Code.SHOT_NOT_NOTED, Subject("shot", shot.index), why=str(error))
+                reason = finding(Code.SHOT_NOT_NOTED, Subject("shot", shot.index), why=error)
         if reason is not None:
             self._note_refusal(request, now_ns, reason)
             self._follow_autopilot(request, now_ns, new=True)

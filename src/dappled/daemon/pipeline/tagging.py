@@ -13,7 +13,7 @@ from dappled.daemon.stream.wire import frame_header
 from dappled.decode.geometry import Pose, Vector3
 from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.drivers.raw.recipe import camera_name
-from dappled.errors import DappledError, report, sentence
+from dappled.errors import DappledError, report
 from dappled.findings import FRAME, Code, Finding, Subject, finding, told
 from dappled.flight import Frame, Tag
 from dappled.workers import Worker
@@ -122,10 +122,10 @@ class Tagging:
         """A frame that can't be tagged."""
         report(log, f"tag of frame {pending.shot.index}", error)
         self._ends.tell(self._ends.observer.tagged, pending)
-        self._ends.leave(pending, Code.FRAME_UNTAGGED, sentence(error))
+        self._ends.leave(pending, Code.FRAME_UNTAGGED, error)
 
     def _dropped(self, pending: PendingShot) -> None:
-        self._ends.leave(pending, Code.FRAME_UNTAGGED)
+        self._ends.leave(pending, Code.FRAME_UNTAGGED, finding(Code.QUEUE_FULL, FRAME))
 
     def _tag(self, pending: PendingShot, frame: Frame) -> None:
         began = self._clock.monotonic_ns()
@@ -161,7 +161,7 @@ class Tagging:
         try:
             return reading.read_metadata(self._ends.writer.path(frame))
         except DappledError as error:
-            found = finding(Code.FILE_UNREADABLE, FRAME, name=frame.name, why=str(error))
+            found = finding(Code.FILE_UNREADABLE, FRAME, name=frame.name, why=error)
             self._ends.note("unreadable", found, frame.index)
             return ExposureSettings()
 

@@ -16,7 +16,7 @@ from dappled.daemon.pipeline.picture_facts import PictureFacts, blur_circle
 from dappled.daemon.pipeline.spacing import Height
 from dappled.decode.geometry import FrameGeometry, Vector3, image_motion
 from dappled.drivers.camera import ExposurePlan, off_plan
-from dappled.findings import FRAME, Code, Finding, Level, Subject, Value, finding, text, told
+from dappled.findings import FRAME, Code, Evidence, Finding, Level, Subject, Value, finding
 from dappled.flight import Tag
 
 VerdictState = Literal["good", "usable", "bad", "unknown"]
@@ -50,7 +50,7 @@ class FrameFacts:
     """What a verdict is given by; None is unknown.
 
     Blur is how far still ground moved over the sensor during the exposure where it moved most, in pixels of the frame
-    and of a view; the ground counts as flat, `height_m` below, as `height_source` has it. `blur_unknown` says why it
+    and of a view; the ground counts as flat, `height_m` below, as `height_source` has it. `blur_unknown` is why it
     isn't known, `focus_unknown` why `defocus_view_px` isn't: the diameter of the circle that a point is drawn as,
     beyond that of the flight's sharpest frames. `picture_px` is the same of the picture at the sensor's own resolution,
     in pixels of the frame. `off_plan` is what exposure and lens are instead of the planned ones.
@@ -58,14 +58,14 @@ class FrameFacts:
 
     blur_px: float | None
     blur_view_px: float | None
-    blur_unknown: str
+    blur_unknown: Finding | None
     height_m: float | None
     height_source: str
     clipped_share: float
     black_share: float
     mean_share: float
     defocus_view_px: float | None
-    focus_unknown: str
+    focus_unknown: Finding | None
     carriers_found: int | None
     carriers_predicted: int
     doubts: tuple[Finding, ...]
@@ -85,8 +85,10 @@ class Verdict:
     facts: FrameFacts | None = None
 
     def values(self) -> dict[str, Any]:
-        """As ledger and stream have it."""
+        """As ledger and stream have it: of what led to a reason its code, since the reason holds it."""
         facts = {} if self.facts is None else codec.plain(self.facts)
+        for name in ("blur_unknown", "focus_unknown") if facts else ():
+            facts[name] = facts[name]["code"] if facts[name] else ""
         numbers = {name: _plain(one) for name, one in facts.items()}
         return {"state": self.state, "reasons": codec.plain(self.reasons), "facts": numbers}
 
@@ -106,7 +108,7 @@ def verdict(facts: FrameFacts, bounds: VerdictBounds) -> Verdict:
     return Verdict(found[0][0] if found else "good", tuple(why for _, why in found), facts)
 
 
-def unjudged(why: str) -> Verdict:
+def unjudged(why: Evidence) -> Verdict:
     """Of a frame that can't be judged."""
     return Verdict("unknown", (finding(Code.FRAME_UNJUDGED, FRAME, why=why),))
 
@@ -199,7 +201,7 @@ class VerdictCounts:
         """Three or more frames that were bad without a good or usable one between them; a change of the lens' settings,
         until so many frames show that it stays."""
         if self.bad_in_a_row >= BAD_IN_A_ROW and self.reason is not None:
-            yield finding(Code.FRAMES_BAD, Subject("flight"), in_a_row=self.bad_in_a_row, why=str(text(self.reason)))
+            yield finding(Code.FRAMES_BAD, Subject("flight"), in_a_row=self.bad_in_a_row, why=self.reason)
         if self.drift is not None and self.held < _STAYS:
             yield self.drift
 
@@ -232,7 +234,7 @@ class Judge:
         """Judge a frame. `rates` are the body's at mid-exposure (rad/s), None where unknown; `carriers` were found, and
         are predicted."""
         if seen is None:
-            return unjudged("the decoder said nothing about its pixels")
+            return unjudged(finding(Code.FRAME_PIXELS_UNTOLD, FRAME))
         blur, blur_unknown = self._blur(tag, rates, seen)
         lens = tag.focal_length_mm, tag.f_number
         circle, focus_unknown = self._defocus(lens, seen)
@@ -281,20 +283,20 @@ class Judge:
         self.counts = VerdictCounts(dict(self._states), in_a_row, reason, last, drift, held)
         return found
 
-    def _defocus(self, lens: LensSettings, seen: PictureFacts) -> tuple[float | None, str]:
+    def _defocus(self, lens: LensSettings, seen: PictureFacts) -> tuple[float | None, Finding | None]:
         """The circle of confusion beyond that of the sharpest quarter of the frames in focus so far, which are kept by
         the lens' settings; or None, and why."""
         circle = blur_circle(seen)
         if circle is None:
-            return None, "the picture has more noise than fine detail"
+            return None, finding(Code.FOCUS_NOISE, FRAME)
         known = self._sharpest.setdefault(lens, deque(maxlen=_MOST))
         reference, beyond = _beyond(known, circle, seen.bounds.defocus_usable_px)
         if reference is None:  # what is sharp by itself needs no other frame
-            few = f"its circle is {circle:.1f} view pixels, with fewer than {_LEAST} frames in focus to compare with"
-            return (circle, "") if circle <= seen.bounds.defocus_usable_px else (None, few)
+            few = finding(Code.FOCUS_FEW_FRAMES, FRAME, circle_px=circle, frames=_LEAST)
+            return (circle, None) if circle <= seen.bounds.defocus_usable_px else (None, few)
         if reference > seen.bounds.defocus_usable_px:  # an absolute measure: then no frame was seen to be sharp
-            return None, f"this flight's sharpest frames have circles of {reference:.1f} view pixels"
-        return beyond, ""
+            return None, finding(Code.FOCUS_FLIGHT_SOFT, FRAME, circle_px=reference)
+        return beyond, None
 
     def _picture(self, lens: LensSettings, seen: PictureFacts) -> float | None:
         """How far the picture is out of focus beyond the sharpest quarter of the frames with the lens as it is; None
@@ -307,27 +309,29 @@ class Judge:
         reference, beyond = _beyond(known, circle, seen.bounds.picture_usable_px)
         return None if reference is None else beyond
 
-    def _blur(self, tag: Tag, rates: Vector3 | None, seen: PictureFacts) -> tuple[tuple[float, float] | None, str]:
+    def _blur(
+        self, tag: Tag, rates: Vector3 | None, seen: PictureFacts
+    ) -> tuple[tuple[float, float] | None, Finding | None]:
         """How far ground moved over the sensor during the exposure, (down, right) in mm; or None, and why."""
         pose, height = tag.pose, Height.of(tag.pose)
-        missing = [
-            (tag.exposure_s is None, "the frame has no exposure time"),
-            (tag.focal_length_mm is None, "the frame has no focal length"),
-            (seen.side_mm is None, "the camera has no profile with the size of its sensor"),
-            (bool(tag.doubts), f"its time is in doubt: {'; '.join(str(told(one, FRAME)) for one in tag.doubts)}"),
-            (tag.utc_sigma_ns > _LATE_NS, f"its time is known to ±{tag.utc_sigma_ns / 1e6:.0f} ms only"),
-            (pose.velocity_ned_m_s is None, "the telemetry has no velocity"),
-            (pose.attitude is None, "the telemetry has no attitude"),
-            (pose.source != "interpolated", f"the telemetry is {(pose.age_ms or 0) / 1e3:.1f} s old"),
-            (self._on_gimbal, "the camera is on a gimbal, whose turn rate is not reported"),
-            (rates is None, "the telemetry has no turn rates, or too few (10 a second are needed)"),
-            (height is None, "the telemetry has no height"),
+        missing: list[tuple[bool, Code, dict[str, Evidence]]] = [
+            (tag.exposure_s is None, Code.BLUR_NO_EXPOSURE_TIME, {}),
+            (tag.focal_length_mm is None, Code.BLUR_NO_FOCAL_LENGTH, {}),
+            (seen.side_mm is None, Code.BLUR_SIZE_UNKNOWN, {}),
+            (bool(tag.doubts), Code.BLUR_TIME_DOUBTED, {"why": next(iter(tag.doubts), None)}),
+            (tag.utc_sigma_ns > _LATE_NS, Code.BLUR_TIME_INEXACT, {"sigma_ms": tag.utc_sigma_ns / 1e6}),
+            (pose.velocity_ned_m_s is None, Code.BLUR_NO_VELOCITY, {}),
+            (pose.attitude is None, Code.BLUR_NO_ATTITUDE, {}),
+            (pose.source != "interpolated", Code.BLUR_POSE_OLD, {"age_s": (pose.age_ms or 0) / 1e3}),
+            (self._on_gimbal, Code.BLUR_GIMBAL_RATE, {}),
+            (rates is None, Code.BLUR_NO_TURN_RATES, {}),
+            (height is None, Code.BLUR_NO_HEIGHT, {}),
         ]
-        if why := next((text for is_so, text in missing if is_so), None):
+        if why := next((finding(code, FRAME).with_facts(**facts) for is_so, code, facts in missing if is_so), None):
             return None, why
         assert height is not None
         if not height.metres >= (_LOW_M if pose.ground is None else 0.0):
-            return None, f"the height is {height.metres:.1f} m ({height.source}), too little to be known"
+            return None, finding(Code.BLUR_TOO_LOW, FRAME, height_m=height.metres, height_by=height.source)
         assert tag.exposure_s is not None
         assert tag.focal_length_mm is not None
         assert seen.side_mm is not None
@@ -338,10 +342,10 @@ class Judge:
         camera = FrameGeometry(self._mount, tag.focal_length_mm, seen.side_mm, seen.view_mm, height.metres)
         moving = image_motion(camera, pose.attitude, pose.velocity_ned_m_s, rates)
         if moving is None:
-            return None, "the camera sees no ground"
+            return None, finding(Code.BLUR_NO_GROUND, FRAME)
         if not all(map(math.isfinite, (*pose.velocity_ned_m_s, *rates, *moving))):
-            return None, "the telemetry's numbers are not finite"
-        return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), ""
+            return None, finding(Code.BLUR_NOT_FINITE, FRAME)
+        return (moving[0] * tag.exposure_s, moving[1] * tag.exposure_s), None
 
 
 def _moved(before: LensSettings, now: LensSettings) -> str:

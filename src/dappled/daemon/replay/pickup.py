@@ -177,8 +177,8 @@ def bring(
                 ledger.add_event(NOTICED, one)
         for number, group in proposal.pairs:
             frame = _record(recorder, source, number, group.main, clock.utc_ns())
-            why = str(text(proposal.reasons[number]))
-            ledger.add_event("picked up", finding(Code.FRAME_PICKED_UP, FRAME, file=group.main.name, why=why), number)
+            found = finding(Code.FRAME_PICKED_UP, FRAME, file=group.main.name, why=proposal.reasons[number])
+            ledger.add_event("picked up", found, number)
             doubt = next((one for one in proposal.doubts if one.subject == Subject("frame", number)), None)
             if doubt is not None:
                 ledger.add_event(DOUBT, doubt, number)

@@ -311,8 +311,9 @@ class RecordedTelemetry:
             gap.frames += within and (gap.before_ns is None or exposure.utc_ns < gap.before_ns)
         time, pose = self._telemetry.locate(exposure, upto_packet=horizon)
         self._unplaced += pose.latitude_rad is None
-        jumps = [float(one.facts["by_m"] or 0) for one in self._telemetry.doubts() if one.code is Code.POSITION_JUMPED]
-        self._jump_m = max([self._jump_m, *jumps])
+        for one in self._telemetry.doubts():
+            if one.code is Code.POSITION_JUMPED and isinstance(by_m := one.facts["by_m"], float):
+                self._jump_m = max(self._jump_m, by_m)
         return time, pose
 
     def rates(self, pose: Pose) -> Vector3 | None:
@@ -323,7 +324,7 @@ class RecordedTelemetry:
         gaps = sorted((gap.finding() for gap in self._gaps), key=lambda one: -one.level)
         count, subject = self._telemetry.statistics().impossible, Subject("log", str(self._path))
         if count:
-            gaps.append(finding(Code.LOG_VALUES_MISSING, subject, values=f"{count} of its messages"))
+            gaps.append(finding(Code.LOG_MESSAGES_IMPOSSIBLE, subject, messages=count))
         if self._of_folder and self._path and self._unplaced:  # of a flight these are told beside each frame
             gaps.append(finding(Code.LOG_FRAMES_UNPLACED, subject, frames=self._unplaced))
         if self._of_folder and self._jump_m:

@@ -408,8 +408,7 @@ class _Comparison:
             if index not in made and index not in uncovered:
                 yield from self._of_shot(index)
         for stray in self.flight.strays:
-            why = None if stray.reason is None else str(text(stray.reason))
-            reason = finding(Code.FILE_NO_TRIGGER, Subject("file", stray.name), file=stray.name, why=why)
+            reason = finding(Code.FILE_NO_TRIGGER, Subject("file", stray.name), file=stray.name, why=stray.reason)
             yield Imbalance("phantom", None, (), self.flight.utc_ns(stray.arrived_utc_ns), None, reason)
 
     def _of_trigger(self, place: int, one: _Trigger) -> Iterator[Imbalance]:

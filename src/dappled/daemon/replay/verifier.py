@@ -13,7 +13,7 @@ from dappled.decode.lightfield.light_field import difference
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import LawDecision
 from dappled.errors import DappledError
-from dappled.findings import Code, Finding, Subject, Value, finding, text
+from dappled.findings import Code, Evidence, Finding, Subject, finding
 from dappled.flight import Frame, Result, Shot, ShotRow, Tag, digest
 
 MOST_SHARE = 1e-6  # of a frame's largest value: what rounding on another platform does to slices, with room
@@ -139,7 +139,7 @@ class ReplayVerifier:
         """Something happened. An event of a kind that the flight has for this shot too is no difference."""
         if index is not None and kind in self._expected[index].events:
             return
-        self._differ(Code.REPLAY_OTHER_EVENT, "" if index is None else index, kind=kind, text=str(text(found)))
+        self._differ(Code.REPLAY_OTHER_EVENT, "" if index is None else index, kind=kind, text=found)
 
     def verdict(self, *, decoded: bool = True) -> list[Finding]:
         """All differences, and what the replay did not come to compare. `decoded`: whether the flight was decoded as it
@@ -184,7 +184,7 @@ class ReplayVerifier:
         else:
             self._differ(Code.REPLAY_OTHER_SHAPE, index, elsewhere=self.elsewhere)
 
-    def _differ(self, code: Code, index: int | str, **facts: Value) -> None:
+    def _differ(self, code: Code, index: int | str, **facts: Evidence) -> None:
         self._differences.append(finding(code, Subject("frame", index)).with_facts(**facts))
 
 

@@ -64,6 +64,13 @@ class LawSearch:
     unseen: Finding | None
 
     @property
+    def log10_odds(self) -> dict[str, float | None]:
+        """The odds against chance of what was found, and of the best lattice near each law's prediction."""
+        nats = {"log10_odds": None if self.found is None else self.found.odds_nats}
+        nats |= {f"log10_odds_{one.law}": one.nats for one in self.odds}
+        return {name: None if one is None else one / math.log(10) for name, one in nats.items()}
+
+    @property
     def sentence(self) -> str:
         """The odds of each law in words."""
         shown = "; ".join(

@@ -86,10 +86,8 @@ def _searched(decoder: MaskDecoder, plane: Source, lens: FrameLens, *, keep_law:
     if search.found is not None and keep_law and search.law not in (None, decoder.optics.law):
         own = search_frame(decoder, plane, lens, other_laws=False)
         if own.found is None:
-            other = finding(
-                Code.CARRIERS_OTHER_LAW, FRAME, law=decoder.optics.law, seen=search.law, odds=search.sentence
-            )
-            return LawCheck(decoder, search, other)
+            other = finding(Code.CARRIERS_OTHER_LAW, FRAME, law=decoder.optics.law, seen=search.law)
+            return LawCheck(decoder, search, other.with_facts(**search.log10_odds))
         search = own
     if search.found is not None:
         return LawCheck(at_found(decoder, search), search)

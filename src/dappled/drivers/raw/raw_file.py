@@ -54,7 +54,7 @@ class RawFile(ExposureSettings):
     units; `black` is one number, or one for each colour index. `cfa` is an int array (a, b) of colour indices that
     repeats over the mosaic from its pixel (0, 0), or None for a single colour; `colour_names[i]` names index i.
     `balance` are the file's own white balance gains by colour index, green 1. `developed` says by
-    what it is known that a camera or a program has bent the values, "" where nothing tells.
+    what it is known that a camera or a program has bent the values, None where nothing tells.
     """
 
     mosaic: Values
@@ -63,7 +63,7 @@ class RawFile(ExposureSettings):
     cfa: NDArray[np.int64] | None
     colour_names: tuple[str, ...]
     balance: tuple[float, ...] | None
-    developed: str = ""
+    developed: Finding | None = None
 
     @classmethod
     def of(cls, settings: ExposureSettings, mosaic: Values, **known: Any) -> RawFile:

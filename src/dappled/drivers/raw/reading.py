@@ -33,6 +33,7 @@ from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.drivers.raw.raw_file import RawFile, RawSource, positive, read_exif
 from dappled.durable import plain_file
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, Finding, finding
 
 __all__ = ["DappledError", "ExposureSettings", "RawFile", "RawSource", "read", "read_metadata"]
 
@@ -255,16 +256,16 @@ def _read_picture(file: BinaryIO) -> RawFile:
     return replace(_plain(values, read_exif(file)), developed=developed)
 
 
-def _developed(image: Image.Image) -> str:
-    """By what a picture is known not to be linear; "" where its file says nothing of the kind."""
+def _developed(image: Image.Image) -> Finding | None:
+    """By what a picture is known not to be linear; None where its file says nothing of the kind."""
     if image.format == "JPEG":
-        return "it is a JPEG"
+        return finding(Code.TONES_JPEG, FRAME)
     gamma = image.info.get("gamma")
     if "srgb" in image.info:
-        return "its sRGB chunk says that it was developed"
+        return finding(Code.TONES_SRGB, FRAME)
     if gamma is not None and 0 < gamma < _LINEAR_FROM:
-        return f"its gAMA chunk says that its values have a gamma of 1/{1 / gamma:.3g}"
-    return ""
+        return finding(Code.TONES_GAMMA, FRAME, inverse=1 / gamma)
+    return None
 
 
 def _png_is_deep_colour(file: BinaryIO) -> bool:

@@ -8,7 +8,6 @@ from dappled.config import profiles
 from dappled.drivers.raw import calibration_files
 from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
-from dappled.findings import told
 
 
 def check(recipe: Recipe) -> None:
@@ -18,7 +17,7 @@ def check(recipe: Recipe) -> None:
     if recipe.mask != profiles.LENSLET:
         profiles.mask(recipe.mask)
     if (wrong := calibration_files.misfit(recipe)) is not None:
-        raise DappledError(str(told(wrong)))
+        raise DappledError(wrong)
     if recipe.taper and recipe.mask == profiles.LENSLET:
         raise DappledError("a taper is for the bands of a printed mask; the bands of lenslets fill the whole spectrum")
     if not 0 <= recipe.taper <= 1:

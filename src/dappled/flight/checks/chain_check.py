@@ -42,7 +42,7 @@ def compare(stored: StoredRows) -> ChainFindings:
         try:
             problems += _differences(f"row of {table}", latest.get(table, {}), stored.keyed_rows(table))
         except FlightError as error:
-            problems.append(finding(Code.LEDGER_ROWS_UNREAD, Subject("table", table), table=table, why=str(error)))
+            problems.append(finding(Code.LEDGER_ROWS_UNREAD, Subject("table", table), table=table, why=error))
     return ChainFindings({link.number: link for link in links}, tuple(problems))
 
 

@@ -131,7 +131,7 @@ def _examining(what: str, found: list[Finding]) -> Iterator[None]:
     try:
         yield
     except DappledError as error:
-        found.append(finding(Code.FLIGHT_PART_UNREAD, Subject("part", what), why=str(error)))
+        found.append(finding(Code.FLIGHT_PART_UNREAD, Subject("part", what), why=error))
     except (
         ValueError,
         TypeError,
@@ -142,7 +142,7 @@ def _examining(what: str, found: list[Finding]) -> Iterator[None]:
         OSError,
         MemoryError,
     ) as error:
-        found.append(finding(Code.FLIGHT_PART_DAMAGED, Subject("part", what), part=what, why=str(error)))
+        found.append(finding(Code.FLIGHT_PART_DAMAGED, Subject("part", what), part=what, why=error))
 
 
 def _chained(folder: FlightFolder, found: list[Finding]) -> ChainFindings:
@@ -196,11 +196,11 @@ def _read(folder: FlightFolder, name: str, held: HeldDigests) -> tuple[int, Find
         right = durable.hash_file(path) in held.right
         return found, None if right else finding(Code.FILE_CHANGED, about, name=name)
     except OutsideError as error:
-        return 0, finding(Code.FILE_OUTSIDE, about, why=str(error))
+        return 0, finding(Code.FILE_OUTSIDE, about, why=error)
     except FileNotFoundError:
         return 0, finding(Code.FILE_MISSING, about, name=name)
     except OSError as error:
-        return 0, finding(Code.FILE_UNREADABLE, about, name=name, why=error.strerror)
+        return 0, finding(Code.FILE_UNREADABLE, about, name=name, why=error)
 
 
 def _shots(folder: FlightFolder, ledger: LedgerReader) -> Iterator[Finding]:

@@ -146,7 +146,7 @@ def _files(
             elif not name.startswith("frames/") or name.endswith(layout.SIDECAR):  # others are missed in the ledger
                 code, wrong = Code.SEAL_FILE_ADDED, False
         except OSError as error:
-            yield wrong, finding(Code.SEAL_FILE_UNREADABLE, SEAL, file=name, why=error.strerror)
+            yield wrong, finding(Code.SEAL_FILE_UNREADABLE, SEAL, file=name, why=error)
         if code is not None:
             yield wrong, finding(code, SEAL, seal=last.seal, file=name)
 

@@ -175,8 +175,10 @@ def _matched(
         )
     if by_time:
         return matched, []
-    why = f"their times are {-matched.offset_s:.3f} s from the shots'" if utc_known else "the flight never knew UTC"
-    return matched, [finding(Code.MARKS_UNTIMED, MARKS, why=why)]
+    off = finding(Code.MARKS_OFF_SHOTS, MARKS, by_s=-matched.offset_s)
+    return matched, [
+        finding(Code.MARKS_UNTIMED, MARKS, why=off if utc_known else finding(Code.TIME_NEVER_KNOWN, MARKS))
+    ]
 
 
 def _not_epochs(path: Path, marks: Sequence[Mark]) -> None:

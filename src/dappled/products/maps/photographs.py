@@ -20,7 +20,7 @@ from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
 from dappled.drivers.raw.reading import RawFile
 from dappled.errors import DappledError
-from dappled.findings import FRAME, Code, Finding, Subject, finding
+from dappled.findings import FRAME, Code, Evidence, Finding, Subject, finding
 from dappled.flight import Frame, LedgerReader, Tag, layout
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.eye import Eye, intrinsics, through
@@ -146,9 +146,9 @@ class Photograph:
         ]
 
 
-def unplaced(name: str, why: object) -> Finding:
+def unplaced(name: str, why: Evidence) -> Finding:
     """Why a frame is not on the map."""
-    return finding(Code.FRAME_UNPLACED, Subject("frame", name), why=str(why))
+    return finding(Code.FRAME_UNPLACED, Subject("frame", name), why=why)
 
 
 def stations(flight: Path, mounting: Mounting) -> tuple[list[Station], list[Finding]]:

@@ -67,7 +67,7 @@ class FrameDepths:
         try:
             made = of_field(opened, self.estimate(opened))
         except DappledError as error:
-            self.left.append(finding(Code.FRAME_NO_HEIGHTS, Subject("frame", one.name), why=str(error)))
+            self.left.append(finding(Code.FRAME_NO_HEIGHTS, Subject("frame", one.name), why=error))
             return
         for kind, values in zip(_KINDS, (made.inverse_per_m, made.sigma_per_m), strict=True):
             np.save(self.scratch / f"{one.name}-{kind}.npy", values)
