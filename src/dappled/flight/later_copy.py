@@ -7,23 +7,21 @@ that came to the copy alone (a pickup there) stay there.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from dappled import durable
 from dappled.clock import Clock
 from dappled.findings import Code, Subject, finding
 from dappled.flight import layout
-from dappled.flight.chain import Column
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import Ledger
+from dappled.flight.ledger_copies import Rows
 from dappled.flight.trees import FileIdentity, Tree
 from dappled.flight.verified_copy import Proved, copy_verified, hashed
 from dappled.shown import printable
 
 _FOLDERS = ("geotags/", "inputs/")
-
-Rows = Mapping[str, Sequence[Sequence[Column]]]
 
 
 def written_by_work(there: Tree) -> dict[str, tuple[FileIdentity, str]]:

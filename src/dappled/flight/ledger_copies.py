@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from dappled import durable
@@ -23,6 +22,8 @@ from dappled.flight.stored_rows import StoredRows
 from dappled.flight.trees import Tree
 from dappled.flight.verified_copy import Proved, different, prove
 
+Rows = Mapping[str, Sequence[Sequence[Column]]]
+
 
 def is_part(name: str) -> bool:
     """Whether a file of the flight belongs to the ledger: SQLite's own files, which are not copied as they are, and the
@@ -30,19 +31,10 @@ def is_part(name: str) -> bool:
     return name in ("flight.sqlite", "flight.sqlite-wal", "flight.sqlite-shm", "seals.jsonl")
 
 
-@dataclass(frozen=True, slots=True)
-class Brought:
-    """A copy of a ledger or of seals: whether it was written, what it is now, and which rows a ledger has that the
-    source's lacks, by table, with their links: work at the copy added them."""
-
-    written: bool
-    proved: Proved
-    later: Mapping[str, Sequence[Sequence[Column]]]
-
-
-def bring(source: Tree, there: Tree, name: str) -> Brought:
+def bring(source: Tree, there: Tree, name: str) -> tuple[Proved, Rows]:
     """Copy the ledger as SQLite sees it, its write-ahead log included. A copy that is an earlier state of the source's
-    is replaced, a later one stays.
+    is replaced, a later one stays. Returns the proof of the copy, and the rows that it has and the source's lacks, by
+    table, with their links: work at the copy added them.
 
     Raises FlightError where each has links that the other lacks, where one of them is not what its own chain says and
     the copy would be replaced, or a disk refuses.
@@ -62,27 +54,13 @@ def bring(source: Tree, there: Tree, name: str) -> Brought:
                     f"{goal} is there already and is no copy of the ledger ({error}): move it away first"
                 ) from error
             if stays:
-                return Brought(False, _proved(source, there, name, held), later)
+                return _proved(source, there, name, held), later
             if their_head is None or ours.link(their_head.number) != their_head:
                 raise _apart(source, there, name)
             _refuse_edited(goal, wrong)
             _refuse_edited(source.path / name, chain_check.compare(ours).problems)
     there.write(name, [image])
-    return Brought(True, _proved(source, there, name, image), {})
-
-
-def bring_seals(source: Tree, there: Tree, name: str) -> Brought | None:
-    """Copy the seals, as `bring` does the ledger: lines are only added to them. None where the source has none.
-
-    Raises FlightError where each has lines that the other lacks, or a disk refuses.
-    """
-    if source.stat(name) is None:
-        return None
-    ours, theirs = _contents(source, there, name)
-    if theirs.startswith(ours):
-        return Brought(False, _proved(source, there, name, theirs), {})
-    there.write(name, [ours])
-    return Brought(True, _proved(source, there, name, ours), {})
+    return _proved(source, there, name, image), {}
 
 
 def _apart(source: Tree, there: Tree, name: str) -> FlightError:
@@ -103,19 +81,32 @@ def _refuse_edited(ledger: Path, problems: Sequence[Finding]) -> None:
         )
 
 
-class SealedStates:
-    """Which earlier states of a flight's files the seals of two copies of it show, where one of them has all seals of
-    the other and more: it is the later one."""
+class SealLines:
+    """The seals of a flight and of a copy of it, and which earlier states of its files they show, where one of the two
+    has all lines of the other and more: it is the later one."""
 
     def __init__(self, source: Tree, there: Tree, name: str) -> None:
         """`name` is that of the file of seals. Raises FlightError, also where each has lines that the other lacks."""
-        ours, theirs = _contents(source, there, name)
-        self.source_is_later = theirs != b"" and ours.startswith(theirs) and ours != theirs
-        self.copy_is_later = ours != b"" and theirs.startswith(ours) and ours != theirs
+        self._source, self._there, self._name = source, there, name
+        self._ours, self._theirs = _content(source, name), _content(there, name)
+        if not self._ours.startswith(self._theirs) and not self._theirs.startswith(self._ours):
+            raise _apart(source, there, name)
+        self.source_is_later = len(self._ours) > len(self._theirs) > 0
+        self.copy_is_later = len(self._theirs) > len(self._ours) > 0
         self._states: set[tuple[str, str]] = set()
         if self.source_is_later or self.copy_is_later:
-            found = seals.parse(max(ours, theirs, key=len), name).seals.values()
+            found = seals.parse(max(self._ours, self._theirs, key=len), name).seals.values()
             self._states = {(file, sha256) for seal in found for file, (_, sha256) in seal.files.items()}
+
+    def bring(self) -> dict[str, Proved]:
+        """Copy the seals, unless the copy has them all; the proof by name, none where the source has none. Raises
+        FlightError."""
+        if self._source.stat(self._name) is None:
+            return {}
+        if len(self._ours) > len(self._theirs):
+            self._there.write(self._name, [self._ours])
+        later = max(self._ours, self._theirs, key=len)
+        return {self._name: _proved(self._source, self._there, self._name, later)}
 
     def differ(self, name: str) -> bool:
         """Whether work may have written this file anew since one of the two copies was sealed."""
@@ -124,14 +115,6 @@ class SealedStates:
     def has(self, name: str, sha256: str) -> bool:
         """Whether a file that later work may write anew had this content when the flight was sealed."""
         return not seals.never_changes(name) and (name, sha256) in self._states
-
-
-def _contents(source: Tree, there: Tree, name: str) -> tuple[bytes, bytes]:
-    """The seals here and there, where one begins with the other; FlightError where each has lines of its own."""
-    ours, theirs = _content(source, name), _content(there, name)
-    if not ours.startswith(theirs) and not theirs.startswith(ours):
-        raise _apart(source, there, name)
-    return ours, theirs
 
 
 def _content(tree: Tree, name: str) -> bytes:

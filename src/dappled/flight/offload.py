@@ -19,10 +19,10 @@ from dappled.findings import Code, Finding, Subject, finding, text, told
 from dappled.flight import later_copy, layout, ledger_copies, places, pruning, seals
 from dappled.flight.checks import flight_check
 from dappled.flight.errors import FlightError, disk_errors
-from dappled.flight.later_copy import Added, Rows
+from dappled.flight.later_copy import Added
 from dappled.flight.layout import FlightFolder
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.ledger_copies import SealedStates
+from dappled.flight.ledger_copies import Rows, SealLines
 from dappled.flight.read_back import ReadBack
 from dappled.flight.records import Frame, Stray
 from dappled.flight.seal_key import SealKey
@@ -88,7 +88,6 @@ class _Copying:
     def __init__(self, folder: FlightFolder, source: Tree, there: Tree, system: str) -> None:
         self._folder, self._source, self._there, self._system = folder, source, there, system
         self._proved: dict[str, Proved] = {}  # what the copy has by now
-        self._written: set[str] = set()  # by this call
 
     def run(
         self,
@@ -102,25 +101,26 @@ class _Copying:
         """Copy, read back, make durable, check, and remove; see `offload`."""
         # What stands on another machine can't be told apart from the source: it is written anew, which shows.
         anew = prune and self._system in places.NETWORK
-        states = SealedStates(self._source, self._there, self._folder.seals.name)
+        seal_lines = SealLines(self._source, self._there, self._folder.seals.name)
         for name in names:
-            self._proved[name] = self._bring(name, states, anew=anew and seals.never_changes(name))
+            self._proved[name] = self._bring(name, seal_lines, anew=anew and seals.never_changes(name))
             progress(self._proved[name].identity.size)
         later = self._bring_ledger()
         self._there.sync()
         self._unmark()
         self._there.sync_above()
         rows = self._acknowledged()
-        elsewhere = self._prove_removed(rows)
-        files = later_copy.written_by_work(self._there) if later or states.copy_is_later else {}
+        elsewhere = self._prove_elsewhere(rows)
+        files = later_copy.written_by_work(self._there) if later or seal_lines.copy_is_later else {}
         self._check()
-        added = Added(later, self._prove_added({**self._proved, **rows}) if later else {}, files, states.copy_is_later)
-        elsewhere |= added.frames
+        frames = {name: one for name, one in elsewhere.items() if name not in rows}
+        added = Added(later, frames, files, seal_lines.copy_is_later)
         _write_sums(self._there, {**self._proved, **elsewhere})
         ways = tuple(sorted({one.how for one in self._proved.values()}))
         doubts = tuple(_doubts(self._there.path, self._system, ways))
         size = sum(one.identity.size for one in self._proved.values())
-        copied, already = len(self._written), len(self._proved) - len(self._written)
+        copied = len(self._proved.keys() & self._there.written)
+        already = len(self._proved) - copied
         pruned = 0
         if prune:
             if "page cache" in ways:
@@ -143,23 +143,22 @@ class _Copying:
             self._folder.name, self._there.path, copied, already, size, pruned, brought, self._system, ways, doubts
         )
 
-    def _bring(self, name: str, states: SealedStates, *, anew: bool) -> Proved:
+    def _bring(self, name: str, seal_lines: SealLines, *, anew: bool) -> Proved:
         """Copy a file, or prove that the copy has it. Of one that later work wrote anew the later one counts. `anew`:
         write it also where it is there already. Raises FlightError where another file is there."""
         self._refuse_in_the_way(name)
         if self._there.stat(name) is not None:
             before, sha256 = hashed(self._source, name)
-            theirs = hashed(self._there, name)[1] if anew or states.differ(name) else sha256
+            theirs = hashed(self._there, name)[1] if anew or seal_lines.differ(name) else sha256
             goal, origin = self._there.path / name, self._source.path / name
             wrong = f"{goal} is there already and differs from {origin}: move it away first"
             if anew and theirs != sha256:
                 raise FlightError(wrong)
-            if states.copy_is_later and states.has(name, sha256):
+            if seal_lines.copy_is_later and seal_lines.has(name, sha256):
                 sha256 = theirs
-            if not anew and not (states.source_is_later and theirs != sha256 and states.has(name, theirs)):
+            if not anew and not (seal_lines.source_is_later and theirs != sha256 and seal_lines.has(name, theirs)):
                 return prove(self._there, name, sha256, wrong, before)
         self._mark()
-        self._written.add(name)
         return copy_verified(self._source, self._there, name)
 
     def _bring_ledger(self) -> Rows:
@@ -167,12 +166,9 @@ class _Copying:
         ledger, seal_file = self._folder.ledger.name, self._folder.seals.name
         for name in (ledger, seal_file):
             self._refuse_in_the_way(name)
-        brought = {ledger: ledger_copies.bring(self._source, self._there, ledger)}
-        if (seal := ledger_copies.bring_seals(self._source, self._there, seal_file)) is not None:
-            brought[seal_file] = seal
-        self._proved |= {name: one.proved for name, one in brought.items()}
-        self._written |= {name for name, one in brought.items() if one.written}
-        return brought[ledger].later
+        self._proved[ledger], later = ledger_copies.bring(self._source, self._there, ledger)
+        self._proved |= SealLines(self._source, self._there, seal_file).bring()
+        return later
 
     def _write_down(self, sure: Mapping[str, Proved], added: Added, *, clock: Clock, key: SealKey | None) -> None:
         """Before anything is removed: bring home what was added at the copy, write down what will go, seal the flight
@@ -195,12 +191,9 @@ class _Copying:
             self._there.sync()
 
     def _refuse_in_the_way(self, name: str) -> None:
-        """Raise FlightError where something in the copy is the source's own file, or no file."""
-        if self._there.stat(name) is None or self._source.stat(name) is None:
-            return
-        with self._source.reading(name) as mine, self._there.reading(name) as other:
-            same = os.path.sameopenfile(mine, other)
-        if same:
+        """Raise FlightError where something in the copy is the source's own file."""
+        mine, other = self._source.stat(name), self._there.stat(name)
+        if mine is not None and other is not None and os.path.samestat(mine, other):
             raise FlightError(
                 f"{self._there.path / name} is the same file as {self._source.path / name} under another name: nothing "
                 "was removed; give a folder on another disk"
@@ -221,33 +214,27 @@ class _Copying:
         with LedgerReader.open(self._folder.ledger) as ledger:
             return {row.name: row for row in ledger.files()}
 
-    def _prove_removed(self, rows: Mapping[str, Frame | Stray]) -> dict[str, Proved]:
-        """Read back the files that an earlier prune removed here. Raises FlightError where this copy lacks one."""
+    def _prove_elsewhere(self, rows: Mapping[str, Frame | Stray]) -> dict[str, Proved]:
+        """Read back the files that the copy alone has: an earlier prune removed them here, or work there brought them.
+        Raises FlightError where one is missing, or isn't what the ledger says: ours, of what was here."""
         gone = pruning.removed(self._folder)
         proved: dict[str, Proved] = {}
-        for name in (name for name in rows if name in gone and name not in self._proved):
+        with LedgerReader.open(self._there.path / self._folder.ledger.name) as ledger:
+            theirs = {row.name: row for row in ledger.files()}
+        for name, row in {**theirs, **rows}.items():
+            if name in self._proved or (name in rows and name not in gone):
+                continue  # what is missed here the check of the copy tells
             self._folder.file(name)  # confined
-            if self._there.stat(name) is None:
+            there = name.startswith("frames/") and name.count("/") == 1 and self._there.stat(name) is not None
+            if not there and name in gone:
                 raise FlightError(
                     f"{name} was offloaded to {gone[name].destination} and removed here, and {self._there.path} lacks "
                     "it: nothing was removed; give that destination, or copy its frames here first"
                 )
+            if not there:
+                raise FlightError(f"the ledger of {self._there.path} names {name}, which is no frame there")
             wrong = f"{self._there.path / name} differs from what the ledger says: nothing was removed"
-            proved[name] = prove(self._there, name, rows[name].sha256, wrong)
-        return proved
-
-    def _prove_added(self, known: Mapping[str, object]) -> dict[str, Proved]:
-        """Read back the files that came to the copy alone (a pickup there), whose ledger was checked. Raises
-        FlightError where one isn't what that ledger says."""
-        proved: dict[str, Proved] = {}
-        with LedgerReader.open(self._there.path / self._folder.ledger.name) as ledger:
-            rows = [row for row in ledger.files() if row.name not in known]
-        for row in rows:
-            self._folder.file(row.name)  # confined
-            if row.name.count("/") != 1 or not row.name.startswith("frames/") or self._there.stat(row.name) is None:
-                raise FlightError(f"the ledger of {self._there.path} names {row.name}, which is no frame there")
-            wrong = f"{self._there.path / row.name} differs from what the ledger there says: nothing was removed"
-            proved[row.name] = prove(self._there, row.name, row.sha256, wrong)
+            proved[name] = prove(self._there, name, row.sha256, wrong)
         return proved
 
     def _check(self) -> None:

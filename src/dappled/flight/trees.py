@@ -48,11 +48,13 @@ class FileIdentity:
 
 
 class Tree(Closing):
-    """A folder, open, and the folders below it that were opened or made. Names are relative to it, with "/" between."""
+    """A folder, open, and the folders below it that were opened or made. Names are relative to it, with "/" between.
+    `written` are the files that were put there."""
 
     def __init__(self, path: Path) -> None:
         """Open a folder; a link at its end is not followed. Raises FlightError."""
         self.path = path
+        self.written: set[str] = set()
         self._folders: dict[str, int] = {}
         with self._saying("open", ""):
             self._folders[""] = os.open(path, _FOLDER)
@@ -137,6 +139,7 @@ class Tree(Closing):
 
         with self._saying("write", name):
             durable.fill_file(Path(last), fill, folder=parent)
+        self.written.add(name)
 
     def remove_part(self, name: str) -> None:
         """Remove what an attempt to write a file left half-written, if there is something. Raises FlightError."""
