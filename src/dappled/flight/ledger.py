@@ -10,9 +10,9 @@ import os
 import sqlite3
 import threading
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import astuple, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar, cast
 
@@ -31,6 +31,7 @@ from dappled.flight.tables import (
     APPLICATION_ID,
     DEFINITIONS,
     KEYS,
+    LINKS,
     ROW_OF,
     SCHEMA,
     SCHEMA_VERSION,
@@ -152,16 +153,14 @@ class LedgerReader(Database):
         return [_shot_row(row) for row in self._rows("SELECT * FROM shots ORDER BY idx")]
 
     def shot(self, index: int) -> ShotRow | None:
-        rows = self._rows("SELECT * FROM shots WHERE idx = ?", index)
-        return _shot_row(rows[0]) if rows else None
+        return self._one(_shot_row, "SELECT * FROM shots WHERE idx = ?", index)
 
     def frames(self) -> list[Frame]:
         """All safe frames, by index."""
         return [Frame(*row) for row in self._rows("SELECT * FROM frames ORDER BY idx")]
 
     def frame(self, index: int) -> Frame | None:
-        rows = self._rows("SELECT * FROM frames WHERE idx = ?", index)
-        return Frame(*rows[0]) if rows else None
+        return self._one(lambda row: Frame(*row), "SELECT * FROM frames WHERE idx = ?", index)
 
     def companions(self) -> list[Frame]:
         """Files beside frames, such as the JPEG of a raw frame; each has the index of its frame."""
@@ -186,15 +185,13 @@ class LedgerReader(Database):
         return {index: self._load(Pose, text) for index, text in self._rows("SELECT idx, record FROM poses")}
 
     def pose(self, index: int) -> Pose | None:
-        rows = self._rows("SELECT record FROM poses WHERE idx = ?", index)
-        return self._load(Pose, rows[0][0]) if rows else None
+        return self._record(Pose, "SELECT record FROM poses WHERE idx = ?", index)
 
     def tags(self) -> dict[int, Tag]:
         return {index: self._load(Tag, text) for index, text in self._rows("SELECT idx, record FROM tags")}
 
     def tag(self, index: int) -> Tag | None:
-        rows = self._rows("SELECT record FROM tags WHERE idx = ?", index)
-        return self._load(Tag, rows[0][0]) if rows else None
+        return self._record(Tag, "SELECT record FROM tags WHERE idx = ?", index)
 
     def results(self, run: str = "live") -> dict[int, Result]:
         """The decoding results of one run, by index."""
@@ -202,8 +199,7 @@ class LedgerReader(Database):
         return {result.index: result for result in (self._load(Result, row[0]) for row in rows)}
 
     def result(self, index: int, run: str = "live") -> Result | None:
-        rows = self._rows("SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
-        return self._load(Result, rows[0][0]) if rows else None
+        return self._record(Result, "SELECT record FROM results WHERE idx = ? AND run = ?", index, run)
 
     def runs(self) -> dict[str, int]:
         """The number of results of each run; "live" is the flight itself."""
@@ -224,8 +220,7 @@ class LedgerReader(Database):
 
     def last_link(self) -> ChainLink | None:
         """The head of the chain. Raises FlightError."""
-        rows = self._rows("SELECT number, subject, key, sha256, link FROM chain ORDER BY number DESC LIMIT 1")
-        return ChainLink(*rows[0]) if rows else None
+        return self._one(lambda row: ChainLink(*row), f"{LINKS} ORDER BY number DESC LIMIT 1")
 
     def events(self) -> list[LedgerEvent]:
         return [LedgerEvent(*row) for row in self._rows("SELECT * FROM events ORDER BY number")]
@@ -236,8 +231,7 @@ class LedgerReader(Database):
 
     def fact(self, kind: type[_Record], name: str) -> _Record | None:
         """One of these values; None where there is none. Raises FlightError for one of another kind."""
-        rows = self._rows("SELECT value FROM facts WHERE key = ?", name)
-        return self._load(kind, rows[0][0]) if rows else None
+        return self._record(kind, "SELECT value FROM facts WHERE key = ?", name)
 
     def began_utc_ns(self) -> int | None:
         """When the flight began, by the machine's clock."""
@@ -257,6 +251,14 @@ class LedgerReader(Database):
         """The ledger as one file would hold it now, what stands in its write-ahead log included."""
         with self._lock, self._speaking():
             return self._db.serialize()
+
+    def _one(self, read: Callable[[Sequence[Any]], _Record], sql: str, *values: object) -> _Record | None:
+        """The first row, read; None where there is none."""
+        return next((read(row) for row in self._rows(sql, *values)), None)
+
+    def _record(self, kind: type[_Record], sql: str, *values: object) -> _Record | None:
+        """The record in the first row; None where there is none."""
+        return self._one(lambda row: self._load(kind, row[0]), sql, *values)
 
     def _load(self, kind: type[_Record], text: str) -> _Record:
         try:
@@ -319,16 +321,8 @@ class Ledger(LedgerReader):
         with self._transaction():
             if self.shot(shot.index) is not None:
                 raise FlightError(f"shot {shot.index} is in the ledger {self.path} already")
-            cause = shot.cause
-            values = (
-                shot.index,
-                cause.source,
-                cause.kind,
-                cause.sequence,
-                shot.wished_utc_ns,
-                shot.wished_monotonic_ns,
-            )
-            self._insert("shots", (shot.index,), *values, "wished", None, None, None)
+            values = (shot.index, *astuple(shot.cause), shot.wished_utc_ns, shot.wished_monotonic_ns)
+            self._insert("shots", *values, "wished", None, None, None)
 
     def fired(self, index: int, called_monotonic_ns: int, returned_monotonic_ns: int) -> None:
         """Note that the trigger call was made between these times."""
@@ -348,9 +342,7 @@ class Ledger(LedgerReader):
         """Acknowledge a frame whose bytes and name are durable."""
         with self._transaction():
             before = self._advance(frame.index, "safe")
-            one = frame
-            values = (one.index, one.name, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
-            self._insert("frames", (frame.index,), *values)
+            self._insert("frames", *astuple(frame))
             if before == "failed":
                 late = finding(Code.FRAME_LATE, FRAME, file=frame.camera_name)
                 self._event("late", late, frame.index)
@@ -363,16 +355,14 @@ class Ledger(LedgerReader):
     def add_companion(self, companion: Frame) -> None:
         """Add a file beside a frame; it is durable under its name."""
         with self._transaction():
-            one = companion
-            values = (one.name, one.index, one.camera_name, one.size, one.sha256, one.arrived_utc_ns)
-            self._insert("companions", (one.name,), *values)
+            index, name, *others = astuple(companion)
+            self._insert("companions", name, index, *others)
 
     def add_stray(self, stray: Stray) -> None:
         """Add a file that belongs to no shot, or is a second one; it is durable under its name."""
         with self._transaction():
             why = "" if stray.reason is None else findings.json_text(stray.reason)
-            values = (stray.name, stray.camera_name, stray.size, stray.sha256, stray.arrived_utc_ns, why)
-            self._insert("strays", (stray.name,), *values)
+            self._insert("strays", *astuple(replace(stray, reason=None))[:-1], why)
             if stray.reason is not None:
                 self._event("stray", stray.reason, None)
 
@@ -380,13 +370,12 @@ class Ledger(LedgerReader):
         """Add a frame's tag and, with a digest of its own, the pose in it."""
         with self._transaction():
             for table, record in (("poses", tag.pose), ("tags", tag)):
-                self._insert(table, (tag.index,), tag.index, digest(record), canonical(record).decode())
+                self._insert(table, tag.index, digest(record), canonical(record).decode())
 
     def add_result(self, result: Result) -> None:
         """Add the result of decoding a frame; once for each run."""
         with self._transaction():
-            values = (result.index, result.run, result.slices_sha256, canonical(result).decode())
-            self._insert("results", (result.index, result.run), *values)
+            self._insert("results", result.index, result.run, result.slices_sha256, canonical(result).decode())
 
     def add_event(self, kind: str, found: Finding, index: int | None = None) -> None:
         with self._transaction():
@@ -402,8 +391,7 @@ class Ledger(LedgerReader):
         with self._transaction():
             for table, some in rows.items():
                 for row in some:
-                    marks = ", ".join("?" * len(row))
-                    self._db.execute(f"INSERT OR REPLACE INTO {table} VALUES ({marks})", row)  # noqa: S608  our own names
+                    self._put(table, row, "INSERT OR REPLACE")
             self._event("brought home", found, None)
 
     def fold(self) -> None:
@@ -416,19 +404,20 @@ class Ledger(LedgerReader):
             )
 
     def _fact(self, key: str, value: object) -> None:
-        self._insert("facts", (key,), key, canonical(value).decode())
+        self._insert("facts", key, canonical(value).decode())
 
     def _event(self, kind: str, found: Finding, index: int | None) -> None:
         values = (self._clock.utc_ns(), kind, index, findings.json_text(found))
         row = self._db.execute("INSERT INTO events (utc_ns, kind, idx, text) VALUES (?, ?, ?, ?)", values)
         self._written["events", (row.lastrowid,)] = None
 
-    def _insert(self, table: str, key: tuple[Column, ...], *values: Column) -> None:
-        """Add a row; only a fact may replace an earlier one."""
-        verb = "INSERT OR REPLACE" if table == "facts" else "INSERT"
-        marks = ", ".join("?" * len(values))
-        self._db.execute(f"{verb} INTO {table} VALUES ({marks})", values)
-        self._written[table, key] = None
+    def _insert(self, table: str, *values: Column) -> None:
+        """Add a row, whose key stands first; only a fact may replace an earlier one."""
+        self._put(table, values, "INSERT OR REPLACE" if table == "facts" else "INSERT")
+        self._written[table, values[: len(KEYS[table])]] = None
+
+    def _put(self, table: str, values: Sequence[Column], verb: str) -> None:
+        self._db.execute(f"{verb} INTO {table} VALUES ({', '.join('?' * len(values))})", values)
 
     def _end(self, index: int, kind: str, why: Finding) -> None:
         self._advance(index, "failed", findings.json_text(why))
@@ -474,8 +463,7 @@ class Ledger(LedgerReader):
 
     def _link(self, last: ChainLink | None, subject: str, key: Sequence[Column], sha256: str) -> ChainLink:
         link = chain.follow(last, subject, chain.json_array(key), sha256)
-        values = (link.number, link.subject, link.key, link.sha256, link.link)
-        self._db.execute("INSERT INTO chain VALUES (?, ?, ?, ?, ?)", values)
+        self._put("chain", astuple(link), "INSERT")
         return link
 
     def _set_up(self) -> None:

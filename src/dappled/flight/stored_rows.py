@@ -8,7 +8,7 @@ from pathlib import Path
 from dappled.flight.chain import ChainLink, Column
 from dappled.flight.errors import FlightError
 from dappled.flight.ledger import LedgerReader
-from dappled.flight.tables import ROW_OF
+from dappled.flight.tables import LINKS, ROW_OF
 
 StoredRow = tuple[Column, ...]
 
@@ -39,12 +39,11 @@ class StoredRows(LedgerReader):
 
     def links(self) -> list[StoredRow]:
         """The chain: (number, subject, key, sha256, link)."""
-        return self._rows("SELECT number, subject, key, sha256, link FROM chain ORDER BY number")
+        return self._rows(f"{LINKS} ORDER BY number")
 
     def link(self, number: int) -> ChainLink | None:
         """One link of the chain."""
-        rows = self._rows("SELECT number, subject, key, sha256, link FROM chain WHERE number = ?", number)
-        return ChainLink(*rows[0]) if rows else None
+        return self._one(lambda row: ChainLink(*row), f"{LINKS} WHERE number = ?", number)
 
     def written_after(self, number: int) -> dict[str, list[StoredRow]]:
         """The rows that have a link after this one, by table, and those links."""

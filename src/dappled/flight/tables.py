@@ -63,6 +63,7 @@ ROW_OF = {  # SQL that reads one row by its key
     table: f"SELECT * FROM {table} WHERE {' AND '.join(f'{column} = ?' for column in key)}"  # noqa: S608  constants
     for table, key in KEYS.items()
 }
+LINKS = "SELECT number, subject, key, sha256, link FROM chain"
 CHANGED_LATER = frozenset({"shots", "facts"})  # tables whose rows are updated; rows of the others stay as they are
 TELEMETRY = "telemetry.tlog"  # the subject of its blocks
 DEFINITIONS = "sqlite_master"  # the subject of the tables' own definitions

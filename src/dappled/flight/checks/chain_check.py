@@ -1,16 +1,21 @@
-"""Compare every row of a ledger with the ledger's hash chain."""
+"""Compare every row of a ledger, and every block of the telemetry log, with the ledger's hash chain."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from dappled import durable
+from dappled.bounds.parsing import check_stored
 from dappled.findings import Code, Finding, Level, Subject, Value, finding
 from dappled.flight import chain
 from dappled.flight.chain import ChainLink, Column
-from dappled.flight.errors import FlightError
+from dappled.flight.errors import FlightError, disk_errors
 from dappled.flight.stored_rows import StoredRow, StoredRows
-from dappled.flight.tables import CHANGED_LATER, DEFINITIONS, KEYS
+from dappled.flight.tables import CHANGED_LATER, DEFINITIONS, KEYS, TELEMETRY
 
 CHAIN = Subject("chain")
 
@@ -44,6 +49,25 @@ def compare(stored: StoredRows) -> ChainFindings:
         except FlightError as error:
             problems.append(finding(Code.LEDGER_ROWS_UNREAD, Subject("table", table), table=table, why=error))
     return ChainFindings({link.number: link for link in links}, tuple(problems))
+
+
+def compare_log(path: Path, links: Mapping[int, ChainLink]) -> Iterator[Finding]:
+    """The blocks of the telemetry log that differ from their links. Raises FlightError when it can't be read."""
+    blocks = [link for link in links.values() if link.subject == TELEMETRY]
+    if not blocks:
+        return
+    about = Subject("file", path.name)
+    with disk_errors("read the telemetry", path):
+        try:
+            with open(path, "rb", opener=durable.plain_file) as file:
+                size = check_stored(file.fileno())
+                for link in blocks:
+                    start, end = _range(link.key)
+                    file.seek(min(start, size))
+                    if hashlib.sha256(file.read(min(end, size) - min(start, size))).hexdigest() != link.sha256:
+                        yield finding(Code.TELEMETRY_BLOCK_CHANGED, about, name=path.name, start=start, end=end)
+        except FileNotFoundError:
+            yield finding(Code.TELEMETRY_BLOCKS_MISSING, about, name=path.name, blocks=len(blocks))
 
 
 def _broken(links: Sequence[ChainLink]) -> Iterator[Finding]:
@@ -88,3 +112,13 @@ def _row(code: Code, what: str, name: str) -> Finding:
 def _shown(name: str) -> str:
     """A key for a sentence: without its brackets, and printable."""
     return str(name)[1:-1].encode("utf-8", "backslashreplace").decode()
+
+
+def _range(key: str) -> tuple[int, int]:
+    """First byte and end of a block; an empty one where the link was damaged, which its chain tells."""
+    try:
+        start, end = json.loads(key)
+    except (ValueError, TypeError, RecursionError):
+        return 0, 0
+    whole = type(start) is int and type(end) is int and 0 <= start <= end
+    return (start, end) if whole else (0, 0)

@@ -14,7 +14,7 @@ from dappled.confined import OutsideError
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, Value, above_note, finding
 from dappled.flight import layout, log_reading, provenance, pruning, seals
-from dappled.flight.checks import chain_check, place_check, seal_check, telemetry_check
+from dappled.flight.checks import chain_check, place_check, seal_check
 from dappled.flight.checks.chain_check import ChainFindings
 from dappled.flight.checks.place_check import PlaceFindings
 from dappled.flight.checks.seal_check import LedgerBytes, SealFindings, Vouched
@@ -82,7 +82,7 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
                 known = frozenset(row.name for row in ledger.files())
                 _compare(folder, ledger, counts, found)
                 with _examining("the telemetry", found):
-                    found += telemetry_check.compare(folder.telemetry, chained.links)
+                    found += chain_check.compare_log(folder.telemetry, chained.links)
                 with _examining("the seals", found):
                     sealed = seal_check.compare(folder, ledger, chained.links, before, key)
     found += [*sealed.problems, *sealed.notes]
