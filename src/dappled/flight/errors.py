@@ -39,6 +39,8 @@ _REMEDIES = {
 def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
     """The sentence for an operating system error: "cannot <doing> <path>: <why>; <what to do>"."""
     number = error.errno or 0
+    if number == errno.ENOTDIR and path.is_symlink():
+        number = errno.ELOOP  # what O_DIRECTORY says of a link
     why = _REMEDIES.get(number) or f"{os.strerror(number) if number else error}; check the disk"
     if isinstance(error, durable.NoPlainFileError):
         why = str(error.strerror)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from dappled import durable
@@ -79,28 +79,24 @@ def offload(
         system = places.file_system(there.folders[""])
         if prune:
             _refuse_unprovable(there, there.path, same_device=same_device)
-        return _Copying(folder, source, there, system).run(names, prune=prune, clock=clock, key=key, progress=progress)
+        copying = _Copying(folder, source, there)
+        copying.copy(names, progress, anew=prune and system in places.NETWORK)
+        done = copying.outcome(system)
+        return copying.prune(done, clock, key) if prune else done
 
 
 class _Copying:
     """One offload, between two open folders."""
 
-    def __init__(self, folder: FlightFolder, source: Tree, there: Tree, system: str) -> None:
-        self._folder, self._source, self._there, self._system = folder, source, there, system
-        self._proved: dict[str, Proved] = {}  # what the copy has by now
+    def __init__(self, folder: FlightFolder, source: Tree, there: Tree) -> None:
+        self._folder, self._source, self._there = folder, source, there
+        self._proved: dict[str, Proved] = {}  # what the copy has by now of what is here
+        self._elsewhere: dict[str, Proved] = {}  # and what it alone has
+        self._added = Added({}, {}, {}, seals=False)
 
-    def run(
-        self,
-        names: list[str],
-        *,
-        prune: bool,
-        clock: Clock,
-        key: SealKey | None,
-        progress: Callable[[int], object],
-    ) -> Offloaded:
-        """Copy, read back, make durable, check, and remove; see `offload`."""
-        # What stands on another machine can't be told apart from the source: it is written anew, which shows.
-        anew = prune and self._system in places.NETWORK
+    def copy(self, names: list[str], progress: Callable[[int], object], *, anew: bool) -> None:
+        """Copy, read back, make durable, and check. `anew`: what stands on another machine can't be told apart from the
+        source, so it is written anew, which shows."""
         seal_lines = SealLines(self._source, self._there, self._folder.seals.name)
         for name in names:
             self._proved[name] = self._bring(name, seal_lines, anew=anew and seals.never_changes(name))
@@ -110,38 +106,38 @@ class _Copying:
         self._unmark()
         self._there.sync_above()
         rows = self._acknowledged()
-        elsewhere = self._prove_elsewhere(rows)
+        self._elsewhere = self._prove_elsewhere(rows)
         files = later_copy.written_by_work(self._there) if later or seal_lines.copy_is_later else {}
         self._check()
-        frames = {name: one for name, one in elsewhere.items() if name not in rows}
-        added = Added(later, frames, files, seal_lines.copy_is_later)
-        _write_sums(self._there, {**self._proved, **elsewhere})
+        frames = {name: one for name, one in self._elsewhere.items() if name not in rows}
+        self._added = Added(later, frames, files, seal_lines.copy_is_later)
+        self._write_sums()
+
+    def outcome(self, system: str) -> Offloaded:
+        """What was copied, and what this copy can't prove."""
         ways = tuple(sorted({one.how for one in self._proved.values()}))
-        doubts = tuple(_doubts(self._there.path, self._system, ways))
+        doubts = tuple(_doubts(self._there.path, system, ways))
         size = sum(one.identity.size for one in self._proved.values())
         copied = len(self._proved.keys() & self._there.written)
         already = len(self._proved) - copied
-        pruned = 0
-        if prune:
-            if "page cache" in ways:
-                raise FlightError(
-                    f"{told(doubts[0])}: nothing was removed; offload without --prune, or to another disk"
-                )
-            sure = {
-                name: self._proved[name]
-                for name, row in rows.items()
-                if name.startswith("frames/") and name in self._proved and self._proved[name].sha256 == row.sha256
-            }
-            if sure:
-                self._write_down(sure, added, clock=clock, key=key)
-                _write_sums(self._there, {**self._proved, **elsewhere})
-                pruned = pruning.remove(self._source, self._there, sure)
-            else:
-                self._source.remove_part(pruning.RECORD)  # of an attempt that was cut short
-        brought = added.count if pruned else 0
-        return Offloaded(
-            self._folder.name, self._there.path, copied, already, size, pruned, brought, self._system, ways, doubts
-        )
+        return Offloaded(self._folder.name, self._there.path, copied, already, size, 0, 0, system, ways, doubts)
+
+    def prune(self, done: Offloaded, clock: Clock, key: SealKey | None) -> Offloaded:
+        """Remove what was copied and is in a row of the ledger, once it is written down and sealed; see `offload`."""
+        if "page cache" in done.read_back:
+            raise FlightError(
+                f"{told(done.doubts[0])}: nothing was removed; offload without --prune, or to another disk"
+            )
+        proved = {name: one for name, one in self._proved.items() if name.startswith("frames/")}
+        rows = self._acknowledged()
+        sure = {name: one for name, one in proved.items() if name in rows and one.sha256 == rows[name].sha256}
+        if not sure:
+            self._source.remove_part(pruning.RECORD)  # of an attempt that was cut short
+            return done
+        self._write_down(sure, clock, key)
+        self._write_sums()
+        pruned = pruning.remove(self._source, self._there, sure)
+        return replace(done, pruned=pruned, brought_home=self._added.count)
 
     def _bring(self, name: str, seal_lines: SealLines, *, anew: bool) -> Proved:
         """Copy a file, or prove that the copy has it. Of one that later work wrote anew the later one counts. `anew`:
@@ -170,7 +166,7 @@ class _Copying:
         self._proved |= SealLines(self._source, self._there, seal_file).bring()
         return later
 
-    def _write_down(self, sure: Mapping[str, Proved], added: Added, *, clock: Clock, key: SealKey | None) -> None:
+    def _write_down(self, sure: Mapping[str, Proved], clock: Clock, key: SealKey | None) -> None:
         """Before anything is removed: bring home what was added at the copy, write down what will go, seal the flight
         here, and bring the copy its ledger again, so that work there goes on from it. Raises FlightError."""
         for name in (self._folder.ledger.name, self._folder.seals.name):
@@ -179,6 +175,7 @@ class _Copying:
                 raise FlightError(
                     f"{self._there.path / name} changed while it was checked: nothing was removed; try again"
                 )
+        added = self._added
         both = [self._folder, *([FlightFolder(self._there.path)] if added else [])]
         signs = key if key is not None and all(seals.standing(one).signed_by(key) for one in both) else None
         if added:
@@ -236,6 +233,14 @@ class _Copying:
             wrong = f"{self._there.path / name} differs from what the ledger says: nothing was removed"
             proved[name] = prove(self._there, name, row.sha256, wrong)
         return proved
+
+    def _write_sums(self) -> None:
+        """Write the manifest beside the copy, as `sha256sum --check` reads it. Raises FlightError."""
+        copy = self._there.path
+        path, manifest = copy.with_name(f"{copy.name}.sha256"), {**self._proved, **self._elsewhere}
+        lines = [_sum(one.sha256, f"{copy.name}/{name}") for name, one in sorted(manifest.items())]
+        with disk_errors("write", path):
+            durable.write_file(path, b"".join(lines))
 
     def _check(self) -> None:
         found = flight_check.check(self._there.path)
@@ -337,14 +342,6 @@ def _doubts(there: Path, system: str, ways: tuple[ReadBack, ...]) -> list[Findin
     elif system not in places.KEEPS_FSYNC:
         found.append(finding(Code.COPY_MAY_NOT_LAST, copy, system=system))
     return found
-
-
-def _write_sums(there: Tree, manifest: Mapping[str, Proved]) -> None:
-    """Write the manifest beside the copy, as `sha256sum --check` reads it. Raises FlightError."""
-    path = there.path.with_name(f"{there.path.name}.sha256")
-    lines = [_sum(one.sha256, f"{there.path.name}/{name}") for name, one in sorted(manifest.items())]
-    with disk_errors("write", path):
-        durable.write_file(path, b"".join(lines))
 
 
 def _sum(sha256: str, name: str) -> bytes:

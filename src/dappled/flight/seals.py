@@ -16,7 +16,6 @@ from enum import StrEnum
 from pathlib import Path
 
 from dappled import codec, durable, file_lock
-from dappled.bounds.claims import ClaimError
 from dappled.bounds.parsing import read_log
 from dappled.clock import Clock
 from dappled.codec import canonical
@@ -303,8 +302,6 @@ def _content(folder: FlightFolder) -> bytes:
         return read_log(folder.seals)
     except FileNotFoundError:
         return b""
-    except ClaimError as error:
-        raise FlightError(f"{folder.seals} can't be read: {error}") from error
 
 
 def _last_digest(content: bytes) -> str:

@@ -7,7 +7,6 @@ stays with its folder.
 from __future__ import annotations
 
 import contextlib
-import errno
 import os
 import stat
 from collections.abc import Iterable, Iterator
@@ -18,7 +17,7 @@ from typing import Self
 
 from dappled import durable
 from dappled.closing import Closing
-from dappled.flight.errors import FlightError, disk_error
+from dappled.flight.errors import FlightError, disk_errors
 
 _CLOEXEC, _HERE, _NONBLOCK = (getattr(os, name, 0) for name in ("O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK"))
 """Flags that Windows lacks. It has no `dir_fd` either: a Tree can't be opened there, but light fields can be read."""
@@ -56,7 +55,7 @@ class Tree(Closing):
         self.path = path
         self.written: set[str] = set()
         self._folders: dict[str, int] = {}
-        with self._saying("open", ""):
+        with disk_errors("open", self.path):
             self._folders[""] = os.open(path, _FOLDER)
 
     def close(self) -> None:
@@ -74,7 +73,7 @@ class Tree(Closing):
         if name in self._folders:
             return
         parent, last = self._at(name)
-        with self._saying("open the folder", name):
+        with disk_errors("open the folder", self.path / name):
             if make:
                 with contextlib.suppress(FileExistsError):
                     os.mkdir(last, 0o750, dir_fd=parent)
@@ -87,7 +86,7 @@ class Tree(Closing):
         todo = [""]
         while todo:
             folder = todo.pop(0)
-            with self._saying("list", folder):
+            with disk_errors("list", self.path / folder):
                 entries = sorted(os.scandir(self._folders[folder]), key=lambda entry: entry.name)
             for entry in entries:
                 name = f"{folder}/{entry.name}" if folder else entry.name
@@ -108,7 +107,7 @@ class Tree(Closing):
         """A file's descriptor, open for reading. Raises FlightError, also for what is no file, and for an OSError or
         EOFError in the block."""
         parent, last = self._at(name)
-        with self._saying("read", name):
+        with disk_errors("read", self.path / name):
             fd = os.open(last, _READ, dir_fd=parent)
             try:
                 if not stat.S_ISREG(os.fstat(fd).st_mode):
@@ -123,7 +122,7 @@ class Tree(Closing):
     def stat(self, name: str) -> os.stat_result | None:
         """What stands under a name, a link itself; None where there is nothing. Raises FlightError."""
         parent, last = self._at(name)
-        with self._saying("look at", name):
+        with disk_errors("look at", self.path / name):
             try:
                 return os.stat(last, dir_fd=parent, follow_symlinks=False)
             except FileNotFoundError:
@@ -137,26 +136,26 @@ class Tree(Closing):
             for piece in pieces:
                 durable.write_all(fd, piece)
 
-        with self._saying("write", name):
+        with disk_errors("write", self.path / name):
             durable.fill_file(Path(last), fill, folder=parent)
         self.written.add(name)
 
     def remove_part(self, name: str) -> None:
         """Remove what an attempt to write a file left half-written, if there is something. Raises FlightError."""
         parent, last = self._at(name)
-        with self._saying("remove the half-written", name), contextlib.suppress(FileNotFoundError):
+        with disk_errors("remove the half-written", self.path / name), contextlib.suppress(FileNotFoundError):
             os.unlink(durable.temporary(Path(last)).name, dir_fd=parent)
 
     def unlink(self, name: str) -> None:
         """Remove a file. Raises FlightError."""
         parent, last = self._at(name)
-        with self._saying("remove", name):
+        with disk_errors("remove", self.path / name):
             os.unlink(last, dir_fd=parent)
 
     def sync(self) -> None:
         """fsync every open folder, the inner ones first. Raises FlightError."""
         for name in sorted(self._folders, reverse=True):
-            with self._saying("sync", name):
+            with disk_errors("sync", self.path / name):
                 os.fsync(self._folders[name])
 
     def sync_above(self) -> None:
@@ -165,7 +164,7 @@ class Tree(Closing):
         for fd in self.above():
             if os.fstat(fd).st_dev != device:
                 break
-            with self._saying("sync a folder above", ""):
+            with disk_errors("sync a folder above", self.path):
                 os.fsync(fd)
 
     def above(self) -> Iterator[int]:
@@ -175,7 +174,7 @@ class Tree(Closing):
             while True:
                 here = os.fstat(fd)
                 try:
-                    with self._saying("open a folder above", ""):
+                    with disk_errors("open a folder above", self.path):
                         upper = os.open("..", _FOLDER, dir_fd=fd)
                 except FlightError as error:
                     if isinstance(error.__cause__, PermissionError):
@@ -193,13 +192,3 @@ class Tree(Closing):
         """(descriptor of the folder, last part) of a name."""
         folder, _, last = name.rpartition("/")
         return self._folders[folder], last
-
-    @contextmanager
-    def _saying(self, doing: str, name: str) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            where = self.path / name
-            if error.errno == errno.ENOTDIR and where.is_symlink():
-                error.errno = errno.ELOOP  # what O_DIRECTORY says of a link
-            raise disk_error(doing, where, error) from error

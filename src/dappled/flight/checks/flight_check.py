@@ -64,7 +64,7 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
     folder = layout.open_folder(path)
     found: list[Finding] = []
     counts = _Counts()
-    sealed = SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), (), ())
+    sealed = SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL))
     with _examining("flight.toml", found):
         layout.read_facts(folder)
     place = PlaceFindings()
@@ -85,7 +85,7 @@ def check(path: Path, key: SealKey | None = None) -> CheckReport:
                     found += chain_check.compare_log(folder.telemetry, chained.links)
                 with _examining("the seals", found):
                     sealed = seal_check.compare(folder, ledger, chained.links, before, key)
-    found += [*sealed.problems, *sealed.notes]
+    found += sealed.found
     found += place_check.compare(place, folder, recorded_as, known, closed=closed, at_work=sealed.unsealed > 0)
     return CheckReport(
         flight=folder.name,

@@ -39,13 +39,12 @@ class LedgerBytes:
 
 @dataclass(frozen=True, slots=True)
 class SealFindings:
-    """What the seals show. `verdict` says what they vouch for where nothing is wrong; `unsealed` counts the links of
-    the chain after the newest seal."""
+    """What the seals show: `found`, problems and notes. `verdict` says what they vouch for where nothing is wrong;
+    `unsealed` counts the links of the chain after the newest seal."""
 
     vouched: Vouched
     verdict: Finding
-    problems: tuple[Finding, ...]
-    notes: tuple[Finding, ...]
+    found: tuple[Finding, ...] = ()
     unsealed: int = 0
 
 
@@ -59,27 +58,23 @@ def compare(
     """Compare seals, chain and files. `links` is the chain; `key` verifies signatures. Raises
     FlightError and OSError."""
     file, facts = seals.read(folder), ledger.facts()
-    problems = [*file.problems, *_numbers(file.seals, links, facts), *_heads(file.seals, links, facts)]
-    problems += [*_signatures(file.seals, key), *_rewritten(file.seals)]
-    notes = [finding(Code.SEAL_UNWRITTEN, SEAL, seal=number) for number in seals.announced(facts)[1]]
-    notes += [
-        finding(Code.SEAL_BY_OWNER, SEAL, seal=number, key=seal.key)
-        for number, seal in file.seals.items()
-        if seal.why == seals.Occasion.OWNER
-    ]
-    notes += [found for event in ledger.events() if event.kind == seals.CHANGED and (found := event.finding)]
+    found = [*file.problems, *_numbers(file.seals, links, facts), *_heads(file.seals, links, facts)]
+    found += [*_signatures(file.seals, key), *_rewritten(file.seals)]
+    found += [finding(Code.SEAL_UNWRITTEN, SEAL, seal=number) for number in seals.announced(facts)[1]]
+    owned = [one for one in file.seals.values() if one.why == seals.Occasion.OWNER]
+    found += [finding(Code.SEAL_BY_OWNER, SEAL, seal=one.seal, key=one.key) for one in owned]
+    found += [told for event in ledger.events() if event.kind == seals.CHANGED and (told := event.finding)]
     last = file.last
     if last is None:
-        return SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), tuple(problems), tuple(notes))
+        return SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), tuple(found))
     unsealed = max(0, len(links) - last.links)
     if unsealed:
-        notes.append(finding(Code.SEAL_UNSEALED, SEAL, seal=last.seal, work=last.why, links=unsealed))
-    for wrong, found in _files(folder, last, provenance.held(ledger), unsealed=unsealed > 0):
-        (problems if wrong else notes).append(replace(found, level=Level.STOP if wrong else Level.NOTE))
+        found.append(finding(Code.SEAL_UNSEALED, SEAL, seal=last.seal, work=last.why, links=unsealed))
+    for wrong, one in _files(folder, last, provenance.held(ledger), unsealed=unsealed > 0):
+        found.append(replace(one, level=Level.STOP if wrong else Level.NOTE))
     if not unsealed:
-        problems += _ledger_file(last, before)
-    vouched, verdict = _verdict(file.seals, last, key, unsealed)
-    return SealFindings(vouched, verdict, tuple(problems), tuple(notes), unsealed)
+        found += _ledger_file(last, before)
+    return SealFindings(*_verdict(file.seals, last, key, unsealed), tuple(found), unsealed)
 
 
 def _numbers(found: Mapping[int, Seal], links: Mapping[int, ChainLink], facts: Mapping[str, Any]) -> Iterator[Finding]:
