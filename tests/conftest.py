@@ -6,6 +6,7 @@ import functools
 import gc
 import os
 import re
+import shutil
 import sys
 import tempfile
 import threading
@@ -146,7 +147,9 @@ def types_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def pytest_configure() -> None:
-    """Processes may be forked from here on."""
+    """Processes may be forked from here on, and have their sockets where no other process of tests, nor a daemon, has
+    its own: a user's daemon holds the camera."""
+    os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="dpl-")
     _forks.install()
 
 
@@ -154,6 +157,7 @@ def pytest_unconfigure(config: pytest.Config) -> None:
     """End the process although a test that failed has left a thread behind: the interpreter would wait for it for ever,
     and so would whoever waits for the tests."""
     _forks.close()
+    shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
     left = [one.name for one in threading.enumerate() if one is not threading.main_thread() and not one.daemon]
     if left and not hasattr(config, "workerinput"):
         print(f"left behind by tests: the threads {', '.join(left)}", file=sys.stderr, flush=True)  # noqa: T201

@@ -126,7 +126,13 @@ def _plain(spec: Field[Any], value: Any) -> Any:
 
 
 def parser(path: str = "") -> CommandParser:
-    """The whole command line. Only the verb of this path, or the verbs of this group, have their arguments."""
+    """The whole command line. Only the verb of this path has its arguments; of other verbs and groups only the line is
+    there that tells of them: to make 50 parsers takes argparse 50 ms."""
+
+    def wanted(**given: Any) -> CommandParser | None:
+        return CommandParser(**given) if f"dappled {path} ".startswith(f"{given['prog']} ") else None
+
+    made: Any = {"parser_class": wanted, "required": True}
     top = CommandParser(
         prog="dappled",
         description="Acquisition daemon for masked light-field cameras that fly.",
@@ -134,16 +140,16 @@ def parser(path: str = "") -> CommandParser:
     )
     top.add_argument("--version", action="version", version=f"dappled {dappled.__version__}")
     top.add_argument("--debug", action="store_true", help="show tracebacks and the log's details")
-    branches = {"": top.add_subparsers(metavar="VERB", required=True)}
+    branches = {"": top.add_subparsers(metavar="VERB", **made)}
     for name, (_, line) in VERBS.items():
         group, _, last = name.rpartition(" ")
         if group not in branches:
             one = branches[""].add_parser(group, **_described(GROUPS[group]))
-            branches[group] = one.add_subparsers(metavar="ACTION", required=True)
+            branches[group] = one and one.add_subparsers(metavar="ACTION", **made)
             if path == group:
                 own = [verb_class(other).examples[0] for other in VERBS if other.startswith(f"{group} ")]
                 one.epilog = _told(own)
-        leaf = branches[group].add_parser(last, **_described(line))
+        leaf: Any = branches[group] and branches[group].add_parser(last, **_described(line))
         if name == path:
             _fill(leaf, verb_class(name))
     return top
