@@ -217,12 +217,17 @@ def _round(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
 def _polygon(blades: int, turn: float) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
     """The transform of a regular polygon of the circle's diameter, turned by a share of a blade: a sum over points."""
     axis = (np.arange(_POINTS) + 0.5) / _POINTS - 0.5
-    y, x = (side.ravel() for side in np.meshgrid(axis, axis, indexing="ij"))
     edges = 2 * np.pi * (np.arange(blades) + turn) / blades
     reach = 0.5 * math.cos(math.pi / blades)
-    inside = np.all(np.outer(np.sin(edges), y) + np.outer(np.cos(edges), x) <= reach, axis=0)
-    points = np.stack([y[inside], x[inside]])
-    return lambda cycles: np.asarray(np.abs(np.exp(2j * np.pi * cycles @ points).mean(axis=1)))
+    across = np.sin(edges)[:, None, None] * axis[:, None] + np.cos(edges)[:, None, None] * axis
+    inside = np.all(across <= reach, axis=0)
+    shares = inside / np.count_nonzero(inside)
+
+    def transform(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+        along_y, along_x = np.exp(2j * np.pi * cycles.T[:, :, None] * axis)
+        return np.asarray(np.abs(((along_y @ shares) * along_x).sum(axis=1)))
+
+    return transform
 
 
 def _square(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
