@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.optics import Lattice, Order
-from dappled.decode.picture.blocks import PatternPlace
+from dappled.decode.picture.blocks import PatternPlace, plane_waves
 
 Coefficients = NDArray[np.complex128]
 # Chosen by hand where no figure stands beside a number; tests/decode/picture measures what all of them together make.
@@ -74,13 +74,12 @@ def shadow_at(
     pixel, with coefficients (K,) or (K, terms)."""
     rows, columns = place.at(shape)
     terms = coefficients.reshape(len(frequencies), -1)
-    down = 2 * np.exp(2j * np.pi * np.outer(rows, frequencies[:, 0]))
-    across = np.exp(2j * np.pi * np.outer(columns, frequencies[:, 1]))
+    down, across = 2 * plane_waves(rows, -frequencies[:, 0]), plane_waves(columns, -frequencies[:, 1])
     y, x = (legvander(at / (side / 2), degree) for at, side in zip((rows, columns), shape, strict=True))
     made = np.ones((len(rows), len(columns)), dtype=np.float32)
     powers = _powers(degree)
     for b in range(degree + 1):
-        wave = np.zeros_like(down)
+        wave = np.zeros(down.shape, dtype=np.complex128)
         for term, (a, other) in enumerate(powers):
             if other == b:
                 wave += down * terms[:, term] * y[:, a, None]
