@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import mmap
 import threading
+import weakref
 from typing import Any, cast
 
 import jsonschema
@@ -198,6 +200,19 @@ def test_who_begins_to_look_at_pictures_gets_that_of_the_newest_frame_without_a_
     eventually(lambda: bench.published, "it is published")
     bench.pictures.stop()
     assert [facts["frame"] for _, facts, _ in bench.published] == [4], "once"
+
+
+def test_slices_are_not_kept_for_a_picture_that_nobody_has_asked_for(bench: Bench) -> None:
+    one = shot(3)
+    assert one.decoded is not None
+    slices = weakref.ref(one.decoded.body)
+    bench.pictures.offer(one)
+    del one
+    gc.collect()
+    assert slices() is None
+    bench.viewers.add("picture")
+    bench.pictures.look()
+    eventually(lambda: bench.published, "the frame was kept all the same")
 
 
 def test_a_picture_is_made_only_while_somebody_has_subscribed_to_it_and_as_the_schema_says(bench: Bench) -> None:

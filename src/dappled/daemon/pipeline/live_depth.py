@@ -6,12 +6,11 @@ from collections.abc import Callable
 
 from dappled import codec
 from dappled.daemon.pipeline.capture import PendingShots
-from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess
+from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import FlightWriter
-from dappled.daemon.pipeline.occasional import Occasional
+from dappled.daemon.pipeline.occasional import FinishedFrame, Occasional
 from dappled.daemon.stream import wire
 from dappled.daemon.stream.publisher import Stream
-from dappled.flight import Tag
 
 
 class LiveDepth(Occasional):
@@ -34,8 +33,9 @@ class LiveDepth(Occasional):
         super().__init__(maker, writer, shots, publisher, interval_s=interval_s)
         self._method, self._nearest = method, nearest
 
-    def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:
-        found = self._maker.depth(path, tag.focal_length_mm, tag.f_number, self._method)
+    def _make(self, one: FinishedFrame) -> None:
+        tag = one.tag
+        found = self._maker.depth(one.path, tag.focal_length_mm, tag.f_number, self._method)
         header = {
             **wire.frame_facts(tag, found.law),
             "method": self._method,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from dappled import codec
-from dappled.daemon.pipeline.decode_process import DecodedFrame
-from dappled.daemon.pipeline.occasional import Occasional
+from dappled.daemon.pipeline.occasional import FinishedFrame, Occasional
 from dappled.daemon.stream import wire
-from dappled.flight import Tag
 
 
 class LivePictures(Occasional):
@@ -17,10 +15,11 @@ class LivePictures(Occasional):
     def _wanted(self) -> bool:
         return self._publisher.wanted(self.topic)
 
-    def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:
-        made = self._maker.picture(path, tag.focal_length_mm, tag.f_number)
+    def _make(self, one: FinishedFrame) -> None:
+        tag = one.tag
+        made = self._maker.picture(one.path, tag.focal_length_mm, tag.f_number)
         header = {
-            **wire.frame_facts(tag, decoded.law),
+            **wire.frame_facts(tag, one.law),
             "media_type": "image/jpeg",
             "width": made.size[0],
             "height": made.size[1],

@@ -4,14 +4,23 @@ from __future__ import annotations
 
 import threading
 from abc import ABC, abstractmethod
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 from dappled.daemon.pipeline.capture import PendingShot, PendingShots
-from dappled.daemon.pipeline.decode_process import DecodedFrame, DecodeProcess
+from dappled.daemon.pipeline.decode_process import DecodeProcess
 from dappled.daemon.pipeline.flight_writer import FlightWriter
 from dappled.daemon.stream.publisher import Stream
 from dappled.flight import Tag
 from dappled.workers import OneThread, Worker
+
+
+class FinishedFrame(NamedTuple):
+    """What is kept of a frame until something is made of it: where its file is, its tag, and the law it was decoded by.
+    Not its slices, which are as large as the frame."""
+
+    path: str
+    tag: Tag
+    law: str
 
 
 class Occasional(OneThread, ABC):
@@ -36,9 +45,9 @@ class Occasional(OneThread, ABC):
         self._maker, self._writer, self._shots, self._publisher = maker, writer, shots, publisher
         self._interval_s, self._clock = interval_s, shots.clock
         self._last_ns: int | None = None
-        self._unseen: PendingShot | None = None  # the newest frame, since when nobody would have seen what is made
+        self._unseen: FinishedFrame | None = None  # the newest frame, since when nobody would have seen what is made
         self._choosing = threading.Lock()
-        self._worker: Worker[PendingShot] = Worker(
+        self._worker: Worker[FinishedFrame] = Worker(
             self.topic, self._work, capacity=1, policy="drop oldest", clock=self._clock
         )
         self._loop = self._worker
@@ -50,35 +59,33 @@ class Occasional(OneThread, ABC):
 
     def offer(self, pending: PendingShot) -> None:
         """Take a finished frame, if one is due and it was decoded."""
-        if pending.decoded is not None:
-            self._choose(pending)
+        if (decoded := pending.decoded) is not None:
+            assert pending.frame is not None  # a decoded shot has all three
+            assert pending.tag is not None
+            self._choose(FinishedFrame(self._writer.path(pending.frame), pending.tag, decoded.law))
 
     def look(self) -> None:
         """Take the newest frame, if nobody would have seen what is made of it when it came, and somebody does now."""
-        if (pending := self._unseen) is not None:
-            self._choose(pending)
+        if (newest := self._unseen) is not None:
+            self._choose(newest)
 
-    def _choose(self, pending: PendingShot) -> None:
+    def _choose(self, one: FinishedFrame) -> None:
         with self._choosing:
             now_ns, wanted = self._clock.monotonic_ns(), self._wanted()
             due = self._last_ns is None or now_ns - self._last_ns >= round(self._interval_s * 1e9)
             if due and wanted:
                 self._last_ns = now_ns
-                self._worker.put(pending)
-            self._unseen = None if wanted else pending
+                self._worker.put(one)
+            self._unseen = None if wanted else one
 
     def _wanted(self) -> bool:
         """Whether somebody would see what is made."""
         return True
 
-    def _work(self, pending: PendingShot) -> None:
-        frame, tag, decoded = pending.frame, pending.tag, pending.decoded
-        assert frame is not None  # a decoded shot has all three
-        assert tag is not None
-        assert decoded is not None
+    def _work(self, one: FinishedFrame) -> None:
         self._shots.wait_decoded()
-        self._make(self._writer.path(frame), tag, decoded)
+        self._make(one)
 
     @abstractmethod
-    def _make(self, path: str, tag: Tag, decoded: DecodedFrame) -> None:
+    def _make(self, one: FinishedFrame) -> None:
         """Make it of the frame's file, and publish it. Raises DecodeProcessError."""
