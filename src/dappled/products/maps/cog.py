@@ -27,14 +27,19 @@ def display(image: Singles, gain: float) -> NDArray[np.uint8]:
 
     NaN becomes transparent black.
     """
+    colours = image.shape[2]
     known = np.isfinite(image[..., 0])
-    made = np.zeros((*known.shape, image.shape[2] + 1), dtype=np.uint8)
-    for band in range(1, image.shape[2]):
+    made = np.zeros((*known.shape, colours + 1), dtype=np.uint8)
+    for band in range(1, colours):
         known &= np.isfinite(image[..., band])
-    for band in range(image.shape[2]):
-        level = np.clip(image[..., band] * np.float32(gain * _LEVELS), 0, _LEVELS)
-        made[..., band] = _shown()[np.where(known, level, 0).astype(np.uint16)]
-    made[..., -1] = known * np.uint8(255)
+    if not known.any():
+        return made
+    level = image * np.float32(gain * _LEVELS)
+    np.fmax(level, np.float32(0), out=level)  # NaN, too
+    np.minimum(level, np.float32(_LEVELS), out=level)
+    made[..., :colours] = np.take(_shown(), level.astype(np.uint16))
+    made[..., -1] = 255
+    made[~known] = 0
     return made
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import xml.etree.ElementTree as ET
 import zipfile
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from dappled.products.maps.map_grid import MapGrid
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 TILE = 1024
+_STRIP = 32  # rows that are shrunk at a time
 Pixels = NDArray[np.uint8]
 _FOLDER = "tiles/"
 _WHEN = (1980, 1, 1, 0, 0, 0)  # zip's earliest time: the same picture gives the same bytes
@@ -156,7 +158,9 @@ def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
     """Add the picture as PNG to the archive's files; returns its name."""
     mode = "LA" if picture.shape[2] == 2 else "RGBA"
     memory = io.BytesIO()
-    Pictures.fromarray(np.ascontiguousarray(picture), mode).save(memory, "PNG", compress_level=1)
+    Pictures.fromarray(np.ascontiguousarray(picture), mode).save(
+        memory, "PNG", compress_level=1, compress_type=zlib.Z_RLE
+    )
     name = f"{place}.png"
     files[name] = memory.getvalue()
     return name
@@ -167,8 +171,16 @@ def _shrunk(picture: Pixels, step: int) -> Pixels:
     if step == 1:
         return picture
     straight, weighted = ("LA", "La") if picture.shape[2] == 2 else ("RGBA", "RGBa")
-    whole = Pictures.fromarray(np.ascontiguousarray(picture), straight).convert(weighted)
-    return np.asarray(whole.reduce(step).convert(straight), dtype=np.uint8)
+    made = np.zeros((*(-(-side // step) for side in picture.shape[:2]), picture.shape[2]), dtype=np.uint8)
+    for top in range(0, len(made), _STRIP):  # a flight's map is empty for the most part
+        strip = picture[top * step : (top + _STRIP) * step]
+        seen = np.flatnonzero(strip[..., -1].any(axis=0))
+        if seen.size:
+            left, right = seen[0] // step, seen[-1] // step + 1
+            part = np.ascontiguousarray(strip[:, left * step : right * step])
+            reduced = Pictures.fromarray(part, straight).convert(weighted).reduce(step).convert(straight)
+            made[top : top + _STRIP, left:right] = np.asarray(reduced)
+    return made
 
 
 def _zipped(files: dict[str, bytes]) -> bytes:

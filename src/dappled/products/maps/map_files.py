@@ -81,7 +81,8 @@ def _overlay(made: Survey, chosen: Sequence[Photograph], name: str, gain: float)
     grid = overlay_grid(made, chosen)
     picture = np.zeros((*grid.shape, _bands(chosen)), dtype=np.uint8)
     for rows, columns, values in map_grid.pieces(chosen, grid, made.ground, made.projection, made.focus_m):
-        picture[rows, columns] = cog.display(values, gain)
+        if (shown := cog.display(values, gain))[..., -1].any():  # what stays empty takes no memory
+            picture[rows, columns] = shown
     return Overlay(name, picture, grid)
 
 

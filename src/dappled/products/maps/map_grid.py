@@ -303,7 +303,7 @@ def pieces(
     projection: Projection,
     focus_m: float = math.inf,
 ) -> Iterator[tuple[slice, slice, Singles]]:
-    """Yield (rows, columns, float32 (h, w, c)) tiles that cover the grid; NaN where no frame looks.
+    """Yield (rows, columns, float32 (h, w, c)) tiles that cover the grid, to be read alone; NaN where no frame looks.
 
     A frame's weight at a place grows with the distance from its own rim, so that each place is shown by the frame that
     sees it best, with soft seams.
@@ -315,16 +315,17 @@ def pieces(
             rows = slice(top, min(top + _TILE, grid.shape[0]))
             columns = slice(left, min(left + _TILE, grid.shape[1]))
             shape = rows.stop - rows.start, columns.stop - columns.start
+            met = [
+                (one, (_both(down, rows), _both(across, columns)))
+                for one, (down, across) in zip(photographs, boxes, strict=True)
+            ]
+            met = [(one, near) for one, near in met if all(part.start < part.stop for part in near)]
+            if not met:
+                yield rows, columns, np.broadcast_to(np.float32(np.nan), (*shape, colours))
+                continue
             total = np.zeros((*shape, colours), dtype=np.float32)
             weight = np.zeros(shape, dtype=np.float32)
-            for one, box in zip(photographs, boxes, strict=True):
-                down, across = box
-                near = (
-                    slice(max(down.start, top), min(down.stop, rows.stop)),
-                    slice(max(across.start, left), min(across.stop, columns.stop)),
-                )
-                if near[0].start >= near[0].stop or near[1].start >= near[1].stop:
-                    continue
+            for one, near in met:
                 inner = slice(near[0].start - top, near[0].stop - top), slice(near[1].start - left, near[1].stop - left)
                 layers = one.layers(focus_m)
                 for image, eye in layers:
@@ -341,6 +342,11 @@ def pieces(
             with np.errstate(invalid="ignore"):
                 total /= _of_each(weight, colours)  # NaN where none looks
             yield rows, columns, total
+
+
+def _both(one: slice, other: slice) -> slice:
+    """What two have in common."""
+    return slice(max(one.start, other.start), min(one.stop, other.stop))
 
 
 def _of_each(values: Singles, colours: int) -> Singles:
