@@ -62,7 +62,7 @@ def sweep(shim: Path, name: str, place: Path, step: int) -> dict[str, Any]:
 def test_some_calls_that_fail_lose_no_frame(shim: Path, place: Path, name: str, step: int) -> None:
     found = sweep(shim, name, place, step)
     assert found["wrong"] == []
-    assert found["refused"] > 755 / step
+    assert found["refused"] > 700 / step  # of the 1086 faults that geotag's 181 calls can meet
 
 
 @pytest.mark.long

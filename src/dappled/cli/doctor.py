@@ -304,4 +304,6 @@ def _hot_shoe(settings: Settings, truth: Path | None) -> Iterator[None]:
 
 def _true_latencies(truth: Path, count: int) -> list[float]:
     """The simulation's own times from trigger to exposure, in milliseconds."""
-    return [json.loads(path.read_text())["latency_s"] * 1e3 for path in sorted(truth.glob("*.json"))[:count]]
+    from dappled.mocks.autopilot import shot_times  # noqa: PLC0415  # as above
+
+    return [shot_times.read(path).latency_s * 1e3 for path in sorted(truth.glob("*.json"))[:count]]

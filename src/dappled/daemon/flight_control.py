@@ -13,7 +13,6 @@ from dappled.daemon.navigation import Navigation
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.decode.geometry import Pose
-from dappled.drivers.mavlink import PacketSender
 from dappled.findings import Code, Finding, Subject, finding
 from dappled.flight import FlightError, Shot, layout
 from dappled.flight.layout import DiskSpace
@@ -36,14 +35,13 @@ class FlightControl:
         navigation: Navigation,
         *,
         camera: ReportedCamera,
-        sender: PacketSender,
         alarms: Alarms,
         handover: FlightHandover | None,
     ) -> None:
         self._settings, self._clock, self._shots = settings, shots.clock, shots
         self._writer, self._recording = writer, writer.recording
         self._navigation, self._camera = navigation, camera
-        self._sender, self._alarms, self._handover = sender, alarms, handover
+        self._alarms, self._handover = alarms, handover
         self.lost_triggers = 0
         self._looked: tuple[Finding | None, int] = (None, 0)
 
@@ -117,13 +115,6 @@ class FlightControl:
     def lost(self, triggers: Finding) -> None:
         self.lost_triggers += triggers.number("triggers")
         self._writer.later(LOST, triggers)
-
-    def send_distance(self, nearest_m: tuple[float, float]) -> None:
-        """Send the nearest distance and its standard error to the autopilot."""
-        boot_ms = (self._clock.monotonic_ns() // 10**6) % 2**32
-        message = camera_status.distance_message(nearest_m, boot_ms, self.mount)
-        if message is not None:
-            self._sender.send(message)
 
 
 class DecodingParameter:

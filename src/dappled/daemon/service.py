@@ -23,7 +23,7 @@ from dappled.config import profiles
 from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.body_plan import BodyPlan
-from dappled.daemon.camera_protocol.camera_status import ReportedCamera
+from dappled.daemon.camera_protocol.camera_status import DistanceSensor, ReportedCamera
 from dappled.daemon.camera_protocol.component import Component
 from dappled.daemon.camera_protocol.earlier_outcomes import EarlierOutcomes
 from dappled.daemon.camera_protocol.own_autopilot import OwnAutopilot
@@ -246,7 +246,6 @@ class Service:
             writer,
             navigation,
             camera=reported,
-            sender=sender,
             alarms=self._alarms,
             handover=self._after,
         )
@@ -286,11 +285,12 @@ class Service:
                 every_s = settings.publish.picture_interval_s
                 viewers.append(LivePictures(*common, interval_s=every_s))
             if settings.decode.depth:
+                ranging = DistanceSensor(sender, self._settings, clock)
                 depth = LiveDepth(
                     *common,
                     method=settings.decode.depth,
                     interval_s=settings.decode.depth_interval_s,
-                    nearest=control.send_distance if settings.decode.depth_to_autopilot else None,
+                    nearest=ranging.send if settings.decode.depth_to_autopilot else None,
                 )
                 viewers.append(depth)
         events = ShotEvents(

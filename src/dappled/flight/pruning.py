@@ -39,8 +39,8 @@ class Removed:
 
 
 def removed(folder: FlightFolder) -> dict[str, Removed]:
-    """The files that were removed from a flight, by name. Raises FlightError where the record is not the one that the
-    ledger vouches for."""
+    """The files that were removed from a flight, by name, as far as they are the ledger's and still gone. Raises
+    FlightError where the record is not the one that the ledger vouches for."""
     path = folder.file(RECORD)
     with disk_errors("read", path):
         try:
@@ -49,13 +49,15 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
             return {}
     with LedgerReader.open(folder.ledger) as ledger:
         noted = [found for event in ledger.events() if event.kind == EVENT and (found := event.finding) is not None]
+        held = {row.name: row.sha256 for row in ledger.files()}
     if hashlib.sha256(data).hexdigest() not in [one.facts.get("sha256") for one in noted]:
         raise FlightError(f"{path} was changed: the ledger has no event with its SHA-256; use another copy of it")
     try:
         rows = [codec.read_json(Removed, line) for line in data.splitlines()]
     except codec.CodecError as error:
         raise FlightError(f"{path} can't be read: {error}") from error
-    return {row.name: row for row in rows}
+    known = (row for row in rows if held.get(row.name) == row.sha256)
+    return {row.name: row for row in known if not folder.file(row.name).exists()}
 
 
 def remove(source: Tree, there: Tree, sure: Mapping[str, Proved]) -> int:

@@ -161,18 +161,18 @@ def _adopt(folder: FlightFolder, ledger: Ledger) -> list[Finding]:
             continue
         with disk_errors("adopt", path):
             stat = path.stat()
-            sha256 = durable.hash_file(path)
+            held = (name, file_name, stat.st_size, durable.hash_file(path), stat.st_mtime_ns)
         number = layout.index_of(file_name)
         row = None if number is None else ledger.shot(number)
         if number is not None and row is not None and row.state != "safe":
-            ledger.safe(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
+            ledger.safe(Frame(number, *held))
             report.append(finding(Code.FILE_ADOPTED, FLIGHT, file=name, shot=number))
         elif number is not None and file_name.endswith(_JPEG) and _has_raw_frame(ledger, number):
-            ledger.add_companion(Frame(number, name, file_name, stat.st_size, sha256, stat.st_mtime_ns))
+            ledger.add_companion(Frame(number, *held))
             report.append(finding(Code.FILE_ADOPTED_BESIDE, FLIGHT, file=name, shot=number))
         else:
             why = finding(Code.FILE_UNCLAIMED, FLIGHT, file=name)
-            ledger.add_stray(Stray(name, file_name, stat.st_size, sha256, stat.st_mtime_ns, why))
+            ledger.add_stray(Stray(*held, why))
             report.append(why)
     return report
 

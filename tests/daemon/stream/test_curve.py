@@ -13,9 +13,11 @@ import zmq.auth
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dappled.clock import SystemClock
 from dappled.daemon.stream import curve
 from dappled.daemon.stream.curve import ClientKeys, ServerKeys
 from dappled.daemon.stream.publisher import Publisher
+from dappled.daemon.stream.sockets import Sockets
 from dappled.daemon.stream.subscriber import Subscriber
 from dappled.daemon.stream.wire import Message
 from dappled.errors import DappledError
@@ -97,7 +99,7 @@ def test_any_file_is_a_key_or_an_error(tmp_path_factory: pytest.TempPathFactory,
 def test_only_those_on_the_list_get_in(keys: tuple[ServerKeys, ClientKeys, ClientKeys]) -> None:
     server, friend, stranger = keys
     endpoint, ask = (f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}" for _ in range(2))
-    one = Publisher(endpoint, ask, keys=server)
+    one = Publisher(endpoint, ask, sockets=Sockets(server, 0o660, SystemClock()))
     one.start("f", lambda _, reply: reply(Message("error", {"error": "x"})))
     stop = threading.Event()
 
@@ -132,7 +134,8 @@ def test_only_those_on_the_list_get_in(keys: tuple[ServerKeys, ClientKeys, Clien
 
 def test_the_daemon_s_own_door_needs_no_key(keys: tuple[ServerKeys, ClientKeys, ClientKeys], tmp_path: Path) -> None:
     private = f"ipc://{tmp_path}/own"
-    one = Publisher(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}", "", keys=keys[0], private=private)
+    sockets = Sockets(keys[0], 0o660, SystemClock())
+    one = Publisher(f"tcp://127.0.0.1:{free_port(socket.SOCK_STREAM)}", "", sockets=sockets, private=private)
     one.start("f", lambda request, reply: reply(Message("frame", dict(request))))
     with Subscriber(private, f"{private}.ask", topics=[]) as subscriber:
         subscriber.ask({"get": "frame", "frame": 5})

@@ -13,11 +13,12 @@ from dappled.clock import Clock
 from dappled.config import profiles
 from dappled.config.settings import Settings
 from dappled.daemon.camera_protocol.parameters import DEFINITION_PATH, Definition, Parameters, camera_definition
+from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.pipeline.capture import PendingShot
 from dappled.daemon.pipeline.shutter import Shutter
 from dappled.decode.geometry import Pose, field_of_view
 from dappled.drivers.camera import Identity
-from dappled.drivers.mavlink import MavlinkMessage, mavlink
+from dappled.drivers.mavlink import MavlinkMessage, PacketSender, mavlink
 from dappled.errors import DappledError, report
 from dappled.findings import Finding
 from dappled.flight import ImageIndex, LedgerReader
@@ -265,6 +266,22 @@ def sensor_orientation(mount: Sequence[float]) -> int | None:
     if down > 0.9:
         return int(_DOWN)
     return int(_FORWARD) if forward > 0.9 else None
+
+
+@dataclass(frozen=True, slots=True)
+class DistanceSensor:
+    """The camera as a rangefinder of the autopilot; `settings` have its mount, as it may be changed in flight."""
+
+    sender: PacketSender
+    settings: LiveSettings
+    clock: Clock
+
+    def send(self, nearest_m: tuple[float, float]) -> None:
+        """Send the nearest distance and its standard error in m."""
+        boot_ms = (self.clock.monotonic_ns() // 10**6) % 2**32
+        message = distance_message(nearest_m, boot_ms, self.settings.now.pose.mount)
+        if message is not None:
+            self.sender.send(message)
 
 
 def distance_message(nearest: tuple[float, float], boot_ms: int, mount: Sequence[float]) -> MavlinkMessage | None:

@@ -25,7 +25,6 @@ import zmq
 from dappled.clock import Clock, SystemClock
 from dappled.config.settings import PublishSettings
 from dappled.daemon.stream import curve, wire
-from dappled.daemon.stream.curve import ServerKeys
 from dappled.daemon.stream.sockets import Sockets
 from dappled.daemon.stream.wire import Message, WireError
 from dappled.errors import report
@@ -106,9 +105,9 @@ class InFlightLimit:
 class Publisher:
     """Publishes messages, and passes on questions to what answers them.
 
-    `slices` and `ask` are the endpoints; with `ask` "" no question is answered. `keys` turn CURVE on for tcp, `mode`
-    is the file mode of ipc sockets. `private` is a further ipc endpoint for processes of the daemon itself; its
-    questions go to "`private`.ask". Raises WireError when an endpoint can't be bound.
+    `slices` and `ask` are the endpoints; with `ask` "" no question is answered. `sockets` opens them, and is closed
+    with this; without one there are no keys. `private` is a further ipc endpoint for processes of the daemon itself;
+    its questions go to "`private`.ask". Raises WireError when an endpoint can't be bound.
     """
 
     def __init__(
@@ -116,10 +115,9 @@ class Publisher:
         slices: str,
         ask: str,
         *,
+        sockets: Sockets | None = None,
         high_water_mark: int = 12,
         capacity: int = 8,
-        keys: ServerKeys | None = None,
-        mode: int = 0o660,
         private: str = "",
         clock: Clock | None = None,
     ) -> None:
@@ -140,7 +138,7 @@ class Publisher:
         self._subscribed: frozenset[bytes] = frozenset()  # what topics of subscribers begin with
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._closed = False
-        self._sockets = Sockets(keys, mode, self._clock)
+        self._sockets = sockets or Sockets(None, 0o660, self._clock)
         try:
             self._pub = self._sockets.open(zmq.XPUB, [private, slices], high_water_mark)
             asked_at = [private and f"{private}.ask", ask]
@@ -153,15 +151,10 @@ class Publisher:
     @classmethod
     def of(cls, settings: PublishSettings, *, private: str = "", clock: Clock | None = None) -> Self:
         """A publisher at the endpoints of these settings. Raises WireError, DappledError."""
-        return cls(
-            settings.slices,
-            settings.ask,
-            high_water_mark=settings.high_water_mark,
-            keys=curve.server(settings.keys, settings.clients),
-            mode=int(settings.socket_mode, 8),
-            private=private,
-            clock=clock,
-        )
+        keys, mode = curve.server(settings.keys, settings.clients), int(settings.socket_mode, 8)
+        sockets = Sockets(keys, mode, clock or SystemClock())
+        mark = settings.high_water_mark
+        return cls(settings.slices, settings.ask, sockets=sockets, high_water_mark=mark, private=private, clock=clock)
 
     def start(self, flight: str, answer: Answer) -> None:
         """Start to send and to listen."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dappled import durable
+from dappled import codec, durable
 from dappled.bounds.parsing import check_stored
 from dappled.findings import Code, Finding, Level, Subject, Value, finding
 from dappled.flight import chain
@@ -117,8 +116,7 @@ def _shown(name: str) -> str:
 def _range(key: str) -> tuple[int, int]:
     """First byte and end of a block; an empty one where the link was damaged, which its chain tells."""
     try:
-        start, end = json.loads(key)
-    except (ValueError, TypeError, RecursionError):
+        start, end = codec.read_json(tuple[int, int], key)
+    except codec.CodecError:
         return 0, 0
-    whole = type(start) is int and type(end) is int and 0 <= start <= end
-    return (start, end) if whole else (0, 0)
+    return (start, end) if 0 <= start <= end else (0, 0)

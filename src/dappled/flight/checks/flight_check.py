@@ -113,7 +113,7 @@ def _compare(
         level = Level.NOTE if layout.is_locked(folder.path.parent) else Level.STOP
         found.append(finding(Code.FLIGHT_UNCLOSED, Subject("flight"), level))
     with _examining("the offloaded files", found):
-        counts.elsewhere = _elsewhere(folder, ledger)
+        counts.elsewhere = pruning.removed(folder)
         found += _where(counts.elsewhere)
     with _examining("the files", found):
         found += _files(folder, ledger, counts)
@@ -152,17 +152,6 @@ def _chained(folder: FlightFolder, found: list[Finding]) -> ChainFindings:
         chained = chain_check.compare(stored)
         found += [*chained.problems, *_records(stored)]
     return chained
-
-
-def _elsewhere(folder: FlightFolder, ledger: LedgerReader) -> dict[str, Removed]:
-    """The files that were removed here after their copies were proved, as far as they are the ledger's and gone."""
-    removed = pruning.removed(folder)
-    rows = {row.name: row for row in ledger.files()}
-    return {
-        name: one
-        for name, one in removed.items()
-        if name in rows and one.sha256 == rows[name].sha256 and not folder.file(name).exists()
-    }
 
 
 def _where(elsewhere: Mapping[str, Removed]) -> Iterator[Finding]:

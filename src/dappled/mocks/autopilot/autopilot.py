@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import select
 import socket
@@ -23,6 +22,7 @@ from dappled.clock import Clock, SystemClock, TimeOfDayClock
 from dappled.drivers.child_process import end_child
 from dappled.drivers.mavlink import LinkError, MavlinkLinks, MavlinkMessage, Packet, mavlink
 from dappled.drivers.python_command import python_module
+from dappled.mocks.autopilot import shot_times
 from dappled.mocks.autopilot.path import SPEED_M_S, FlightPath, TruePose
 from dappled.workers import Loop
 
@@ -297,11 +297,11 @@ class HotShoe:
             for path in sorted(self._truth.glob("*.json")):
                 if path.name not in reported:
                     try:
-                        times = json.loads(path.read_text())
+                        times = shot_times.read(path)
                     except ValueError:
                         continue  # it is still written
                     reported.add(path.name)
-                    self._report(int(path.stem), times["trigger_t_s"] + times["latency_s"])
+                    self._report(int(path.stem), times.trigger_t_s + times.latency_s)
 
     def _report(self, number: int, opened_t_s: float) -> None:
         boot_us = BootTime().ns(opened_t_s) // 1000

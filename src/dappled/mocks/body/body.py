@@ -27,6 +27,7 @@ from dappled.clock import SystemClock
 from dappled.drivers.child_process import end_child
 from dappled.drivers.python_command import python_module
 from dappled.errors import DappledError
+from dappled.mocks.autopilot.shot_times import ShotTimes
 from dappled.mocks.body.eos450d import SERIAL, Eos450d, Expose, Properties
 from dappled.mocks.body.eos_card import CARD_BYTES
 from dappled.mocks.body.faults import BodyFaults
@@ -263,8 +264,7 @@ def _simulated(options: BodyOptions) -> Pictures:
             # The body's own latency, which the renderer has no need to wait for: no contact closes before it is over.
             time.sleep(max(0.0, latency_s - (time.monotonic_ns() - trigger_monotonic_ns) / 1e9))
             middle_t_s = trigger_t_s + latency_s + exposure_s / 2
-            times = {"trigger_t_s": trigger_t_s, "mid_exposure_t_s": middle_t_s, "latency_s": latency_s}
-            (truth / f"{shot_number:06d}.json").write_text(json.dumps(times), encoding="utf-8")
+            ShotTimes(trigger_t_s, middle_t_s, latency_s).write(truth, shot_number)
         made = camera.expose(trigger_t_s, shot_number, f_number=options.f_number)
         if truth is not None:
             made.truth.save(truth / f"{shot_number:06d}.npz")
