@@ -133,10 +133,9 @@ def balance(path: Path) -> Balance:
         shots, frames, facts = ledger.shots(), ledger.frames(), ledger.facts()
         correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.began_utc_ns()
         cut_short = ledger.fact(dict[str, float], CUT_SHORT)
-        events = ledger.events()
         results = ledger.results()
         judged = {index: found for index, one in results.items() if (found := one.verdict)}
-        lost = [one for event in events if event.kind == LOST and (one := event.finding)]
+        lost = ledger.found(LOST)
         states = Counter(row.state for row in shots)
         return Balance(
             flight=folder.name,
@@ -153,16 +152,16 @@ def balance(path: Path) -> Balance:
             closed="closed_utc_ns" in facts,
             following=len(ledger.following()),
             companions=len(ledger.companions()),
-            refused=_refused(events).total(),
+            refused=_refused(ledger).total(),
             lost=sum(one.number("triggers") for one in lost),
             lost_triggers=tuple(lost),
             began_utc_ns=None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns,
             judged=_by_verdict(judged, len(frames)),
             bad=_reasons("bad", judged, frames),
             unknown=_reasons("unknown", judged, frames),
-            doubts=_found(events, DOUBT, LATER_DOUBT),
-            card=_found(events, NOTICED),
-            stood=_stood(events, correction_ns),
+            doubts=tuple(ledger.found(DOUBT, LATER_DOUBT)),
+            card=tuple(ledger.found(NOTICED)),
+            stood=_stood(ledger.events(), correction_ns),
             cut_short=None
             if cut_short is None
             else finding(
@@ -181,11 +180,6 @@ def _mask(results: Mapping[int, Result]) -> Finding | None:
     for index, one in sorted(results.items()):
         mask.add(index, one.mask_nats)
     return mask.told
-
-
-def _found(events: Iterable[LedgerEvent], *kinds: str) -> tuple[Finding, ...]:
-    """What events of these kinds hold."""
-    return tuple(found for event in events if event.kind in kinds and (found := event.finding) is not None)
 
 
 def _stood(events: Iterable[LedgerEvent], correction_ns: int | None) -> tuple[StoodFinding, ...]:
@@ -291,7 +285,7 @@ def by_source(path: Path) -> tuple[SourceReport, ...]:
     """A report for each source, by name. Raises FlightError."""
     with LedgerReader.open(layout.open_folder(path).ledger) as ledger:
         rows, tags, results = ledger.shots(), ledger.tags(), ledger.results()
-        refused = _refused(ledger.events())
+        refused = _refused(ledger)
     counts: dict[str, Counter[str]] = {source: Counter(refused=count) for source, count in refused.items()}
     for row in rows:
         mine = counts.setdefault(row.shot.cause.source, Counter())
@@ -306,10 +300,9 @@ def by_source(path: Path) -> tuple[SourceReport, ...]:
     )
 
 
-def _refused(events: Iterable[LedgerEvent]) -> Counter[str]:
+def _refused(ledger: LedgerReader) -> Counter[str]:
     """Refused requests by source. A flood is one event with a count a minute."""
     found: Counter[str] = Counter()
-    for event in events:
-        if event.kind == REFUSED and (one := event.finding) is not None:
-            found[str(one.subject.which)] += one.number("times")
+    for one in ledger.found(REFUSED):
+        found[str(one.subject.which)] += one.number("times")
     return found

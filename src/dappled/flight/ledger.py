@@ -225,6 +225,12 @@ class LedgerReader(Database):
     def events(self) -> list[LedgerEvent]:
         return [LedgerEvent(*row) for row in self._rows("SELECT * FROM events ORDER BY number")]
 
+    def found(self, *kinds: str) -> list[Finding]:
+        """What the events of these kinds hold, in their order, as far as it can be read."""
+        marks = ", ".join("?" * len(kinds))
+        rows = self._rows(f"SELECT text FROM events WHERE kind IN ({marks}) ORDER BY number", *kinds)  # noqa: S608  marks
+        return [found for (text,) in rows if (found := findings.of_json_text(text)) is not None]
+
     def facts(self) -> dict[str, Any]:
         """Values that hold for the whole flight: telemetry_sha256, closed_utc_ns …"""
         return {key: self._load(Any, value) for key, value in self._rows("SELECT key, value FROM facts")}

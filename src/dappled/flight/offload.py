@@ -274,7 +274,7 @@ def _finish_seal(folder: FlightFolder, clock: Clock) -> None:
     what was done in between. Raises FlightError."""
     with LedgerReader.open(folder.ledger) as ledger:
         count, missing = seals.announced(ledger.facts())
-        opened = [one for event in ledger.events() if event.kind == seals.OPENED and (one := event.finding)]
+        opened = ledger.found(seals.OPENED)
     last = seals.read(folder).last
     written = 0 if last is None else last.seal
     if opened and opened[-1].facts.get("work") == seals.Occasion.PRUNE and count > written and count not in missing:

@@ -39,7 +39,7 @@ def sign(flight: Path, clock: Clock, key: SealKey) -> CheckReport:
             return found
         opened = seals.reopened(folder, clock, seals.Occasion.OWNER, key, judged=True)
         with opened, Ledger(folder.ledger, clock) as ledger:
-            known = [event.finding for event in ledger.events() if event.kind == seals.CHANGED]
+            known = ledger.found(seals.CHANGED)
             for one in found.notes:
                 if one not in known:
                     ledger.add_event(seals.CHANGED, one)

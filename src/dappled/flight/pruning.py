@@ -48,9 +48,9 @@ def removed(folder: FlightFolder) -> dict[str, Removed]:
         except FileNotFoundError:
             return {}
     with LedgerReader.open(folder.ledger) as ledger:
-        noted = [found for event in ledger.events() if event.kind == EVENT and (found := event.finding) is not None]
+        noted = [one.facts.get("sha256") for one in ledger.found(EVENT)]
         held = {row.name: row.sha256 for row in ledger.files()}
-    if hashlib.sha256(data).hexdigest() not in [one.facts.get("sha256") for one in noted]:
+    if hashlib.sha256(data).hexdigest() not in noted:
         raise FlightError(f"{path} was changed: the ledger has no event with its SHA-256; use another copy of it")
     try:
         rows = [codec.read_json(Removed, line) for line in data.splitlines()]

@@ -63,7 +63,7 @@ def compare(
     found += [finding(Code.SEAL_UNWRITTEN, SEAL, seal=number) for number in seals.announced(facts)[1]]
     owned = [one for one in file.seals.values() if one.why == seals.Occasion.OWNER]
     found += [finding(Code.SEAL_BY_OWNER, SEAL, seal=one.seal, key=one.key) for one in owned]
-    found += [told for event in ledger.events() if event.kind == seals.CHANGED and (told := event.finding)]
+    found += ledger.found(seals.CHANGED)
     last = file.last
     if last is None:
         return SealFindings("not sealed", finding(Code.SEAL_NONE, SEAL), tuple(found))
