@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import time
 from pathlib import Path
@@ -26,13 +27,20 @@ BOARD = (9, 6)
 TILTS = ((0, 0), (0.5, 0), (-0.5, 0.1), (0, 0.55), (0.1, -0.5), (0.4, 0.4), (-0.4, -0.4))
 
 
-def drawn(tilt: tuple[float, float], lens: Lens = TRUE, aside: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
-    """A board of 9 × 6 inner corners, one unit a square, as this lens shows it, edges a pixel wide."""
+@functools.cache
+def rays_of(lens: Lens) -> NDArray[np.float64]:
+    """(pixels, 3): where each pixel looks."""
     rows, columns = SENSOR.shape
     matrix = eye.intrinsics(SENSOR, lens, GRID)
     pixels = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1).reshape(-1, 2).astype(float)
     flat = (pixels - matrix[:2, 2]) @ np.linalg.inv(matrix[:2, :2]).T
-    rays = np.concatenate([eye.undistorted(flat, lens.distortion), np.ones((len(pixels), 1))], axis=1)
+    return np.concatenate([eye.undistorted(flat, lens.distortion), np.ones((len(pixels), 1))], axis=1)
+
+
+def drawn(tilt: tuple[float, float], lens: Lens = TRUE, aside: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+    """A board of 9 × 6 inner corners, one unit a square, as this lens shows it, edges a pixel wide."""
+    rows, columns = SENSOR.shape
+    rays = rays_of(lens)
     turn = eye.turn(np.array([tilt[0], tilt[1], 0.1]))
     middle = np.array([*aside, 45.0])
     depth = (turn[:, 2] @ middle) / (rays @ turn[:, 2])
