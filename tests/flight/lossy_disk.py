@@ -63,9 +63,9 @@ class Call:
 
 def record(code: str, *arguments: str, log: Path) -> list[Call]:
     """Run Python code under strace and return the calls that succeeded, in the order of their ends."""
-    command = ["strace", "-f", "--seccomp-bpf", "-y", "-xx", "-s", "10000000", "-e", f"trace={CALLS}", "-e", "signal=none", "-o"]
+    command = ["strace", "-f", "--seccomp-bpf", "-y", "-xx", "-s", "10000000", "-e", f"trace={CALLS}"]
     subprocess.run(
-        [*command, str(log), sys.executable, "-c", code, *arguments],
+        [*command, "-e", "signal=none", "-o", str(log), sys.executable, "-c", code, *arguments],
         cwd=Path(__file__).parents[2], check=True, timeout=300, stdout=subprocess.DEVNULL,
     )  # fmt: skip
     calls: list[Call] = []
