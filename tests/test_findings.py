@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from pathlib import Path
 
@@ -81,7 +82,7 @@ def test_a_number_that_is_not_finite_is_unknown_and_the_finding_survives_the_led
 
 
 def test_a_fact_may_be_an_error_or_a_finding_and_only_a_renderer_makes_words_of_it() -> None:
-    lost = finding(Code.FILE_UNREADABLE, FRAME, name="a.cr2", why=FileNotFoundError(2, "?", "flights/a.cr2"))
+    lost = finding(Code.FILE_UNREADABLE, FRAME, name="a.cr2", why=FileNotFoundError(2, os.strerror(2), "flights/a.cr2"))
     assert lost.facts["why"] == Fault("FileNotFoundError", 2, "flights/a.cr2")
     assert str(findings.text(lost)) == "a.cr2 can't be read: No such file or directory"
     misfit = finding(Code.DECODE_MISFIT, FRAME, why=lost)
@@ -102,6 +103,8 @@ def test_an_error_tells_what_led_to_it_and_its_own_finding_where_it_has_one() ->
     own = finding(Code.FRAME_CLIPPED, FRAME, share=0.1)
     assert finding(Code.FRAME_UNDECODABLE, FRAME, why=DappledError(own)).facts["why"] == own
     assert str(DappledError(own)) == str(findings.told(own, FRAME))
+    refused = finding(Code.FILE_UNREADABLE, FRAME, name="a", why=OSError(22, "it is no plain file", "a"))
+    assert str(findings.text(refused)) == "a can't be read: it is no plain file"
     damaged = finding(Code.FLIGHT_PART_DAMAGED, FRAME, part="the tags", why=ValueError("no such orders"))
     assert str(findings.text(damaged)).endswith("damaged: ValueError: no such orders")
 

@@ -115,7 +115,9 @@ class Fault:
         number, path = (system.errno, system.filename) if isinstance(system, OSError) else (None, None)
         kind, named = type(error).__name__, path if isinstance(path, str | bytes | PathLike) else ""  # or a number
         said = str(error) if hasattr(error, "finding") else f"{kind}: {error}"  # only our own tell by themselves
-        return cls(kind, number, os.fsdecode(named), "" if system is error and number else said)
+        if isinstance(error, OSError) and number:
+            said = "" if error.strerror == os.strerror(number) else str(error.strerror)
+        return cls(kind, number, os.fsdecode(named), said)
 
     def words(self, *, named: bool = True) -> Text:
         """What it says, as a clause; of the system's errors with the file's name, where it is to be `named`."""
@@ -223,9 +225,9 @@ def in_order(found: Sequence[Finding]) -> list[Finding]:
 
 class _Sentences(string.Formatter):
     """Formats facts as `str.format` does. `{reason:?: }` is empty, or ": " and the reason; `{frames:#frame}` is
-    1 frame, 2 frames; `{why}` of an error or a finding is what it says, `{why:-}` without the name of a file
-    that the sentence has. Facts may come from damaged files: one that is missing, or of another type, is shown as it
-    is.
+    1 frame, 2 frames; `{why}` of an error or a finding is what it says and what to do, `{why:-}` without what
+    to do, and without the name of a file. Facts may come from damaged files: one that is missing, or of another type,
+    is shown as it is.
     """
 
     def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -233,7 +235,8 @@ class _Sentences(string.Formatter):
 
     def format_field(self, value: Any, format_spec: str) -> str:
         if isinstance(value, Fault | Finding):
-            value = str(value.words(named=format_spec != "-") if isinstance(value, Fault) else text(value))
+            whole = not format_spec.startswith(("-", "?"))
+            value = str(value.words(named=whole) if isinstance(value, Fault) else _led_by(value, whole=whole))
         format_spec = format_spec.removeprefix("-")
         if format_spec.startswith("?"):
             return "" if value in (None, "") else f"{format_spec[1:]}{value}"
@@ -252,6 +255,10 @@ def _filled(sentence: str, facts: Mapping[str, Value]) -> str:
 def text(one: Finding) -> Text:
     """What was found, as a clause without its subject and without a full stop."""
     return Text(_filled(words()[one.code].sentence, one.facts))
+
+
+def _led_by(one: Finding, *, whole: bool) -> Text:
+    return told(one, one.subject) if whole else text(one)
 
 
 def remedy(one: Finding) -> Text:

@@ -176,7 +176,7 @@ def each_frame(
     """
     bad = 0
     found: dict[Path, Sequence[Finding]] = {}
-    answers = crew.in_order(frames, partial(_tried, make) if into_folder else make, _lost)
+    answers = crew.in_order(frames, partial(processes.tried, make) if into_folder else make, _lost)
     with closing(answers):
         for frame, made in zip(output.each(frames), answers, strict=True):
             if isinstance(made, FrameMade):
@@ -194,13 +194,6 @@ def each_frame(
     doubted = sum(worst(each) > Level.NOTE for each in found.values())
     told = first_by_name((frame.stem, each) for frame, each in found.items())
     return Report(findings=told, extent=f"{doubted} of {of_all}", failed=bool(bad))
-
-
-def _tried(make: Callable[[Path], FrameMade], frame: Path) -> FrameMade | DappledError:
-    try:
-        return make(frame)
-    except DappledError as error:
-        return DappledError(str(error))  # it may come from another process
 
 
 def _lost(frame: Path, why: str) -> DappledError:

@@ -1,9 +1,8 @@
-"""The error of a flight folder, and the sentence for each error of the operating system."""
+"""The error of a flight folder, and the finding for each error of the operating system and of SQLite."""
 
 from __future__ import annotations
 
 import errno
-import os
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,44 +11,46 @@ from pathlib import Path
 from dappled import durable
 from dappled.bounds.claims import ClaimError
 from dappled.errors import DappledError
+from dappled.findings import Code, Subject, finding
+
+DISK, LEDGER = Subject("disk"), Subject("ledger")
 
 
 class FlightError(DappledError):
     """A flight folder can't be written or read."""
 
 
-_REMEDIES = {
-    errno.ENOSPC: "the disk is full; free some space or set record.directory to another disk",
-    errno.EDQUOT: "the disk quota is used up; free some space or set record.directory to another disk",
-    errno.EFBIG: "the file would be larger than the system allows; raise the file size limit",
-    errno.EROFS: "the disk is mounted read-only; remount it for writing or set record.directory to another disk",
-    errno.EACCES: "permission denied; make it accessible to this user or set record.directory to another folder",
-    errno.EPERM: "permission denied; make it accessible to this user or set record.directory to another folder",
-    errno.EIO: "the disk reports an input/output error; check the disk (dmesg) or set record.directory to another one",
-    errno.ENOTDIR: "a part of this path is a file, not a folder; set record.directory to a folder",
-    errno.EEXIST: "a file of this name is in the way; move it or set record.directory to another folder",
-    errno.ELOOP: "a link is in its place, and links are not followed; remove it",
-    errno.EMFILE: "too many files are open; close other programs or raise the limit (ulimit -n)",
-    errno.ENFILE: "too many files are open; close other programs",
-    errno.ENOENT: "it does not exist; check the path",
-    errno.EISDIR: "it is a folder, not a file; check the path",
+_SYSTEM = {
+    errno.ENOSPC: Code.SYSTEM_DISK_FULL,
+    errno.EDQUOT: Code.SYSTEM_QUOTA_USED,
+    errno.EFBIG: Code.SYSTEM_FILE_LIMIT,
+    errno.EROFS: Code.SYSTEM_READ_ONLY,
+    errno.EACCES: Code.SYSTEM_DENIED,
+    errno.EPERM: Code.SYSTEM_DENIED,
+    errno.EIO: Code.SYSTEM_IO_ERROR,
+    errno.ENOTDIR: Code.SYSTEM_NO_FOLDER,
+    errno.EEXIST: Code.SYSTEM_IN_THE_WAY,
+    errno.ELOOP: Code.SYSTEM_LINK,
+    errno.EMFILE: Code.SYSTEM_FILES_OPEN,
+    errno.ENFILE: Code.SYSTEM_FILES_OPEN_EVERYWHERE,
+    errno.ENOENT: Code.SYSTEM_MISSING,
+    errno.EISDIR: Code.SYSTEM_FOLDER,
 }
 
 
 def disk_error(doing: str, path: Path, error: OSError) -> FlightError:
-    """The sentence for an operating system error: "cannot <doing> <path>: <why>; <what to do>"."""
+    """The error for one of the operating system: "cannot <doing> <path>: <why>; <what to do>"."""
     number = error.errno or 0
     if number == errno.ENOTDIR and path.is_symlink():
         number = errno.ELOOP  # what O_DIRECTORY says of a link
-    why = _REMEDIES.get(number) or f"{os.strerror(number) if number else error}; check the disk"
-    if isinstance(error, durable.NoPlainFileError):
-        why = str(error.strerror)
-    return FlightError(f"cannot {doing} {path}: {why}")
+    known = None if isinstance(error, durable.NoPlainFileError) else _SYSTEM.get(number, Code.SYSTEM_OTHER)
+    why = error if known is None else finding(known, DISK, why=error)
+    return FlightError(finding(Code.DISK_REFUSED, DISK, doing=doing, path=path, why=why))
 
 
 @contextmanager
 def disk_errors(doing: str, path: Path) -> Iterator[None]:
-    """Context of work on a file or folder: raises FlightError, the sentence of `disk_error`, for an OSError in it, and
+    """Context of work on a file or folder: raises FlightError, as `disk_error` makes it, for an OSError in it, and
     for a file that claims too much."""
     try:
         yield
@@ -59,28 +60,26 @@ def disk_errors(doing: str, path: Path) -> Iterator[None]:
         raise FlightError(f"cannot {doing} {path}: {error}") from error
 
 
-_LEDGER_REASONS = {
-    "SQLITE_NOTADB": "it is damaged, or not an SQLite file; move it away: frames and shots.jsonl are intact",
-    "SQLITE_CORRUPT": "it is damaged; move it away: frames and shots.jsonl are intact",
-    "SQLITE_FULL": "the disk is full; free some space or set record.directory to another disk",
-    "SQLITE_READONLY": "the disk or the file is read-only; make it writable or set record.directory elsewhere",
-    "SQLITE_CANTOPEN": "it can't be opened; check that its folder exists and is accessible",
-    "SQLITE_TOOBIG": "a value in it takes more than 16 MB, which dappled never writes; use another copy of it",
-    "SQLITE_BUSY": "another program holds it; close that program",
-    "SQLITE_IOERR": "the disk reports an input/output error, or is full; check the disk (df, dmesg)",
+_SQLITE = {
+    "SQLITE_NOTADB": Code.SQLITE_NO_DATABASE,
+    "SQLITE_CORRUPT": Code.SQLITE_CORRUPT,
+    "SQLITE_FULL": Code.SQLITE_FULL,
+    "SQLITE_READONLY": Code.SQLITE_READ_ONLY,
+    "SQLITE_CANTOPEN": Code.SQLITE_UNOPENED,
+    "SQLITE_TOOBIG": Code.SQLITE_TOO_BIG,
+    "SQLITE_BUSY": Code.SQLITE_BUSY,
+    "SQLITE_IOERR": Code.SQLITE_IO_ERROR,
 }
 
 
 def ledger_error(path: Path, error: sqlite3.Error | UnicodeDecodeError) -> FlightError:
-    """The sentence for an SQLite error in a ledger: what can't be done, why, and what to do."""
-    code = getattr(error, "sqlite_errorname", "") or ""
+    """The error for one of SQLite about a ledger: what can't be done, why, and what to do."""
+    name = getattr(error, "sqlite_errorname", "") or ""
     if isinstance(error, UnicodeDecodeError):  # SQLite quotes damaged text in the words of its error
-        code = "SQLITE_CORRUPT"
+        name = "SQLITE_CORRUPT"
     if isinstance(error, sqlite3.ProgrammingError):
-        return FlightError(f"the ledger {path} was used after it was closed or in a wrong way: {error}")
-    if code.startswith("SQLITE_CONSTRAINT"):
-        return FlightError(f"the ledger {path} refuses a row that contradicts the others: {error}")
-    for start, why in _LEDGER_REASONS.items():
-        if code.startswith(start):
-            return FlightError(f"cannot use the ledger {path}: {why}")
-    return FlightError(f"cannot use the ledger {path}: {error}; check the disk and the file")
+        return FlightError(finding(Code.LEDGER_MISUSED, LEDGER, path=path, why=error))
+    if name.startswith("SQLITE_CONSTRAINT"):
+        return FlightError(finding(Code.LEDGER_CONTRADICTED, LEDGER, path=path, why=error))
+    code = next((code for start, code in _SQLITE.items() if name.startswith(start)), Code.SQLITE_OTHER)
+    return FlightError(finding(Code.LEDGER_UNUSABLE, LEDGER, path=path, why=finding(code, LEDGER, why=error)))

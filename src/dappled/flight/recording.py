@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, TypeVar
 
-from dappled import durable, findings
+from dappled import durable
 from dappled.clock import Clock
 from dappled.findings import FRAME, Code, Finding, Subject, finding
 from dappled.flight import layout, provenance, recovery, seals
@@ -49,14 +49,6 @@ class FileBytes(Protocol):
         """Where whoever wrote them has hashed them."""
 
 
-class StrayFileError(FlightError):
-    """The file was made safe, but it is not the frame of a shot: it is kept among the frames as `stray`."""
-
-    def __init__(self, stray: Stray) -> None:
-        super().__init__(str(stray.reason and findings.named(stray.reason)))
-        self.stray = stray
-
-
 class Recorder:
     """Writes the frames of one flight. One thread calls it.
 
@@ -77,14 +69,15 @@ class Recorder:
     def record(self, index: int, camera_name: str, blob: FileBytes, *, arrived_utc_ns: int) -> Frame:
         """Make the file of shot `index` safe: on return its bytes, its name and its ledger row are durable.
 
-        The same bytes a second time give the same Frame. Raises StrayFileError (the bytes are kept under another name)
-        for a second file of a shot or an unknown shot, and FlightError when the disk or the blob fails: then no torn
-        file is left under a final name, and the shot is noted as failed if the ledger can still be written.
+        The same bytes a second time give the same Frame. Raises FlightError for a second file of a shot or an
+        unknown shot, whose bytes are kept as a stray, and when the disk or the blob fails: then no torn file is left
+        under a final name, and the shot is noted as failed if the ledger can still be written.
         """
         row = self._ledger.shot(index)
         if row is None:
             why = finding(Code.FILE_UNASKED, Subject("file", camera_name), shot=index)
-            raise StrayFileError(self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns))
+            self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns)
+            raise FlightError(why)
         first = self._ledger.frame(index)
         if first is not None:
             return self._again(first, camera_name, blob, arrived_utc_ns)
@@ -126,7 +119,8 @@ class Recorder:
             self._ledger.add_event("double", finding(Code.FILE_CAME_AGAIN, FRAME, file=camera_name), first.index)
             return first
         why = finding(Code.FILE_SECOND, Subject("file", camera_name), shot=first.index, frame=first.name)
-        raise StrayFileError(self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns))
+        self.record_stray(camera_name, blob, why, arrived_utc_ns=arrived_utc_ns)
+        raise FlightError(why)
 
     def _write(self, name: str, camera_name: str, blob: FileBytes) -> str:
         path = self._folder.path / name

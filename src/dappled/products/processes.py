@@ -15,6 +15,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from dappled.closing import Closing
+from dappled.errors import DappledError
 from dappled.large_blocks import reuse_large_blocks
 from dappled.shown import guard_output
 
@@ -176,6 +177,14 @@ def _work(channel: Connection) -> None:
         make = new or make
         assert make is not None
         channel.send(make(job))
+
+
+def tried(make: Callable[[Job], Answer], job: Job) -> Answer | DappledError:
+    """What is made of a job, or why not, as it may come from another process."""
+    try:
+        return make(job)
+    except DappledError as error:
+        return DappledError(error.finding or str(error))
 
 
 def single_threaded() -> None:

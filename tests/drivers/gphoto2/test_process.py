@@ -37,7 +37,6 @@ from dappled.drivers.gphoto2.protocol import (
     CardContents,
     Fetched,
     FileAdded,
-    HeldError,
     LostError,
     NotOnBusError,
     RefusedError,
@@ -616,7 +615,7 @@ def test_a_shot_is_fired_where_the_body_is_still_closing_for_the_listing(ready: 
     three_shots(ready)
     made(ready, 4, b"by hand", tells=False)
     assert brought(shot_on(ready, 4, body_s(ready), 5)) == [(4, b"5", False)]
-    ready.camera.errors["open"] = [HeldError("busy")]
+    ready.camera.errors["open"] = [SessionError("busy")]
     assert states(ready.turn(5.5, steps=1)) == []
     ready.fire(5)
     assert [type(event) for event in ready.turn(0.3) if isinstance(event, Fired | Arrival)] == [Fired, Arrival]

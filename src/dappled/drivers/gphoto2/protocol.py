@@ -38,10 +38,6 @@ class NotOnBusError(AbsentError):
     """It will not be there before something changes on the USB bus."""
 
 
-class HeldError(SessionError):
-    """The camera is there and can't be opened."""
-
-
 class LostError(SessionError):
     """The session is unusable: close it and open another."""
 

@@ -27,7 +27,6 @@ from dappled.drivers.gphoto2.protocol import (
     Fetched,
     FileAdded,
     FileFacts,
-    HeldError,
     LostError,
     NotOnBusError,
     RefusedError,
@@ -155,13 +154,13 @@ def _opened(model: str, port: str) -> Any:
         camera.init()
     except gp.GPhoto2Error as error:
         if error.code in _HELD:
-            raise HeldError(
+            raise SessionError(
                 f"the camera at {port} can't be opened ({error.string}): another program holds it, often the desktop's "
                 "gvfs-gphoto2-volume-monitor; end that program"
             ) from error
         if error.code in _GONE:
             raise AbsentError(f"no camera answers at {port} ({error.string}): connect it and switch it on") from error
-        raise HeldError(f"the camera at {port} can't be opened: {error.string}; switch it off and on") from error
+        raise SessionError(f"the camera at {port} can't be opened: {error.string}; switch it off and on") from error
     return camera
 
 

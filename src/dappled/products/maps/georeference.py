@@ -7,7 +7,7 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -157,7 +157,7 @@ def survey(
     with processes.Crew(workers) as crew:
         told = _told(recipe, stations, files, crew, progress) if options.view == MEAN else {}
         develop = _Developing(flight, recipe, options, projection.name, scratch, watch, told, flown)
-        with closing(crew.in_order(stations, develop, _lost)) as made:
+        with closing(crew.in_order(stations, partial(processes.tried, develop), _lost)) as made:
             for number, station in enumerate(stations):
                 progress("develop", number, len(stations))
                 one = next(made)
@@ -206,21 +206,18 @@ class _Developing:
         """The map's."""
         return Projection(self.projection_name)
 
-    def __call__(self, station: Station) -> Photograph | DappledError:
-        """A photograph without its picture, which lies on the shelf; or why there is none."""
+    def __call__(self, station: Station) -> Photograph:
+        """A photograph without its picture, which lies on the shelf. Raises DappledError."""
         options = self.options
-        try:
-            frame = laboratory(self.recipe).frame(
-                self.flight, station.frame, station.tag,
-                focal_length_mm=options.focal_length_mm, f_number=options.f_number,
-                told=self.told.get(station.frame.index, ()), flown_nats=self.flown.get(station.frame.index),
-            )  # fmt: skip
-            one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
-            if self.watch is not None:
-                self.watch(one, frame.decoded.light_field)
-            one = replace(one, doubts=frame.doubts, mask_nats=frame.mask_nats)
-        except DappledError as error:
-            return DappledError(str(error))  # it may come from another process
+        frame = laboratory(self.recipe).frame(
+            self.flight, station.frame, station.tag,
+            focal_length_mm=options.focal_length_mm, f_number=options.f_number,
+            told=self.told.get(station.frame.index, ()), flown_nats=self.flown.get(station.frame.index),
+        )  # fmt: skip
+        one = frame.photograph(station, self.projection, view=options.view, focus_m=options.focus_m)
+        if self.watch is not None:
+            self.watch(one, frame.decoded.light_field)
+        one = replace(one, doubts=frame.doubts, mask_nats=frame.mask_nats)
         return _shelved(one, self.scratch)
 
 
