@@ -71,10 +71,10 @@ CPUWeight=400 against this.
 other work (load 5.7): 0.95 a megapixel. Patches with any disparity take a quarter, patches at rest another one,
 likelihoods of kinds a sixth, depth map and the mask's place a twelfth each.
 
-**Photographs and maps of a flight, 1.5 CPU seconds a frame of 2.5 MP.** Not measured on a calm machine. A Bayer frame
-of the simulated flight, one thread, in turns with commit 5ad8b79f beside other work (load 9): what it tells of its
-shadow 0.40 (0.62), its picture about 0.45 as before. LibRaw's colours take 0.2. Eight frames as KMZ make 132 000 page
-faults (513 000).
+**Photographs and maps of a flight, 1.5 CPU seconds a frame of 2.5 MP.** A further Bayer frame of the simulated flight
+on a KMZ, one thread, load 3 to 8, one pair: 2.04 (2.94 at commit 5ad8b79f); 8 frames make 41 000 page faults (190 000).
+What a frame tells of its shadow takes 0.40 of it (0.62), its picture about 0.45 as before, LibRaw's colours 0.2; most
+of the rest draws and compresses the map. Photographs were not measured.
 
 **Joint views in 400 MB for 10 MP.** A decode of 10.24 MP to 5 × 5 views allocates 390 MB at most in Python, with one
 worker.
