@@ -628,7 +628,7 @@ def test_telemetry_that_comes_too_seldom_is_named_with_its_rate_until_it_comes_a
 
     def slow() -> list[tuple[object, ...]]:
         found = [one for one in rig.component.findings() if one.code is Code.TELEMETRY_SLOW]
-        return [(one.subject.which, round(float(one.facts["seen_hz"] or 0)), one.facts["wanted_hz"]) for one in found]
+        return [(one.subject.which, round(float(str(one.facts["seen_hz"]))), one.facts["wanted_hz"]) for one in found]
 
     fly(12, 50, 10)
     assert slow() == [("ATTITUDE_QUATERNION", 10, 50)]
