@@ -154,7 +154,7 @@ def _flights(given: Sequence[Path]) -> list[Path]:
     """The flights that were named, and those in folders of flights that were."""
     found: list[Path] = []
     for path in given:
-        inside = [] if (path / "flight.toml").exists() or not path.is_dir() else layout.flights(path)
+        inside = [] if (path / "flight.toml").exists() or not path.is_dir() else layout.held_flights(path)
         found += [one.path for one in inside] or [path]
     return found
 

@@ -250,11 +250,12 @@ def show(path: Path) -> FlightContents:
 
 
 def list_flights(root: Path) -> list[ListedFlight]:
-    """All flights under `root`; one that can't be read is listed with the reason. Raises FlightError for no folder."""
+    """All flights under `root`, renamed ones too; one that can't be read is listed with the reason. Raises FlightError
+    for no folder."""
     if not root.is_dir():
         raise FlightError(f"there is no flights folder {root}; check record.directory")
     listed = []
-    for folder in layout.flights(root):
+    for folder in layout.held_flights(root):
         try:
             listed.append(ListedFlight(folder.name, folder.path, balance(folder.path), None))
         except FlightError as error:

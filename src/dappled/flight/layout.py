@@ -198,6 +198,13 @@ def flights(root: Path) -> list[FlightFolder]:
     return [FlightFolder(root / name) for name in _folders(root) if is_flight_name(name)]
 
 
+def held_flights(root: Path) -> list[FlightFolder]:
+    """All flights under `root`, by name, also those that somebody gave another name. Raises FlightError."""
+    with disk_errors("list the flights in", root):
+        named = [(name, root / name) for name in _folders(root) if not durable.is_temporary(name)]
+        return [FlightFolder(path) for name, path in named if is_flight_name(name) or not not_a_flight(path)]
+
+
 def _folders(root: Path) -> list[str]:
     try:
         return sorted(entry.name for entry in os.scandir(root) if entry.is_dir(follow_symlinks=False))

@@ -182,6 +182,17 @@ def test_a_flight_is_shown_line_by_line(recorded: FlightFolder) -> None:
     assert shown.facts["telemetry_packets"] == 20
 
 
+def test_a_flight_under_another_name_is_listed_and_what_is_no_flight_is_not(recorded: FlightFolder) -> None:
+    renamed = recorded.path.rename(recorded.path.with_name("first field"))
+    (beside := renamed.with_name("pictures")).mkdir()
+    (making := renamed.with_name(".made.part")).mkdir()
+    (making / "flight.toml").write_bytes(b"")
+    (beside / "frame.dng").write_bytes(b"")
+    (listed,) = flight_report.list_flights(renamed.parent)
+    assert (listed.path, listed.problem) == (renamed, None)
+    assert listed.balance == flight_report.balance(renamed)
+
+
 def test_flights_are_listed_with_what_is_wrong(recorded: FlightFolder) -> None:
     (other := recorded.path.with_name("20260101T000000Z-00000000")).mkdir()
     listed = flight_report.list_flights(recorded.path.parent)
