@@ -106,8 +106,10 @@ class Machine:
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, env={**os.environ, **here},
             )  # fmt: skip
         # Its processes wait for each other thousands of times a second: each time behind what else runs on this host,
-        # and where nothing does, for a core that sleeps: a virtual one takes its time to wake.
+        # and where nothing does, for a core that sleeps: a virtual one takes its time to wake. On one and the same core
+        # none has to be woken: READY after 1.1 s instead of 5.1.
         with contextlib.suppress(OSError):
+            os.sched_setaffinity(self._process.pid, {max(os.sched_getaffinity(0))})
             os.sched_setscheduler(self._process.pid, os.SCHED_RR, os.sched_param(1))
         self._awake = [subprocess.Popen([sys.executable, "-c", AWAKE]) for _ in range(os.cpu_count() or 1)]
         while time.monotonic() < began + within_s:
