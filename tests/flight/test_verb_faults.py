@@ -21,6 +21,7 @@ import pytest
 from tests.flight.verbs import VERBS
 
 HERE = Path(__file__).parent
+FEWEST = {"geotag": 700}  # refused faults at least, with each call: it makes 181, of which 1086 faults can come
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def sweep(shim: Path, name: str, place: Path, step: int) -> dict[str, Any]:
 def test_some_calls_that_fail_lose_no_frame(shim: Path, place: Path, name: str, step: int) -> None:
     found = sweep(shim, name, place, step)
     assert found["wrong"] == []
-    assert found["refused"] > 700 / step  # of the 1086 faults that geotag's 181 calls can meet
+    assert found["refused"] > FEWEST.get(name, 755) / step
 
 
 @pytest.mark.long

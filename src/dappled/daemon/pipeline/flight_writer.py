@@ -11,7 +11,7 @@ from dappled.clock import Clock
 from dappled.drivers.camera import Blob, Fired
 from dappled.drivers.raw.recipe import DECISION, LawDecision
 from dappled.errors import DappledError, report
-from dappled.findings import FRAME, Code, Finding, Subject, finding, named
+from dappled.findings import Code, Finding, Subject, finding, named
 from dappled.flight import Frame, Recording, Result, Shot, Tag
 
 log = logging.getLogger(__name__)
@@ -125,9 +125,7 @@ class LedgerWriter:
     def law_decided(self, decision: LawDecision) -> None:
         """Write the law that a frame showed into flight.toml, so that replays and products decode as the flight did."""
         self.recording.add_facts({DECISION: codec.plain(decision)})
-        self.event(
-            "law", finding(Code.DECODE_LAW_DECIDED, FRAME, law=decision.law, frame=decision.first), decision.first
-        )
+        self.event("law", decision.found, decision.first)
 
     def decoded(self, result: Result) -> None:
         self.recording.ledger.add_result(result)

@@ -162,7 +162,7 @@ class Decoding:
             writer.path(frame), tag.focal_length_mm, tag.f_number, index=frame.index, look=True
         )
         law = decoded.decision
-        decided = () if law is None else (finding(Code.DECODE_LAW_DECIDED, FRAME, law=law.law, frame=law.first),)
+        decided = () if law is None else (law.found,)
         self.failures = replace(self.failures, in_a_row=0, found=(*decoded.doubts, *decoded.about_flight, *decided))
         pending.decoded = decoded
         self._unrecorded = decoded.decision or self._unrecorded

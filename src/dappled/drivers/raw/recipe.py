@@ -12,6 +12,7 @@ from dappled import codec, confined
 from dappled.config import profiles
 from dappled.decode.optics import LAWS
 from dappled.errors import DappledError
+from dappled.findings import FRAME, Code, Finding, finding
 
 FOLDER = "inputs"
 """The folder of a flight that keeps copies of the recipe's files and profiles."""
@@ -38,6 +39,11 @@ class LawDecision:
         """Raises ValueError for an unknown law."""
         if self.law not in LAWS:
             raise ValueError(f"the law {self.law!r} is unknown")
+
+    @property
+    def found(self) -> Finding:
+        """It as a finding, for ledger and pilot."""
+        return finding(Code.DECODE_LAW_DECIDED, FRAME, law=self.law, frame=self.first)
 
 
 @dataclass(frozen=True, slots=True)
