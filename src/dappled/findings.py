@@ -224,10 +224,10 @@ def in_order(found: Sequence[Finding]) -> list[Finding]:
 
 
 class _Sentences(string.Formatter):
-    """Formats facts as `str.format` does. `{reason:?: }` is empty, or ": " and the reason; `{frames:#frame}` is
-    1 frame, 2 frames; `{why}` of an error or a finding is what it says and what to do, `{why:-}` without what
-    to do, and without the name of a file. Facts may come from damaged files: one that is missing, or of another type,
-    is shown as it is.
+    """Formats facts as `str.format` does. `{reason:?: }` is empty, or ": " and the reason; behind a stroke the value
+    has a format of its own (`{focus_m:?, m: |.3g}`). `{frames:#frame}` is 1 frame, 2 frames; `{why}` of an error or a
+    finding is what it says and what to do, `{why:-}` without what to do, and without the name of a file. Facts may come
+    from damaged files: one that is missing, or of another type, is shown as it is.
     """
 
     def get_value(self, key: int | str, args: Sequence[Any], kwargs: Mapping[str, Any]) -> Any:
@@ -239,7 +239,8 @@ class _Sentences(string.Formatter):
             value = str(value.words(named=whole) if isinstance(value, Fault) else _led_by(value, whole=whole))
         format_spec = format_spec.removeprefix("-")
         if format_spec.startswith("?"):
-            return "" if value in (None, "") else f"{format_spec[1:]}{value}"
+            clause, _, own = format_spec[1:].partition("|")
+            return "" if value in (None, "") else clause + self.format_field(value, own)
         if format_spec.startswith("#") and isinstance(value, int):
             return f"{value} {format_spec[1:]}" + ("" if value == 1 else "s")
         try:

@@ -56,6 +56,16 @@ def nearest(word: str, known: Iterable[str]) -> str:
     return f"; did you mean {near!r}?" if near else ""
 
 
+class _LeftOut:
+    """Stands for the parser of a verb that the call doesn't name: to make 50 of them takes argparse 50 ms."""
+
+    def add_subparsers(self, **_: object) -> _LeftOut:
+        return self
+
+    def add_parser(self, *_: object, **__: object) -> _LeftOut:
+        return self
+
+
 @dataclass(frozen=True, slots=True)
 class Call:
     """A command line that was read: the verb with its arguments, the words that name it, and --debug."""
@@ -127,10 +137,10 @@ def _plain(spec: Field[Any], value: Any) -> Any:
 
 def parser(path: str = "") -> CommandParser:
     """The whole command line. Only the verb of this path has its arguments; of other verbs and groups only the line is
-    there that tells of them: to make 50 parsers takes argparse 50 ms."""
+    there that tells of them."""
 
-    def wanted(**given: Any) -> CommandParser | None:
-        return CommandParser(**given) if f"dappled {path} ".startswith(f"{given['prog']} ") else None
+    def wanted(**given: Any) -> CommandParser | _LeftOut:
+        return CommandParser(**given) if f"dappled {path} ".startswith(f"{given['prog']} ") else _LeftOut()
 
     made: Any = {"parser_class": wanted, "required": True}
     top = CommandParser(
@@ -140,16 +150,16 @@ def parser(path: str = "") -> CommandParser:
     )
     top.add_argument("--version", action="version", version=f"dappled {dappled.__version__}")
     top.add_argument("--debug", action="store_true", help="show tracebacks and the log's details")
-    branches = {"": top.add_subparsers(metavar="VERB", **made)}
+    branches: dict[str, Any] = {"": top.add_subparsers(metavar="VERB", **made)}
     for name, (_, line) in VERBS.items():
         group, _, last = name.rpartition(" ")
         if group not in branches:
             one = branches[""].add_parser(group, **_described(GROUPS[group]))
-            branches[group] = one and one.add_subparsers(metavar="ACTION", **made)
+            branches[group] = one.add_subparsers(metavar="ACTION", **made)
             if path == group:
                 own = [verb_class(other).examples[0] for other in VERBS if other.startswith(f"{group} ")]
                 one.epilog = _told(own)
-        leaf: Any = branches[group] and branches[group].add_parser(last, **_described(line))
+        leaf = branches[group].add_parser(last, **_described(line))
         if name == path:
             _fill(leaf, verb_class(name))
     return top

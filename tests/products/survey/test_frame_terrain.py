@@ -169,6 +169,7 @@ def test_a_focus_that_was_told_wrong_is_doubted_and_found() -> None:
     assert doubt.code is Code.HEIGHTS_OFF
     assert doubt.facts["focus_m"] == pytest.approx(200, rel=0.03)
     assert "from the given ground as a whole" in str(text(doubt))
+    assert f"(--focus), in m: {doubt.facts['focus_m']:.3g}" in str(text(doubt))
     assert found.focus_m == pytest.approx(200, rel=0.03)
     assert len(frame_terrain.told(made, frame_terrain.of(made, {"000000": depth}, quiet))) == 1
 

@@ -163,9 +163,8 @@ def told(made: Survey, terrain: FrameTerrain) -> list[Finding]:
     worth = facts | {"frames": round(facts["frames"]), "relief_m": 3 * facts["single_sigma_m"]}
     said = [finding(Code.HEIGHTS_OF_FRAMES, about, **worth)]
     if abs(terrain.level_m) > _LEVEL_SIGMAS * math.hypot(terrain.level_sigma_m, made.ground.sigma_m, facts["sigma_m"]):
-        focus_m = float(f"{terrain.focus_m:.3g}")
-        off = finding(Code.HEIGHTS_OFF, about, off_m=terrain.level_m, distances_from=terrain.source, focus_m=focus_m)
-        said.append(off)
+        source, focus_m = terrain.source, terrain.focus_m
+        said.append(finding(Code.HEIGHTS_OFF, about, off_m=terrain.level_m, distances_from=source, focus_m=focus_m))
     return said
 
 
