@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import base64
 import html
-import io
 from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+
+from dappled.encoded_pictures import file_of
 
 _LONGEST = 240  # pixels of the picture
 _QUALITY = 80
@@ -21,9 +21,8 @@ def block(line: str, picture: NDArray[np.floating] | None, remarks: Iterable[str
     if picture is not None:
         step = max(1, -(-max(picture.shape[:2]) // _LONGEST))
         eight = np.rint(255 * picture[::step, ::step]).astype(np.uint8)
-        file = io.BytesIO()
-        Image.fromarray(eight).save(file, "JPEG", quality=_QUALITY)
-        parts.append(f'<img alt="" src="data:image/jpeg;base64,{base64.b64encode(file.getvalue()).decode()}">')
+        jpeg = base64.b64encode(file_of(eight, "JPEG", quality=_QUALITY)).decode()
+        parts.append(f'<img alt="" src="data:image/jpeg;base64,{jpeg}">')
     parts += [f"<div>{html.escape(one)}</div>" for one in remarks]
     return "".join(parts)
 

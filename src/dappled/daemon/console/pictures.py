@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 from scipy import fft
 
 from dappled.decode import srgb
 from dappled.decode.lightfield import ViewStack
 from dappled.decode.lightfield.refocus import shift_and_add
+from dappled.encoded_pictures import file_of
 from dappled.findings import Finding
 
 Grey = NDArray[np.uint8]
@@ -154,18 +153,12 @@ def depth_colours(disparity: NDArray[np.float32], sigma: NDArray[np.float32] | N
 
 def jpeg(picture: NDArray[np.uint8], quality: int = 85) -> bytes:
     """A JPEG file."""
-    return _file(picture, "JPEG", quality=quality)
+    return file_of(picture, "JPEG", quality=quality)
 
 
 def png(picture: NDArray[np.uint8]) -> bytes:
     """A PNG file."""
-    return _file(picture, "PNG", compress_level=3)
-
-
-def _file(picture: NDArray[np.uint8], kind: str, **options: int) -> bytes:
-    file = io.BytesIO()
-    Image.fromarray(picture).save(file, kind, **options)
-    return file.getvalue()
+    return file_of(picture, "PNG", compress_level=3)
 
 
 def _pooled(band: NDArray[np.floating], size: tuple[int, int]) -> NDArray[np.floating]:

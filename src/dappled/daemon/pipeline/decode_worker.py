@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 import logging
 import os
 import signal
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from dappled import codec
 from dappled.config import profiles
@@ -35,6 +33,7 @@ from dappled.drivers.raw import recipe_check
 from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
 from dappled.drivers.raw.frame_mosaic import mosaic_of
 from dappled.drivers.raw.recipe import LawDecision
+from dappled.encoded_pictures import file_of
 from dappled.errors import DappledError, sentence
 from dappled.findings import FRAME, Code, Finding, finding
 from dappled.shown import guard_output
@@ -233,9 +232,7 @@ class DecodeWorker:
     def _preview(self, slices: Any, carriers: Any) -> tuple[bytes, tuple[int, int]]:
         step = max(1, round(max(slices.shape[1:]) * np.sqrt(2 * len(slices) - 1) / self._preview_px))
         mosaic = slice_mosaic(slices[:, ::step, ::step], carriers)
-        file = io.BytesIO()
-        Image.fromarray(mosaic).save(file, "JPEG", quality=80)
-        return file.getvalue(), (mosaic.shape[1], mosaic.shape[0])
+        return file_of(mosaic, "JPEG", quality=80), (mosaic.shape[1], mosaic.shape[0])
 
 
 def _fine(done: DecodeResult, *, staggered: bool) -> FineDetail:

@@ -12,12 +12,12 @@ import numpy as np
 import rawpy
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
 
 from dappled.decode import srgb
 from dappled.decode.array_types import Floats, Singles
 from dappled.decode.picture.picture import interpolated
 from dappled.drivers.raw.picture_maker import MadePicture
+from dappled.encoded_pictures import file_of
 
 LINEAR_RAW = 34892  # a photometric interpretation, as _CFA
 _CFA = 32803
@@ -41,9 +41,7 @@ def developed(made: MadePicture) -> NDArray[np.uint16]:
 
 def jpeg(made: MadePicture) -> bytes:
     """A JPEG in sRGB, to look at."""
-    file = io.BytesIO()
-    Image.fromarray(srgb.eight(developed(made))).save(file, "JPEG", quality=_QUALITY)
-    return file.getvalue()
+    return file_of(srgb.eight(developed(made)), "JPEG", quality=_QUALITY)
 
 
 def linear(made: MadePicture, *, colour: bool = True) -> Singles:

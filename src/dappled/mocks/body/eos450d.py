@@ -7,7 +7,6 @@ busy during a capture, and no shot to memory before the computer has announced r
 
 from __future__ import annotations
 
-import io
 import math
 import struct
 import threading
@@ -21,6 +20,7 @@ from typing import TypeAlias
 from PIL import Image
 
 from dappled.clock import Clock
+from dappled.encoded_pictures import file_of
 from dappled.mocks.body import ptp
 from dappled.mocks.body.eos_card import CARD_BYTES, FOLDER, STORAGE, Card, StoredObject
 from dappled.mocks.body.faults import BodyFaults
@@ -239,9 +239,7 @@ def _announced(made: StoredObject, to_memory: bool) -> bytes:
 
 def thumbnail(number: int) -> bytes:
     """The JPEG beside the raw file of the shot with this number: a small grey picture, its own for each."""
-    file = io.BytesIO()
-    Image.new("L", (64, 48), number % 256).save(file, "JPEG", comment=f"shot {number}")
-    return file.getvalue()
+    return file_of(Image.new("L", (64, 48), number % 256), "JPEG", comment=f"shot {number}")
 
 
 def chart(number: int) -> bytes:
@@ -253,9 +251,7 @@ def chart(number: int) -> bytes:
         picture.paste(200, (line, 160, line + 2, 320))
     left = 8 * number % 460
     picture.paste(255, (left, 230, left + 20, 250))
-    file = io.BytesIO()
-    picture.save(file, "JPEG", quality=85)
-    return file.getvalue()
+    return file_of(picture, "JPEG", quality=85)
 
 
 _VIEWFINDER_JPEG = 1  # type of a block of the viewfinder's data; length and type go before the bytes

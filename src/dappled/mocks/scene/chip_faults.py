@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import io
-
 import numpy as np
-from PIL import Image
 from scipy import ndimage
 
 from dappled.decode import srgb
 from dappled.decode.array_types import Singles
+from dappled.encoded_pictures import file_of
 
 RGGB = np.array([[0, 1], [1, 2]])
 
@@ -80,6 +78,4 @@ def encoded(linear: Singles) -> Singles:
 
 def jpeg_of(linear: Singles, quality: int) -> bytes:
     """An sRGB JPEG of linear light (H, W) or (H, W, 3), 1.0 = white."""
-    file = io.BytesIO()
-    Image.fromarray(np.rint(encoded(linear) * 255).astype(np.uint8)).save(file, "JPEG", quality=quality)
-    return file.getvalue()
+    return file_of(np.rint(encoded(linear) * 255).astype(np.uint8), "JPEG", quality=quality)

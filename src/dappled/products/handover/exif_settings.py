@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
-from PIL import Image
 
 from dappled import __version__
+from dappled.encoded_pictures import file_of
 from dappled.products.geotags.exif_gps import Entry, ratio_entry, text_entry
 
 EXIF_IFD = 0x8769
@@ -74,6 +74,4 @@ def tiff(values: NDArray[Any], *more: tuple[int, int, int, bytes, bool]) -> byte
 
 def jpeg(values: NDArray[np.uint8], exif: bytes) -> bytes:
     """A JPEG of (h, w) or (h, w, 3) values, as good as the first copy should be, with this EXIF."""
-    buffer = io.BytesIO()
-    Image.fromarray(values).save(buffer, "JPEG", quality=95, subsampling=0, exif=exif)
-    return buffer.getvalue()
+    return file_of(values, "JPEG", quality=95, subsampling=0, exif=exif)

@@ -7,7 +7,6 @@ LibRaw makes of the mosaic, with the camera's white balance and matrix, in sRGB.
 
 from __future__ import annotations
 
-import io
 import math
 import struct
 from pathlib import Path
@@ -19,6 +18,7 @@ from dappled import durable
 from dappled.decode import srgb
 from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
+from dappled.encoded_pictures import file_of
 from dappled.products.geotags import exif_gps
 from dappled.products.geotags.exif_gps import Entry, text_entry
 from dappled.products.handover import exif_settings
@@ -51,9 +51,7 @@ def encoded(
         if kind == ".png":
             # Pillow writes no 16-bit colours: 8 bits are what a PNG is looked at with.
             eight = shown if shown.ndim == 2 else srgb.eight(shown)
-            buffer = io.BytesIO()
-            Image.fromarray(eight).save(buffer, "PNG", exif=exif, compress_level=1)
-            data = buffer.getvalue()
+            data = file_of(eight, "PNG", exif=exif, compress_level=1)
         else:
             data = exif_settings.jpeg(srgb.eight(shown), exif)
     return data if where is None else exif_gps.tagged(data, where)

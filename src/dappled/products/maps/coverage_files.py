@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from dappled import durable
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry.area import PlannedArea
+from dappled.encoded_pictures import file_of
 from dappled.errors import counted
 from dappled.products.extras import need
 from dappled.products.maps import cog
@@ -92,9 +92,7 @@ def write_picture(
     sheet = Image.new("RGB", (max(size[0], _SIDE), size[1] + 150), (255, 255, 255))
     sheet.paste(drawn, (0, 0))
     _legend(ImageDraw.Draw(sheet), font, size[1] + 12, zoom / covered.grid.step_x, least)
-    file = io.BytesIO()
-    sheet.save(file, "PNG")
-    durable.write_file(path.absolute(), file.getvalue())
+    durable.write_file(path.absolute(), file_of(sheet, "PNG"))
 
 
 def _legend(pen: ImageDraw.ImageDraw, font: Any, top: int, px_per_m: float, least: int) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pictures
 
 from dappled import durable
+from dappled.encoded_pictures import file_of
 from dappled.products.maps.map_grid import MapGrid
 
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
@@ -157,12 +158,8 @@ def _region(grid: MapGrid) -> ET.Element:
 def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
     """Add the picture as PNG to the archive's files; returns its name."""
     mode = "LA" if picture.shape[2] == 2 else "RGBA"
-    memory = io.BytesIO()
-    Pictures.fromarray(np.ascontiguousarray(picture), mode).save(
-        memory, "PNG", compress_level=1, compress_type=zlib.Z_RLE
-    )
-    name = f"{place}.png"
-    files[name] = memory.getvalue()
+    drawn, name = Pictures.fromarray(np.ascontiguousarray(picture), mode), f"{place}.png"
+    files[name] = file_of(drawn, "PNG", compress_level=1, compress_type=zlib.Z_RLE)
     return name
 
 
