@@ -211,8 +211,7 @@ class MaskDecoder:
         lattice = self.optics.lattice(focal_length_mm)
         if self.ratio is None:
             return lattice
-        (ay, ax), (by, bx) = np.reshape(self.ratio, (2, 2)) @ lattice.matrix()
-        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+        return Lattice.of(np.reshape(self.ratio, (2, 2)) @ lattice.matrix())
 
     def predict(self, focal_length_mm: float) -> list[Carrier]:
         """The half plane's carriers that lie on the sensor, (0, 0) first."""

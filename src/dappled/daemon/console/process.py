@@ -23,7 +23,6 @@ from dappled.drivers.child_process import ChannelError, ChannelMessage, ProcessC
 from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 
-log = logging.getLogger(__name__)
 _BACKLOG = 32
 _TOKEN_CHARACTERS = 12
 _ANSWER_S = 3.0

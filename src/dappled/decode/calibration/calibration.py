@@ -145,8 +145,7 @@ class Calibration:
         correction = np.array(
             [[np.interp(focal_length_mm, lengths, [c[i, j] for c in corrections]) for j in (0, 1)] for i in (0, 1)]
         )
-        (ay, ax), (by, bx) = self._law(focal_length_mm, distance) @ correction
-        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+        return Lattice.of(self._law(focal_length_mm, distance) @ correction)
 
     def mask_move(
         self,

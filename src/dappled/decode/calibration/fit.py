@@ -196,13 +196,11 @@ def _mean(fits: list[LatticeFit]) -> LatticeFit:
     those that know it: the stop of another frame may have averaged it out."""
     if len(fits) == 1:
         return fits[0]
-    matrix = np.mean([f.lattice.matrix() for f in fits], axis=0)
-    (ay, ax), (by, bx) = matrix
     transfers = np.array([f.transfer for f in fits])
     turns = np.exp(2j * np.pi * np.array([f.origin for f in fits])).mean(axis=0)
     return replace(
         fits[0],
-        lattice=Lattice((float(ay), float(ax)), (float(by), float(bx))),
+        lattice=Lattice.of(np.mean([f.lattice.matrix() for f in fits], axis=0)),
         rotation_rad=float(np.mean([f.rotation_rad for f in fits])),
         mask_distance_mm=float(np.mean([f.mask_distance_mm for f in fits])),
         distance_fitted=all(f.distance_fitted for f in fits),

@@ -21,9 +21,7 @@ from dappled.findings import Code, Finding, Level, Subject
 
 # Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
 
-_ALIKE_BINS = 0.5  # rms from their lattice: peaks farther off belong to the scene
 _CLEAR = 6.5  # times the level around: noise moves a carrier so strong by less than a tenth of a bin
-_ENOUGH = 0.6  # of a mask's carriers: a prediction with so many peaks near it is the right one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,8 +127,7 @@ def refine(spectrum: Spectrum, lattice: Lattice, orders: Sequence[Order], worker
             weights.append(weight)
         root = np.sqrt(np.array(weights))[:, None]
         correction = np.linalg.lstsq(np.array(k, dtype=np.float64) * root, np.array(shifts) * root, rcond=None)[0]
-        (ay, ax), (by, bx) = lattice.matrix() + correction
-        lattice = Lattice((float(ay), float(ax)), (float(by), float(bx)))
+        lattice = Lattice.of(lattice.matrix() + correction)
     return lattice
 
 

@@ -40,8 +40,7 @@ class LatticeChange:
     def of(self, lattice: Lattice) -> Lattice:
         """A predicted lattice, changed so."""
         c, s = math.cos(self.turn_rad), math.sin(self.turn_rad)
-        (ay, ax), (by, bx) = (1 + self.off) * lattice.matrix() @ np.array([[c, -s], [s, c]])
-        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+        return Lattice.of((1 + self.off) * lattice.matrix() @ np.array([[c, -s], [s, c]]))
 
     @property
     def finding(self) -> Finding:

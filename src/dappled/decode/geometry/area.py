@@ -18,7 +18,6 @@ from dappled.decode.array_types import Floats
 from dappled.errors import DappledError, counted, first_line
 
 MOST_CORNERS = 2000  # a drawn field has fewer; a ring is compared with itself, side by side
-_BAD = (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError, ElementTree.ParseError)
 Ring = tuple[tuple[float, float], ...]  # (latitude, longitude) in degrees, the first corner not repeated
 
 

@@ -85,7 +85,7 @@ _TOLD_MOTIONLESS = (0.7, 0.86, 2.65)  # the same, of patches at rest that are as
 @dataclass(frozen=True, slots=True, eq=False)
 class JointViews:
     """`views` float32 (V, U, h, w), and their standard errors `sigma` float32 (V, U, m, n), one for each patch: in the
-    view's samples patch (i, j) lies around (STEP·i − 0.5, STEP·j − 0.5).
+    view's samples patch (i, j) lies around (S·i − 0.5, S·j − 0.5), S = SIDE / 2.
 
     `shares` of its patches say how views were made.
     """

@@ -23,7 +23,6 @@ Doubles = NDArray[Any]
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
 SIDE = 24  # samples: a patch is wide against parallax, and small against things at one disparity
-STEP = SIDE // 2  # from one patch to the next
 FARTHEST = 2.0  # times the reach: nothing that moves farther is told from other things
 STILL = 1 / 16  # of the reach: hardly any parallax
 MOTIONLESS = STILL / 4  # of the reach: what a patch by itself can't tell from none

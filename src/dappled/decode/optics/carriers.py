@@ -92,6 +92,12 @@ class Lattice:
     ky: Vector
     kx: Vector
 
+    @classmethod
+    def of(cls, matrix: NDArray[np.float64]) -> Lattice:
+        """The lattice that has this `matrix` (2, 2)."""
+        (ay, ax), (by, bx) = matrix.tolist()
+        return cls((ay, ax), (by, bx))
+
     def matrix(self) -> NDArray[np.float64]:
         """(2, 2), rows the two vectors: frequencies = orders @ matrix."""
         return np.array([self.ky, self.kx], dtype=np.float64)

@@ -41,5 +41,4 @@ def searched(part: Singles, lattice: Lattice, orders: Sequence[Order], *, turned
     if scores[at] < middle + _CLEAR * scatter:
         return lattice
     turn, scale = turns[at[1]], 1 + scales[at[0]]
-    (a, b), (c, d) = scale * np.asarray(lattice.rotated(float(turn)).matrix())
-    return Lattice((float(a), float(b)), (float(c), float(d)))
+    return Lattice.of(scale * lattice.rotated(float(turn)).matrix())

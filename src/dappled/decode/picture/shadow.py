@@ -202,8 +202,7 @@ def lattice_bins(shape: tuple[int, int], lattice: Lattice) -> Floats:
 
 
 def lattice_of_bins(shape: tuple[int, int], bins: Floats) -> Lattice:
-    (a, b), (c, d) = (bins.reshape(2, 2) / np.array(shape)[:, None]).T
-    return Lattice((float(a), float(b)), (float(c), float(d)))
+    return Lattice.of((bins.reshape(2, 2) / np.array(shape)[:, None]).T)
 
 
 def _no_shadow(told: ShadowEvidence) -> Shadow:

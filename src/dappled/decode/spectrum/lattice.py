@@ -12,7 +12,7 @@ from scipy import ndimage
 
 from dappled.decode.errors import DecodeError
 from dappled.decode.optics import Carrier, Lattice, Order
-from dappled.decode.spectrum.peaks import Measured, fit, is_suspect, lattice_from, measure, residual_bins
+from dappled.decode.spectrum.peaks import Measured, fit, is_suspect, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum
 
 _SMALLEST_VERIFIED = 6  # carriers in one half plane, DC left out
@@ -79,7 +79,7 @@ def find_lattice(spectrum: Spectrum) -> FoundLattice:
     basis = _vote(points, weights, spectrum)
     for _ in range(3):
         basis = reduced(_refit(basis, points, weights))
-    lattice = _lattice(basis, spectrum)
+    lattice = Lattice.of(basis / np.array(spectrum.padded))
     verified: list[tuple[Carrier, Measured]] = []
     predicted = 0
     for radius in (2.0, 1.5, 1.5):
@@ -215,15 +215,11 @@ def _named(lattice: Lattice, verified: list[tuple[Carrier, Measured]]) -> tuple[
             renamed.append(((-ky, -kx), measured.twin()))
         else:
             renamed.append(((ky, kx), measured))
-    return lattice_from(matrix), sorted(renamed, key=lambda pair: pair[0])
+    return Lattice.of(matrix), sorted(renamed, key=lambda pair: pair[0])
 
 
 def _artefact(candidate: Candidate, spectrum: Spectrum) -> bool:
     return is_suspect(candidate.row / spectrum.padded[0], candidate.column / spectrum.padded[1], spectrum.shape)
-
-
-def _lattice(basis_bins: NDArray[np.float64], spectrum: Spectrum) -> Lattice:
-    return lattice_from(basis_bins / np.array(spectrum.padded))
 
 
 def _parabola(below: float, centre: float, above: float) -> float:

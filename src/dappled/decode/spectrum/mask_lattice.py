@@ -21,7 +21,7 @@ from dappled.decode.array_types import Floats
 from dappled.decode.optics import Carrier, Lattice, Order
 from dappled.decode.optics.visibility import OrderStrength
 from dappled.decode.spectrum.lattice import Candidate, candidates
-from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, fit, is_suspect, lattice_from, measure, residual_bins
+from dappled.decode.spectrum.peaks import ALONE_NATS, Measured, fit, is_suspect, measure, residual_bins
 from dappled.decode.spectrum.transform import Spectrum, hann
 
 # Chosen by hand where no figure stands beside a number; benchmarks/masks.py measures what all of them together make.
@@ -211,10 +211,10 @@ def _judged(
         weights = peaks.prominence[[n for _, n in picked], None]
         seen = peaks.places[[n for _, n in picked]]
         matrix = np.asarray(np.linalg.lstsq(orders[chosen] * weights, seen * weights, rcond=None)[0], dtype=np.float64)
-    scale, turn, skew = _against(predicted, lattice_from(matrix / bins))
+    lattice = Lattice.of(matrix / bins)
+    scale, turn, skew = _against(predicted, lattice)
     if skew > _SKEW:
         return None
-    lattice = lattice_from(matrix / bins)
     looked = lattice.carriers([asked[i].order for i in chosen])
     near = measure(spectrum, looked, 1.5, prominence_nats=ALONE_NATS)
     fitted, pairs = _on_lattice(spectrum, [(c, m) for c, m in zip(looked, near, strict=True) if m is not None])

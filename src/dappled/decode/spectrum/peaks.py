@@ -164,7 +164,7 @@ def fit(pairs: Sequence[tuple[Carrier, Measured]]) -> Lattice:
     keep = residual <= 3 * max(float(np.median(residual)), 1e-9)  # an outlier is a peak of something else
     if keep.sum() >= _FEWEST_WITHOUT_OUTLIERS and np.linalg.matrix_rank(orders[keep]) == 2:
         matrix = np.linalg.lstsq((orders * weights)[keep], (seen * weights)[keep], rcond=None)[0]
-    return lattice_from(matrix)
+    return Lattice.of(matrix)
 
 
 def residual_bins(carriers: Sequence[Carrier], measured: Sequence[Measured], spectrum: Spectrum) -> float:
@@ -176,12 +176,6 @@ def residual_bins(carriers: Sequence[Carrier], measured: Sequence[Measured], spe
         for c, m in zip(carriers, measured, strict=True)
     ]
     return math.sqrt(sum(squares) / len(squares))
-
-
-def lattice_from(matrix: NDArray[np.float64]) -> Lattice:
-    """The lattice of a (2, 2) matrix, the inverse of `Lattice.matrix`."""
-    (ay, ax), (by, bx) = matrix
-    return Lattice((float(ay), float(ax)), (float(by), float(bx)))
 
 
 def own_lattice(

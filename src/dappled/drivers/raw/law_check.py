@@ -13,7 +13,7 @@ from dappled.decode.decoder import DecodeReport, MaskDecoder
 from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum import Spectrum
 from dappled.decode.spectrum.mask_lattice import MaskLattice
-from dappled.decode.spectrum.peaks import Measured, lattice_from
+from dappled.decode.spectrum.peaks import Measured
 from dappled.decode.spectrum.transform import Source, transform
 from dappled.findings import FRAME, Code, Finding, finding
 
@@ -49,7 +49,7 @@ def check_report(
     pairs = list(zip(report.predicted, report.measured, strict=True))
     orders = np.array([(c.ky, c.kx) for c in report.used], dtype=np.float64)
     at = np.array([(c.fy, c.fx) for c in report.used])
-    used = lattice_from(np.linalg.lstsq(orders, at, rcond=None)[0])
+    used = Lattice.of(np.linalg.lstsq(orders, at, rcond=None)[0])
     return check(decoder, plane, lens, used, pairs, carriers_from=report.carriers_from, keep_law=keep_law)
 
 

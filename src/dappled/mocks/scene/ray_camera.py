@@ -162,8 +162,7 @@ class RayCamera:
         """Where the carriers are, in cycles/pixel (in the middle of the field, where the film is bowed)."""
         f = self.mask.frequency_per_mm * self.print_scale * (1 - self.alpha)
         steps = np.diag([f * (1 + self.anisotropy / 2), f * (1 - self.anisotropy / 2)])
-        (ay, ax), (by, bx) = steps @ _turn(self.turn_rad + self.turned_rad) * self.pitch_mm
-        return Lattice((float(ay), float(ax)), (float(by), float(bx)))
+        return Lattice.of(steps @ _turn(self.turn_rad + self.turned_rad) * self.pitch_mm)
 
     def expose(self) -> RayFrame:
         """Take the picture."""
