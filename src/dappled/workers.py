@@ -13,7 +13,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Generic, Literal, TypeVar
 
@@ -25,17 +25,17 @@ Policy = Literal["refuse", "drop oldest"]
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Statistics:
     """What went through a queue so far. `waiting` is now; the rest only grow."""
 
     name: str
     capacity: int
-    waiting: int
-    accepted: int
-    dropped: int
-    done: int
-    failed: int
+    waiting: int = 0
+    accepted: int = 0
+    dropped: int = 0
+    done: int = 0
+    failed: int = 0
 
 
 class Loop:
@@ -117,29 +117,28 @@ class Worker(Loop, Generic[Item]):
     ) -> None:
         super().__init__(name, self._run, clock=clock)
         self._work = work
-        self._capacity = capacity
         self._policy = policy
         self._on_drop = on_drop
         self._on_failure = on_failure
         self._items: deque[Item] = deque()
         self._changed = threading.Condition()
         self._busy = False
-        self._accepted = self._dropped = self._done = self._failed = 0
+        self._counts = Statistics(name, capacity)
 
     def put(self, item: Item) -> bool:
         """Queue an item; False when it was turned away. Never waits."""
         lost: Item | None = None
         with self._changed:
             taken = not self.stopping.is_set()
-            if taken and len(self._items) >= self._capacity:
+            if taken and len(self._items) >= self._counts.capacity:
                 if self._policy == "drop oldest":
                     lost = self._items.popleft()
                 else:
                     taken = False
-                self._dropped += 1
+                self._counts.dropped += 1
             if taken:
                 self._items.append(item)
-                self._accepted += 1
+                self._counts.accepted += 1
                 self._changed.notify_all()
         if lost is not None or not taken:
             self._call(self._on_drop, item if lost is None else lost)
@@ -158,7 +157,7 @@ class Worker(Loop, Generic[Item]):
         with self._changed:
             left = list(self._items)
             self._items.clear()
-            self._dropped += len(left)
+            self._counts.dropped += len(left)
         for item in left:
             self._call(self._on_drop, item)
         return ended
@@ -166,15 +165,7 @@ class Worker(Loop, Generic[Item]):
     def statistics(self) -> Statistics:
         """Counters, taken together."""
         with self._changed:
-            return Statistics(
-                self.name,
-                self._capacity,
-                len(self._items) + self._busy,
-                self._accepted,
-                self._dropped,
-                self._done,
-                self._failed,
-            )
+            return replace(self._counts, waiting=len(self._items) + self._busy)
 
     def _run(self) -> None:
         while True:
@@ -190,13 +181,13 @@ class Worker(Loop, Generic[Item]):
                 self._work(item)
             except Exception as error:  # noqa: BLE001  # one bad item must not end the worker; it is counted
                 with self._changed:
-                    self._failed += 1
+                    self._counts.failed += 1
                 if self._on_failure is None:
                     report(log, self.name, error)
                 self._call(self._on_failure, item, error)
             else:
                 with self._changed:
-                    self._done += 1
+                    self._counts.done += 1
 
     def _call(self, receiver: Callable[..., None] | None, *facts: object) -> None:
         try:

@@ -13,7 +13,7 @@ from dappled.config.settings import RecordSettings, Settings
 from dappled.daemon.body_plan import BodyReport
 from dappled.daemon.health import go_no_go
 from dappled.daemon.health.standing import ALL_IS_WELL, StandingFindings, in_record
-from dappled.daemon.navigation import BootClock, TelemetryStatistics
+from dappled.daemon.navigation import BootClock, TelemetryCounts
 from dappled.daemon.pipeline.capture import PendingShots
 from dappled.daemon.pipeline.overlap import FrameOverlap
 from dappled.daemon.pipeline.pipeline import DecodeFailures
@@ -112,7 +112,7 @@ class VehicleState:
     its battery: None where it isn't known."""
 
     links: Sequence[LinkStatistics]
-    telemetry: TelemetryStatistics
+    telemetry: TelemetryCounts
     clock: BootClock | None = None
     pose: Pose | None = None
     battery: VehicleBattery | None = None

@@ -2,9 +2,9 @@
 
 from dappled.daemon.navigation.clocks import BodyLatency, BootClock, CameraClock, ExposureTime
 from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_doubt, recorded_vehicles
-from dappled.daemon.navigation.samples import TelemetryStatistics, UtcCorrection, first_position_utc_ns
+from dappled.daemon.navigation.samples import TelemetryCounts, UtcCorrection, first_position_utc_ns
 
 __all__ = [
-    "BodyLatency", "BootClock", "CameraClock", "ExposureTime", "Navigation", "Telemetry", "TelemetryStatistics",
+    "BodyLatency", "BootClock", "CameraClock", "ExposureTime", "Navigation", "Telemetry", "TelemetryCounts",
     "UtcCorrection", "first_position_utc_ns", "recorded_doubt", "recorded_vehicles",
 ]  # fmt: skip

@@ -35,10 +35,9 @@ from dappled.daemon.navigation.samples import (
     HALF_MS_NS,
     Around,
     AttitudeSample,
-    Counts,
     PositionDoubt,
     PositionSample,
-    TelemetryStatistics,
+    TelemetryCounts,
     UtcCorrection,
 )
 from dappled.daemon.navigation.vehicle_history import USED_MESSAGES, VehicleHistory
@@ -103,7 +102,7 @@ class Telemetry:
         self._component_id, self._cam_idx, self._attitude_sigma_rad = component_id, cam_idx, attitude_sigma_rad
         self._lock = threading.Lock()
         self._packets = self._prune_at = 0
-        self._counts = Counts()
+        self._counts = TelemetryCounts()
         self._candidates: dict[int, VehicleHistory] | None = {}  # by system id; None: it is known which one counts
         self._history = self._of(_NOBODY)
 
@@ -129,9 +128,9 @@ class Telemetry:
                 for history in histories:
                     history.prune(stamp_us * 1000 - HISTORY_NS)
 
-    def _of(self, system_id: int, counts: Counts | None = None) -> VehicleHistory:
+    def _of(self, system_id: int, counts: TelemetryCounts | None = None) -> VehicleHistory:
         return VehicleHistory(
-            system_id, self._component_id, counts or Counts(), cam_idx=self._cam_idx, doubt=self._doubt
+            system_id, self._component_id, counts or TelemetryCounts(), cam_idx=self._cam_idx, doubt=self._doubt
         )
 
     def _heard(self, message: MavlinkMessage) -> list[VehicleHistory]:
@@ -287,21 +286,11 @@ class Telemetry:
         correction_ns = unix_minus_boot_ns + now_boot_ns - clock.utc_ns(now_boot_ns)
         return UtcCorrection(correction_ns, round(clock.sigma_ns), f"SYSTEM_TIME, clocks by {clock.source}", by_fix)
 
-    def statistics(self) -> TelemetryStatistics:
-        """Counters."""
+    def statistics(self) -> TelemetryCounts:
+        """Counters, as they are now."""
         with self._lock:
-            counts, history = self._counts, self._history
-            return TelemetryStatistics(
-                self._packets,
-                counts.positions,
-                counts.attitudes,
-                history.time.reboots,
-                counts.out_of_order,
-                feedbacks=counts.feedbacks,
-                gimbals=history.gimbals.seen,
-                impossible=counts.impossible,
-                jumps=counts.jumps,
-            )
+            reboots, gimbals = self._history.time.reboots, self._history.gimbals.seen
+            return replace(self._counts, packets=self._packets, reboots=reboots, gimbals=gimbals)
 
 
 class Navigation:

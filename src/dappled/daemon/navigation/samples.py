@@ -201,11 +201,14 @@ def is_mark(message: MavlinkMessage, system_id: int | None) -> bool:
 
 
 @dataclass(slots=True)
-class Counts:
-    """How much of all vehicles was used so far, and how much came out of order."""
+class TelemetryCounts:
+    """How much of all vehicles was fed and used so far, and how much came out of order. `impossible` were not used:
+    they can't be true. `jumps` contradicted their velocity."""
 
+    packets: int = 0
+    reboots: int = 0
+    gimbals: int = 0
     positions: int = 0
-    attitudes: int = 0
     feedbacks: int = 0
     marks: int = 0  # among the feedbacks
     out_of_order: int = 0
@@ -224,21 +227,6 @@ class Counts:
         """Count a position that contradicts its velocity, once for all that follow within a second."""
         self.jumps += not self.jumps or stamp_ns - self.jump_ns > _ONE_JUMP_NS
         self.jump_ns, self.jump_m = stamp_ns, by_m
-
-
-@dataclass(frozen=True, slots=True)
-class TelemetryStatistics:
-    """What was fed so far. `impossible` were not used: they can't be true. `jumps` contradicted their velocity."""
-
-    packets: int
-    positions: int
-    attitudes: int
-    reboots: int
-    out_of_order: int
-    feedbacks: int = 0
-    gimbals: int = 0
-    impossible: int = 0
-    jumps: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,6 @@ from dappled.daemon.navigation.samples import (
     NEAREST_NS,
     Around,
     AttitudeSample,
-    Counts,
     Feedback,
     GimbalSample,
     GnssSample,
@@ -29,6 +28,7 @@ from dappled.daemon.navigation.samples import (
     PositionDoubt,
     PositionSample,
     Sample,
+    TelemetryCounts,
     around_instant,
     beside,
     between,
@@ -105,7 +105,7 @@ class Steady(Generic[M]):
     They count from the packet that makes it so: a pose depends on the packets below its limit alone.
     """
 
-    def __init__(self, counts: Counts, *motions: Motion) -> None:
+    def __init__(self, counts: TelemetryCounts, *motions: Motion) -> None:
         self._counts, self._motions = counts, motions
         self._tracks, self._first = Tracks(*motions), -1
         self._begun: Track | None = None
@@ -139,7 +139,7 @@ class VehicleHistory:
         self,
         system_id: int,
         component_id: int,
-        counts: Counts,
+        counts: TelemetryCounts,
         *,
         cam_idx: int = 0,
         doubt: PositionDoubt | None = None,
@@ -311,7 +311,6 @@ class VehicleHistory:
             sample = replace(sample, sigma_rad=told_rad)
         if sample is None or not self._believed(sample, message, self._attitudes):
             return
-        self.counts.attitudes += 1
         first, matrix = self.time.first(number + 1), matrix_of(sample.attitude).ravel().tolist()
         for one in self._steady_attitudes.take(sample, (matrix,), first):
             if _rises(self._attitudes, one, first):

@@ -86,7 +86,7 @@ class PacketReceiver(Protocol):
 # --- one link
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class LinkStatistics:
     """Counters of a link. `error` says why it is down, None when it is up; `signing` is None without a key.
 
@@ -95,14 +95,14 @@ class LinkStatistics:
     """
 
     url: str
-    packets_in: int
-    packets_out: int
-    packets_bad: int
-    packets_unsent: int
-    packets_unlogged: int
-    failures: int
-    last_heard_monotonic_ns: int | None
-    error: str | None
+    packets_in: int = 0
+    packets_out: int = 0
+    packets_bad: int = 0
+    packets_unsent: int = 0
+    packets_unlogged: int = 0
+    failures: int = 0
+    last_heard_monotonic_ns: int | None = None
+    error: str | None = None
     signing: SigningStatistics | None = None
     packets_unrecorded: int = 0
 
@@ -118,10 +118,8 @@ class Link:
         self.error: str | None = None
         self.packer = mavlink.MAVLink(None)
         self.heard_1 = self.heard_2 = False
-        self.packets_in = self.packets_out = self.packets_bad = 0
-        self.packets_unsent = self.packets_unlogged = self.packets_unrecorded = self.failures = 0
+        self.counts = LinkStatistics(address.url)
         self.budgets = {sent: LogBudget(anybody=self.exposed and guard is None) for sent in (False, True)}
-        self.last_heard_monotonic_ns: int | None = None
 
     def packed(self, message: MavlinkMessage, system_id: int, component_id: int) -> bytes:
         """Pack a message from this component: signed where there is a key, else in the version that was heard."""
@@ -150,19 +148,7 @@ class Link:
 
     def statistics(self) -> LinkStatistics:
         """Counters so far."""
-        return LinkStatistics(
-            self.address.url,
-            self.packets_in,
-            self.packets_out,
-            self.packets_bad,
-            self.packets_unsent,
-            self.packets_unlogged,
-            self.failures,
-            self.last_heard_monotonic_ns,
-            self.error,
-            self.guard.statistics() if self.guard else None,
-            self.packets_unrecorded,
-        )
+        return replace(self.counts, error=self.error, signing=self.guard.statistics() if self.guard else None)
 
 
 # --- all links
@@ -235,14 +221,14 @@ class PacketSender:
         source, size = (message.get_srcSystem(), message.get_srcComponent()), _STAMP_BYTES + len(framed.raw)
         address = link.channel.source() if link.channel and not sent else ""
         if not link.budgets[sent].takes(source, message.get_msgId(), size, self._clock.monotonic_ns(), address):
-            link.packets_unrecorded += 1
+            link.counts.packets_unrecorded += 1
             return Packet(None, stamp_us, link.number, message, framed.raw, sent, trusted, exposed)
         try:
             number = packet_log.log_packet(stamp_us, framed.raw)
         except Exception:  # a full disk must not stop the commands of a flying machine
-            if link.packets_unlogged == 0:
+            if link.counts.packets_unlogged == 0:
                 log.exception("A MAVLink packet could not be written to the telemetry log")
-            link.packets_unlogged += 1
+            link.counts.packets_unlogged += 1
         packet = Packet(number, stamp_us, link.number, message, framed.raw, sent, trusted, exposed)
         self.hand(link, packet, packet_log)
         return packet
@@ -258,13 +244,13 @@ class PacketSender:
         try:
             receiver.on_packet(packet)
         except Exception:  # whatever the receiver raises, the next packet is handled
-            link.failures += 1
+            link.counts.failures += 1
             log.exception("A MAVLink packet (%s) could not be handled", packet.message.get_type())
 
     def _send_on(self, link: Link, message: MavlinkMessage) -> bool:
         channel = link.channel
         if channel is None or self._log is None:
-            link.packets_unsent += 1
+            link.counts.packets_unsent += 1
             return False
         raw = link.packed(message, self.system_id, self.component_id)
         stamp_us = self._clock.utc_ns() // 1000
@@ -274,9 +260,9 @@ class PacketSender:
             link.fail(error.strerror or error)
             taken = False
         if not taken:
-            link.packets_unsent += 1
+            link.counts.packets_unsent += 1
             return False
-        link.packets_out += 1
+        link.counts.packets_out += 1
         framed = Framed(raw, message)
         if message.get_msgId() == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             self._own_heartbeats.add(framed)
@@ -419,10 +405,10 @@ class MavlinkLinks:
         else:
             sifted = link.guard.sift(data)
             packets = framer.datagram(sifted.sound)
-            link.packets_bad += sifted.bad
+            link.counts.packets_bad += sifted.bad
         for framed in packets:
             self._received(link, channel, stamp_us, framed, receiver)
-        link.packets_bad += framer.bad - bad
+        link.counts.packets_bad += framer.bad - bad
 
     def _wait(self, channel: ByteChannel) -> bool:
         """Wait until there is something to read, and flush meanwhile."""
@@ -451,9 +437,9 @@ class MavlinkLinks:
                 channel.shown("old")  # another link brought it first: this proves nobody here
             elif trusted:
                 channel.shown("signed" if signed else "sound")
-            link.packets_in += 1
+            link.counts.packets_in += 1
             if trusted or message.get_msgId() != mavlink.MAVLINK_MSG_ID_RADIO_STATUS:  # a radio alone is no peer
-                link.last_heard_monotonic_ns = self._clock.monotonic_ns()
+                link.counts.last_heard_monotonic_ns = self._clock.monotonic_ns()
             link.heard_1 |= framed.version == 1
             link.heard_2 |= framed.version == 2
             exposed = link.exposed and not signed

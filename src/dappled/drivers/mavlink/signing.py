@@ -12,7 +12,7 @@ import logging
 import secrets
 import threading
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -246,15 +246,15 @@ def _bounded(time: int) -> int:
     return min(max(time, 0), _LATEST)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SigningStatistics:
     """How many packets of a link with a key were accepted and refused, by reason."""
 
-    good: int
-    forged: int
-    replayed: int
-    unsigned_taken: int
-    unsigned_refused: int
+    good: int = 0
+    forged: int = 0
+    replayed: int = 0
+    unsigned_taken: int = 0
+    unsigned_refused: int = 0
     copies: int = 0
 
     @property
@@ -284,7 +284,7 @@ class SignatureGuard:
         self._time, self._book = time, time.book(key)
         self._unsigned = unsigned
         self._radio, self._radio_sifted = Rate(_RADIO_A_S), Rate(_RADIO_SIFTED_A_S)
-        self._good = self._forged = self._replayed = self._copies = self._taken = self._refused = 0
+        self._counts = SigningStatistics()
 
     def judge(self, raw: bytes, system: int, component: int, message_id: int) -> Trust:
         """Return whether to obey a sound packet (a copy: as one that came over another link), only hear it, or refuse
@@ -292,17 +292,17 @@ class SignatureGuard:
         if not is_signed(raw):
             return self._judge_unsigned(message_id)
         if not self.rightly_signed(raw):
-            self._forged += 1
+            self._counts.forged += 1
             return "refuse"
         stream = (system, component, raw[-SIGNATURE_BYTES])
         verdict = self._book.judge(self._time, stream, timestamp_of(raw), raw[-6:], self._link_id)
         if verdict == "old":
-            self._replayed += 1
+            self._counts.replayed += 1
             return "refuse"
         if verdict == "copy":
-            self._copies += 1
+            self._counts.copies += 1
             return "copy"
-        self._good += 1
+        self._counts.good += 1
         return "obey"
 
     def sift(self, datagram: bytes) -> Sifted:
@@ -322,11 +322,11 @@ class SignatureGuard:
                 if self.rightly_signed(raw):
                     kept.append(raw)
                 else:
-                    self._forged += 1
+                    self._counts.forged += 1
             elif self._unsigned != "refuse" or self._is_radio(message_of(raw), self._radio_sifted):
                 kept.append(raw)
             else:
-                self._refused += 1
+                self._counts.unsigned_refused += 1
         return Sifted(b"".join(kept), 0)
 
     def prepare(self, packer: mavlink.MAVLink) -> None:
@@ -337,15 +337,13 @@ class SignatureGuard:
 
     def statistics(self) -> SigningStatistics:
         """Counters."""
-        return SigningStatistics(
-            self._good, self._forged, self._replayed, self._taken, self._refused, copies=self._copies
-        )
+        return replace(self._counts)
 
     def _judge_unsigned(self, message_id: int) -> Trust:
         if self._unsigned == "refuse" and not self._is_radio(message_id, self._radio):
-            self._refused += 1
+            self._counts.unsigned_refused += 1
             return "refuse"
-        self._taken += 1
+        self._counts.unsigned_taken += 1
         return "obey" if self._unsigned == "allow" else "hear"
 
     def _is_radio(self, message_id: int, rate: Rate) -> bool:
