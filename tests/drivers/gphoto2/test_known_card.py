@@ -43,7 +43,7 @@ def test_the_shots_beside_a_file_are_those_next_to_it_by_the_camera_s_count() ->
     [((9, 5000), True), ((9, 5000 + 7200), True), ((9, None), True), ((8, 5000), False), ((9, 5001), False)],
 )
 def test_a_file_is_known_by_size_and_time_in_any_zone(facts: tuple[int, int | None], known: bool) -> None:
-    card = KnownCard([(FOLDER, "IMG_0001.CR2", 9, 5000)])
+    card = KnownCard([(FOLDER, "IMG_0001.CR2", 9, 5000, None)])
     assert card.has(named(1), facts) is known
     assert card.is_other(CardContents({named(1): facts}), has_old=False) is not known
 

@@ -99,7 +99,8 @@ class Card:
 
 class Body:
     """The body, and a session with it. Like libgphoto2, a session knows the card as it was when it was opened, and the
-    files announced since; a release swallows the events that nobody has read."""
+    files announced since, without a time where that was within 2 s; a release swallows the events that nobody has
+    read."""
 
     keeps_files = True
     identity = Identity("Canon", "450D", "1", "usb:1,2")
@@ -109,6 +110,7 @@ class Body:
     ) -> None:
         """`latest_s`: how long the body takes to expose, at most."""
         self.clock, self.chance, self.dated, self.latest_s = clock, chance, dated, latest_s
+        self.opened_s = 0.0
         self.offset_s = chance.uniform(0, 10**6)
         self.card = Card()
         self.pictures: list[Picture] = []
@@ -128,7 +130,7 @@ class Body:
     def open(self, _settings: GPhoto2Settings, _before: str | None) -> Body:
         if self.now_s < self.down_until_s:
             raise AbsentError("pulled")
-        self._dead, self._coming = False, []
+        self._dead, self._coming, self.opened_s = False, [], self.now_s
         self._cache = {file: (self.card, (len(data), taken)) for file, (data, taken) in self.card.files.items()}
         for one in self.pictures:
             one.listed = one.listed or (one.card is self.card and one.made_s <= self.now_s)
@@ -185,6 +187,7 @@ class Body:
             if picture is not None and isinstance(news, FileAdded):
                 picture.listed = True
                 data, taken_s = picture.card.files[news.file]
+                taken_s = None if self.now_s < self.opened_s + 2 else taken_s
                 self._cache.setdefault(news.file, (picture.card, (len(data), taken_s)))
         return [news for _, news, _ in due]
 
@@ -418,7 +421,7 @@ class World:
                 found.counts["distinct in doubt"] += doubt
         elif not doubt:
             # Within a whole second and the body's latencies no evidence tells pictures apart.
-            near = not self.body.dated or abs(picture.made_s - fired_s) <= TOLERANCE_S
+            near = event.facts["taken_s"] is None or abs(picture.made_s - fired_s) <= TOLERANCE_S
             found.counts["alike"] += near
             if not near:
                 found.wrong.append(

@@ -1,7 +1,8 @@
-"""Know a card's files by name, size and time, and by the numbers that a camera counts in their names.
+"""Know a card's files by name, size, time and bytes, and by the numbers that a camera counts in their names.
 
 A card that was changed may number from 0001 again: a known name is not a known file. libgphoto2 gives no number of a
-file that would last longer than a session.
+file that would last longer than a session, and no time of one that is made within 2 s of a listing: that one is fetched
+again where a file of its name and size has a time later, or is announced, and its bytes tell.
 """
 
 from __future__ import annotations
@@ -24,6 +25,14 @@ Counter = tuple[str, int]
 
 
 @dataclass(frozen=True, slots=True)
+class _Brought:
+    """A file that was fetched, and its hash; None: unknown, of one that an earlier process brought to memory."""
+
+    facts: FileFacts
+    sha256: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class _Frame:
     """A file whose shot is certain."""
 
@@ -39,11 +48,11 @@ class KnownCard:
         self.is_listed = False
         self._label = ""
         self._files: dict[CameraFile, FileFacts | None] = {}  # None: it couldn't be brought, whatever it is
-        self._brought: dict[CameraFile, list[FileFacts]] = {}
+        self._brought: dict[CameraFile, list[_Brought]] = {}
         self._newest: Counter | None = None
-        for folder, name, size, taken_s in brought:
+        for folder, name, size, taken_s, sha256 in brought:
             file = CameraFile(folder, name)
-            self.settle(file, (size, taken_s))
+            self.settle(file, (size, taken_s), sha256)
             self._newest = _counter(file)
         self._frames: deque[_Frame] = deque(maxlen=_NEIGHBOURS)
 
@@ -54,10 +63,31 @@ class KnownCard:
         return file in self._files
 
     def has(self, file: CameraFile, facts: FileFacts) -> bool:
-        """Whether this very file needs no fetching: it is known on the card, or was brought from any."""
-        if file in self._files and ((known := self._files[file]) is None or _same(known, facts)):
+        """Whether this very file needs no fetching: it is known on the card, or was brought from any. One that was
+        brought without a time, and has one now, may be another: its bytes tell."""
+        if file in self._files and self._files[file] is None:
             return True
-        return any(_same(one, facts) for one in self._brought.get(file, ()))
+        known = [one for one in self._facts(file) if _same(one, facts)]
+        return any(one[1] is not None or facts[1] is None for one in known)
+
+    def is_proven(self, file: CameraFile, facts: FileFacts) -> bool:
+        """Whether a known name is this very file for certain: its time is known, too. libgphoto2 may have none of a
+        file that was made within 2 s of a listing; another of this size can't be told from it then."""
+        if file in self._files and self._files[file] is None:
+            return True
+        known = [one for one in self._facts(file) if _same(one, facts)]
+        return any(one[1] is not None and facts[1] is not None for one in known)
+
+    def is_again(self, file: CameraFile, facts: FileFacts, sha256: str) -> bool | None:
+        """Whether a file that was fetched is one that had been fetched before, by its bytes; None where no other of
+        this name, size and (where both are known) time was."""
+        alike = [one.sha256 for one in self._brought.get(file, ()) if one.sha256 and _same(one.facts, facts)]
+        return sha256 in alike if alike else None
+
+    def _facts(self, file: CameraFile) -> list[FileFacts]:
+        """What is known of files of this name, on this card and brought from any."""
+        there = self._files.get(file)
+        return [*([] if there is None else [there]), *(one.facts for one in self._brought.get(file, ()))]
 
     def is_done(self, file: CameraFile) -> bool:
         """Whether a known file was brought or given up: it isn't one that was there before."""
@@ -76,7 +106,12 @@ class KnownCard:
 
     def change(self) -> None:
         """Another card is in the camera."""
-        self._files, self._newest = {}, None
+        self._files = {}
+        self.count_anew()
+
+    def count_anew(self) -> None:
+        """What the camera counted so far says nothing of what comes."""
+        self._newest = None
         self._frames.clear()
 
     def list(self, found: CardContents, coming: Iterable[CameraFile]) -> None:
@@ -91,11 +126,11 @@ class KnownCard:
             newest = max(self._files, key=lambda file: (found.files[file][1] or 0, file.folder, file.name))
             self._newest = _counter(newest)
 
-    def settle(self, file: CameraFile, facts: FileFacts | None) -> None:
+    def settle(self, file: CameraFile, facts: FileFacts | None, sha256: str | None = None) -> None:
         """A file was brought, or (None) given up."""
         self._files[file] = facts
         if facts is not None:
-            self._brought.setdefault(file, []).append(facts)
+            self._brought.setdefault(file, []).append(_Brought(facts, sha256))
 
     def deleted(self, file: CameraFile) -> None:
         """A file was deleted: the camera may use its name again."""
@@ -149,6 +184,6 @@ def _steps(before: Counter, after: Counter) -> int | None:
 
 
 def _same(one: FileFacts, other: FileFacts) -> bool:
-    """Whether two files of one name are one, by size and time."""
+    """Whether two files of one name may be one, by size and, where both are known, time."""
     apart_s = 0 if one[1] is None or other[1] is None else abs(one[1] - other[1])
     return one[0] == other[0] and apart_s % _ZONE_S == 0 and apart_s <= _ZONES * _ZONE_S

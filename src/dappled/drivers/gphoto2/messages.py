@@ -32,7 +32,7 @@ _SEND_S = 5.0
 CUT_OFF = "cut off"
 
 
-SeenFile = tuple[str, str, int, int | None]
+SeenFile = tuple[str, str, int, int | None, str | None]
 _KIND = "is"  # beside an event's own values
 _EVENTS: Mapping[str, type[CameraEvent]] = {one.__name__: one for one in get_args(CameraEvent)}
 
@@ -40,9 +40,9 @@ _EVENTS: Mapping[str, type[CameraEvent]] = {one.__name__: one for one in get_arg
 @dataclass(frozen=True, slots=True)
 class Carryover:
     """What a process that died leaves to the next: the body's serial number, the shots that were fired and have no file
-    yet, the offsets of the body's clock, and folder, name, size and time of the files that came last. Pictures made
-    after `since_ns` (monotonic; None: unknown) are among these, or were not brought. `cut_off`: folder and name of
-    those that were announced, and not brought when the link broke."""
+    yet, the offsets of the body's clock, and folder, name, size, time and hash of the files that came last.
+    Pictures made after `since_ns` (monotonic; None: unknown) are among these, or were not brought. `cut_off`: folder
+    and name of those that were announced, and not brought when the link broke."""
 
     serial: str | None = None
     late: tuple[Claim, ...] = ()
@@ -64,7 +64,8 @@ class Carryover:
         if not isinstance(event, Arrival | Companion):
             return self
         facts = event.facts
-        file = (str(facts.get("folder")), str(facts.get("name")), event.blob.size, facts.get("taken_s"))
+        named = (str(facts.get("folder")), str(facts.get("name")))
+        file = (*named, event.blob.size, facts.get("taken_s"), event.blob.sha256)
         return replace(
             self,
             late=tuple(claim for claim in self.late if claim.shot != event.shot),

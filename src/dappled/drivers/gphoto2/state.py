@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from dappled import codec, picture_order
+from dappled import codec, durable, picture_order
 from dappled.drivers.attribution import BodyClock, Claim, FileClue, FramedShot, attribute, rivals
 from dappled.drivers.camera import (
     Arrival,
@@ -238,11 +238,11 @@ class CameraState:
 
     def compared(self, file: CameraFile, facts: FileFacts | None, now_ns: int) -> None:
         """A file with a known name was looked at: another size or time is another picture, on another card. None: the
-        library knows it no more. Then the card is listed before anything is fetched."""
-        if facts is None or not self._card.has(file, facts):
+        library knows it no more. Then, and where a time is unknown, the card is listed before anything is fetched."""
+        if facts is not None and self._card.has(file, facts) and not self._card.is_done(file):
+            self._queue([file], now_ns)  # it was listed before it was announced
+        elif facts is None or not self._card.is_proven(file, facts):
             self._suspects[file] = _Announced(now_ns, self._since_ns)
-        elif not self._card.is_done(file):  # it was listed before it was announced
-            self._queue([file], now_ns)
 
     def listed(self, found: CardContents, now_ns: int) -> list[CameraEvent]:
         """The card was listed: fetch what is new. On a card that is seen for the first time that is what was made since
@@ -255,12 +255,15 @@ class CameraState:
         owed = self.current is not None or bool(self._late)  # the body's clock may have been set before its file
         made |= {file: True for file in newer if made[file] is None or owed}  # where time says nothing, the count may
         old = any(self._made_since(taken_s) is False for _, taken_s in found.files.values())
-        if self._card.is_other(found, has_old=old and self._card.is_listed):
+        is_other = self._card.is_other(found, has_old=old and self._card.is_listed)
+        if is_other:
             only_recent = True
             self._card.change()
             self._last_frame = None
             told.append(Noticed(finding(Code.CARD_CHANGED, Subject("card")), now_ns))
-            self._to_fetch |= {file: one for file, one in self._suspects.items() if file in found.files}
+        suspects = [(file, one) for file, one in self._suspects.items() if file in found.files]
+        self._to_fetch |= {file: one for file, one in suspects if not self._card.is_proven(file, found.files[file])}
+        if is_other:
             unsure = [file for file in strange if not made[file] and file not in self._to_fetch]
             told += [_on_card(file, now_ns) for file in (unsure if len(unsure) <= LATE_LIMIT else ())]
             newer = []
@@ -316,13 +319,25 @@ class CameraState:
         announced = self._to_fetch.pop(file)
         self._tries.pop(file, None)
         self._quiet_ns = arrival.monotonic_ns
-        if not file.in_memory:
-            self._card.settle(file, (arrival.blob.size, taken_s))
         self._settings_due_ns = arrival.monotonic_ns + _ns(_SETTINGS_S)
+        told: list[CameraEvent] = []
+        if not file.in_memory:
+            facts = (arrival.blob.size, taken_s)
+            sha256 = arrival.blob.sha256 or durable.hash_descriptor(arrival.blob.fd, arrival.blob.size)
+            is_again = self._card.is_again(file, facts, sha256)
+            self._card.settle(file, facts, sha256)
+            if is_again:  # it was announced once more
+                arrival.blob.close()
+                return []
+            if is_again is False:  # other bytes where the listing could tell no difference
+                self._card.count_anew()
+                self._card.count(file)
+                self._last_frame = None
+                told.append(Noticed(finding(Code.CARD_CHANGED, Subject("card")), arrival.monotonic_ns))
         if self._makes_pairs() and _is_jpeg(arrival.name) and self._main_shot(file) is None:
             self._held[_stem(file)] = (file, arrival, taken_s, announced)
-            return []
-        return self._deliver(file, arrival, taken_s, announced)
+            return told
+        return [*told, *self._deliver(file, arrival, taken_s, announced)]
 
     def not_fetched(self, file: CameraFile, reason: str, now_ns: int) -> list[CameraEvent]:
         """A file could not be fetched: try again later, three times in all, then fail the current shot."""
