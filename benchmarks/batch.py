@@ -37,7 +37,7 @@ from dappled.decode.geometry import Pose
 from dappled.decode.optics import MaskedOptics
 from dappled.decode.spectrum.plane import to_plane
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.flight import Frame
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.masked_camera import reference_camera

@@ -36,7 +36,8 @@ from dappled.daemon.pipeline.decode_process import DecodedFrame
 from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import Shutter
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.drivers.camera import Arrival, Blob, CameraEvent, Fired, Identity, PlainCamera, StateChanged
 from dappled.findings import Code

@@ -20,7 +20,7 @@ from dappled.confined import OutsideError
 from dappled.daemon.camera_protocol import camera_status
 from dappled.daemon.replay import replay, runs
 from dappled.decode.lightfield import LightField
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Code
 from dappled.flight import (

@@ -14,7 +14,8 @@ import tomli_w
 from PIL import Image
 
 from dappled.cli import main
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from tests.simulated.calibration import from_frame

@@ -10,7 +10,7 @@ import pytest
 from dappled.cli import VERBS, frame_arguments, main
 from dappled.cli.command_line import options, parser
 from dappled.cli.verb import Overwriting
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 
 FOLDERS = {"batch", "geotag"}  # their -o is a folder that they add to

@@ -20,7 +20,8 @@ from dappled.daemon.pipeline.flight_writer import LedgerWriter
 from dappled.daemon.pipeline.picture_facts import PictureFacts
 from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.stream.publisher import Stream
 from dappled.decode.geometry import Pose, Vector3

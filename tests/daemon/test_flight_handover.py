@@ -17,7 +17,8 @@ from dappled.daemon.flight_handover import BY_BODY, NONE, FlightHandover, Recipe
 from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.camera import CameraError, Setting, SettingName
 from dappled.errors import DappledError
 from dappled.findings import Finding

@@ -20,7 +20,7 @@ from dappled.config import settings as configuration
 from dappled.config.settings import Settings
 from dappled.daemon.flight_handover import FlightHandover
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.mocks.simulation import Simulation, World
 from dappled.workers import Loop

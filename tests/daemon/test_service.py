@@ -29,7 +29,7 @@ from dappled.daemon.health import go_no_go, resources
 from dappled.daemon.health.standing import in_record
 from dappled.daemon.navigation import UtcCorrection
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.service import AGAIN_NS, PeriodicTask, Service
 from dappled.drivers.camera import CameraError, Identity, Setting, SettingsChanged, StateChanged
 from dappled.errors import DappledError

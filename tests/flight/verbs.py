@@ -19,7 +19,7 @@ from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import late_tags, pickup
 from dappled.daemon.replay.pickup import Choice
 from dappled.daemon.replay.runs import Run, RunWriter
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.wired.ptp_source import PtpSource
 from dappled.drivers.wired.sources import parse_source
 from dappled.flight import LedgerReader, Result, layout, offload, places, recording, seals

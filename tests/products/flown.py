@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Pose, Quaternion, camera_pose, metres_per_radian
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.flight import Recording, recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose

@@ -12,7 +12,8 @@ from dappled.config import settings as configuration
 from dappled.config.schema import TomlSource
 from dappled.config.settings import Settings
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import ShotDecision
 from dappled.daemon.service import Service
 from dappled.flight import LedgerReader, flight_report
 from dappled.flight.checks import flight_check

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.flight import Frame, LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody, pattern
 from tests.system.flying import flying, settings_of

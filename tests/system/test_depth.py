@@ -21,7 +21,8 @@ from scipy import ndimage
 import dappled
 from dappled.cli.calibrate.target import from_frames as targets_from_frames
 from dappled.decode.depth.depth_map import DepthMap
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.mocks.scene.bench import Bench, TexturedPlane
 from dappled.mocks.scene.masked_camera import LEVEL, MaskedCamera, Truth, reference_camera
 from dappled.mocks.scene.synthesis import PASS, Grid

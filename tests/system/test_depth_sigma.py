@@ -14,7 +14,8 @@ import pytest
 import tomli_w
 
 import dappled
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.mocks.autopilot.path import FlightPath
 from dappled.mocks.scene.bench import Bench, TexturedPlane
 from dappled.mocks.scene.landscape import noise

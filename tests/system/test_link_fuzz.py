@@ -15,7 +15,8 @@ from pathlib import Path
 import pytest
 
 from dappled.drivers.mavlink import make_key, mavlink, read_key
-from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.drivers.mavlink.signature_book import UNITS_PER_S
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S
 from dappled.mocks.body.body import BodyOptions, SimulatedBody
 from dappled.mocks.simulation import free_port
 from tests.daemon.camera_protocol.rig import Peer

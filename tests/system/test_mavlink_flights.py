@@ -17,7 +17,8 @@ from dappled.config.schema import ConfigError
 from dappled.daemon.camera_protocol.parameters import code
 from dappled.drivers.mavlink import mavlink
 from dappled.drivers.mavlink import signing as mavlink_signing
-from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.drivers.mavlink.signature_book import UNITS_PER_S
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S
 from dappled.findings import Code, Subject
 from dappled.flight import LedgerReader
 from dappled.mocks.body.body import BodyOptions, SimulatedBody

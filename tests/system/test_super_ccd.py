@@ -10,7 +10,8 @@ import pytest
 from scipy import ndimage
 
 from dappled.cli import main
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.mocks.scene.synthesis import Grid
 from tests.simulated.super_ccd import MaskedFinePix
 

@@ -11,7 +11,8 @@ import pytest
 import tomli_w
 
 from dappled.cli import main
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.findings import Code
 from dappled.mocks import shoot
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera

@@ -25,7 +25,8 @@ from dappled.findings import FRAME, told
 
 if not words_only:
     from dappled.drivers.raw import recipe_check
-    from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+    from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.products import processes
     from dappled.products.exports import light_files
 

@@ -18,8 +18,8 @@ from dappled.errors import CallError, DappledError, counted
 from dappled.findings import Finding, Level, first_by_name, worst
 
 if not words_only:
-    from dappled.drivers.raw.darkroom import Recipe
-    from dappled.drivers.raw.darkroom import of_flight as recorded_recipe
+    from dappled.drivers.raw.recipe import Recipe
+    from dappled.drivers.raw.recipe import of_flight as recorded_recipe
     from dappled.flight import layout
     from dappled.products import processes
 

@@ -23,7 +23,7 @@ if not words_only:
     from dappled.config import profiles
     from dappled.daemon.pipeline import recipes
     from dappled.decode.geometry import camera_pose
-    from dappled.drivers.raw.darkroom import Recipe
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.flight import layout
     from dappled.products.maps import earth, georeference, references, self_calibration
     from dappled.products.maps.earth import EarthError

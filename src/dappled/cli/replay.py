@@ -32,7 +32,7 @@ if not words_only:
     from dappled.daemon.replay.runs import Run, RunWriter
     from dappled.daemon.replay.vehicle_choice import VehicleError
     from dappled.daemon.replay.verifier import MOST_SHARE, ReplayVerifier
-    from dappled.drivers.raw.darkroom import Recipe
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.flight import LIVE, TimeSource, layout
     from dappled.flight.checks import flight_check
 

@@ -52,7 +52,8 @@ from dappled.daemon.pipeline.occasional import Occasional
 from dappled.daemon.pipeline.overlap import OverlapWatch
 from dappled.daemon.pipeline.pipeline import Decoding, Pipeline
 from dappled.daemon.pipeline.recipes import Names
-from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.daemon.pipeline.spacing import DistanceTrigger
 from dappled.daemon.pipeline.verdicts import Judge
 from dappled.daemon.shot_events import ShotEvents

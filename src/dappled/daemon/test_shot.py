@@ -15,7 +15,7 @@ from dappled.clock import Clock, SystemClock
 from dappled.config.settings import Settings
 from dappled.daemon.navigation import clocks
 from dappled.daemon.pipeline.capture import Observer, PendingShot
-from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.errors import DappledError
 from dappled.workers import Loop

@@ -33,8 +33,9 @@ from dappled.decode.lightfield import refocus as refocusing
 from dappled.decode.lightfield.refocus import FocalPlane, StereoPair, eyes
 from dappled.decode.optics import Sensor
 from dappled.drivers.raw import developing
-from dappled.drivers.raw.darkroom import Darkroom, Recipe, of_flight
+from dappled.drivers.raw.darkroom import Darkroom
 from dappled.drivers.raw.picture_maker import PictureMaker
+from dappled.drivers.raw.recipe import Recipe, of_flight
 from dappled.errors import DappledError, counted
 from dappled.findings import FRAME, Finding, told
 from dappled.flight import Tag, flight_report, layout
@@ -527,15 +528,3 @@ def _recipe(plain: Recipe, given: Mapping[str, Any], path: Path) -> Recipe:
     if not made.mask:
         raise OpenError(f"{path} is a raw frame: say how to decode it, as in dappled.open(path, mask='mask-2')")
     return made
-
-
-__all__ = [
-    "DecodeError",
-    "Opened",
-    "OpenedFlight",
-    "OpenedFrame",
-    "OpenedLightField",
-    "SharpPicture",
-    "light_field",
-    "open",
-]

@@ -14,7 +14,8 @@ from dappled import findings
 from dappled.cli import main
 from dappled.decode.calibration.calibration import Calibration
 from dappled.drivers.raw import calibration_files
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.findings import Code
 from dappled.mocks.scene.masked_camera import MaskedCamera, reference_camera
 from dappled.products.exports import light_files

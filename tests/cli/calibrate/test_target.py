@@ -13,7 +13,8 @@ import pytest
 from dappled.cli import main
 from dappled.cli.calibrate.target import from_frames, misfits
 from dappled.decode.depth.ranging import Target, fit_targets
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Code
 from dappled.mocks.scene.masked_camera import reference_camera

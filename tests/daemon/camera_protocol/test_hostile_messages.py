@@ -25,7 +25,9 @@ from hypothesis import strategies as st
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import Unsigned
 from dappled.drivers.mavlink import signing as mavlink_signing
-from dappled.drivers.mavlink.links import Framer, Packet, mavlink
+from dappled.drivers.mavlink.framing import Framer, mavlink
+from dappled.drivers.mavlink.links import Packet
+from dappled.drivers.mavlink.signature_book import UNITS_PER_S
 from tests.daemon.camera_protocol.rig import Camera, Peer
 from tests.daemon.camera_protocol.test_component import Rig
 from tests.waiting import eventually
@@ -234,7 +236,7 @@ def test_forged_replayed_and_unsigned_packets_fire_nothing_on_a_signed_link(tmp_
         def sign(peer: Peer, secret: bytes) -> None:
             peer.packer.signing.secret_key, peer.packer.signing.sign_outgoing = secret, True
             now = time.time() - mavlink_signing.EPOCH_UNIX_S
-            peer.packer.signing.timestamp = round(now * mavlink_signing.UNITS_PER_S)
+            peer.packer.signing.timestamp = round(now * UNITS_PER_S)
 
         fire = mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, 1, 0, 0, 0)
         sign(gcs, key)
@@ -276,7 +278,7 @@ def test_a_station_with_a_wrong_clock_is_taken_once_it_has_heard_the_camera(
                 signer = station.packer.signing
                 signer.secret_key, signer.sign_outgoing = key, True
                 now = time.time() - mavlink_signing.EPOCH_UNIX_S
-                signer.timestamp = round((now + off_s) * mavlink_signing.UNITS_PER_S)
+                signer.timestamp = round((now + off_s) * UNITS_PER_S)
                 listener = mavlink.MAVLink(None)  # as programs have it: one object signs, hears, and learns the time
                 listener.signing = signer
                 station.decode = listener.decode
@@ -385,7 +387,7 @@ def test_a_signed_request_that_two_links_bring_is_one_shot_and_answered_on_both(
     ):
         signer = near.packer.signing
         signer.secret_key, signer.sign_outgoing = key, True
-        signer.timestamp = round((time.time() - mavlink_signing.EPOCH_UNIX_S) * mavlink_signing.UNITS_PER_S)
+        signer.timestamp = round((time.time() - mavlink_signing.EPOCH_UNIX_S) * UNITS_PER_S)
         fire = near.packed(mavlink.MAVLink_command_long_message(1, 100, 2000, 0, 0, 0, 1, 7, 0, 0, 0))
         near.raw(fire)
         assert near.ack(2000) == ACCEPTED

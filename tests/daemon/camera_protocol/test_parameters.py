@@ -24,7 +24,8 @@ from dappled.daemon.camera_protocol.parameters import (
 )
 from dappled.drivers.camera import Setting, SettingName
 from dappled.drivers.mavlink import MavlinkMessage, Signing, make_key, mavlink, open_signing, read_key
-from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.drivers.mavlink.signature_book import UNITS_PER_S
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S
 from tests.daemon.camera_protocol.rig import Camera, Peer
 
 

@@ -13,7 +13,8 @@ from scipy import ndimage
 
 from dappled.daemon.health.frame_checks import check_frame, sharpness
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, finding, told
 from dappled.mocks.scene.masked_camera import reference_camera

@@ -21,7 +21,7 @@ from dappled.daemon.live_settings import LiveSettings
 from dappled.daemon.navigation.clocks import ExposureTime
 from dappled.daemon.navigation.navigation import Navigation, Telemetry, recorded_vehicles
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.replay import replay
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.daemon.service import Service

@@ -18,7 +18,7 @@ from PIL import Image
 from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.decode_process import DecodeProcess, DecodeProcessError, serve
 from dappled.drivers.child_process import ProcessChannel, RestartBudget
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.mocks.scene.masked_camera import reference_camera
 from dappled.workers import Loop
 from tests.waiting import eventually

@@ -9,8 +9,8 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock
-from dappled.daemon.pipeline.repeats import FORWARDED_NS
-from dappled.daemon.pipeline.shutter import CaptureRequest, Shutter
+from dappled.daemon.pipeline.repeats import FORWARDED_NS, CaptureRequest
+from dappled.daemon.pipeline.shutter import Shutter
 from dappled.drivers.mavlink import mavlink
 from tests.daemon.fakes import FakeSink
 from tests.simulated.personality import CameraPort, CameraTriggers

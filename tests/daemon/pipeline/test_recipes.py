@@ -14,7 +14,7 @@ from dappled.config import settings as configuration
 from dappled.config.schema import ConfigError
 from dappled.config.settings import CameraSettings, DecodeSettings, MaskSettings, Settings
 from dappled.daemon.pipeline import recipes
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 
 SETTINGS = Settings(camera=CameraSettings(profile="reference-36mm"), mask=MaskSettings("reference-5x5"))

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from dappled.clock import RecordedClock, SystemClock
 from dappled.daemon.pipeline import shutter as module
-from dappled.daemon.pipeline.shutter import CaptureRequest, ShotDecision, Shutter
+from dappled.daemon.pipeline.repeats import CaptureRequest
+from dappled.daemon.pipeline.shutter import ShotDecision, Shutter
 from dappled.findings import Code, Subject, finding
 from dappled.flight import Shot
 from dappled.flight.logs import DURABLE_S

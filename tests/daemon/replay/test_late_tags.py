@@ -18,7 +18,7 @@ from dappled.config import settings as configuration
 from dappled.config.settings import MavlinkSettings, PoseSettings, PublishSettings, RecordSettings, Settings
 from dappled.daemon import service as module
 from dappled.daemon.pipeline.capture import PendingShot
-from dappled.daemon.pipeline.shutter import CaptureRequest
+from dappled.daemon.pipeline.repeats import CaptureRequest
 from dappled.daemon.service import Service
 from dappled.drivers.mavlink import mavlink
 from dappled.flight import FlightsLock, LedgerReader, TimeSource, layout, recovery

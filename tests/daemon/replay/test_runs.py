@@ -13,7 +13,7 @@ from dappled.clock import RecordedClock
 from dappled.daemon.pipeline.recipes import Names
 from dappled.daemon.replay import runs
 from dappled.daemon.replay.runs import Run, RunWriter
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.flight import FlightsLock, LedgerReader, Recording, Result, offload, recording
 from dappled.flight.checks.flight_check import check

@@ -10,7 +10,8 @@ import time
 
 import pytest
 
-from dappled.drivers.mavlink.channels import Address, LinkError, TcpServer, over_tcp, parse
+from dappled.drivers.mavlink.channels import Address, LinkError, parse
+from dappled.drivers.mavlink.streams import TcpServer, over_tcp
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,10 @@ from hypothesis import strategies as st
 
 from dappled.clock import Clock, SystemClock
 from dappled.drivers.mavlink import channels
-from dappled.drivers.mavlink.channels import Address, ByteStream
-from dappled.drivers.mavlink.links import Framer, LinkError, MavlinkLinks, Packet, PacketParser, mavlink, pack
+from dappled.drivers.mavlink.channels import Address, LinkError
+from dappled.drivers.mavlink.framing import Framer, PacketParser, mavlink, pack
+from dappled.drivers.mavlink.links import MavlinkLinks, Packet
+from dappled.drivers.mavlink.streams import ByteStream
 from tests.needs import without
 from tests.waiting import eventually
 

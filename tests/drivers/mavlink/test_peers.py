@@ -14,7 +14,8 @@ from dappled.clock import SystemClock
 from dappled.drivers.mavlink import MavlinkLinks, Packet, make_key, mavlink, open_signing, pack, read_key
 from dappled.drivers.mavlink.channels import UdpIn
 from dappled.drivers.mavlink.peers import CREDIT_BYTES, MOST, Peers
-from dappled.drivers.mavlink.signing import EPOCH_UNIX_S, UNITS_PER_S
+from dappled.drivers.mavlink.signature_book import UNITS_PER_S
+from dappled.drivers.mavlink.signing import EPOCH_UNIX_S
 from dappled.drivers.mavlink.streams import TcpServer
 from tests.drivers.mavlink.strangers import Strangers
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 
 from dappled.clock import SystemClock
 from dappled.drivers.mavlink import signing
-from dappled.drivers.mavlink.links import Framer, mavlink, pack
+from dappled.drivers.mavlink.framing import Framer, mavlink, pack
+from dappled.drivers.mavlink.signature_book import UNITS_PER_S
 from dappled.drivers.mavlink.signing import SignatureGuard, SigningError, SigningTime, Unsigned, timestamp_of
 from dappled.errors import DappledError
 from dappled.key_files import KeyFileError
@@ -44,7 +45,7 @@ class Peer:
         self.packer.signing.secret_key = key
         self.packer.signing.sign_outgoing = True
         self.packer.signing.link_id = 3
-        self.packer.signing.timestamp = round((NOW_NS / 1e9 + offset_s - signing.EPOCH_UNIX_S) * signing.UNITS_PER_S)
+        self.packer.signing.timestamp = round((NOW_NS / 1e9 + offset_s - signing.EPOCH_UNIX_S) * UNITS_PER_S)
 
     def packet(self) -> bytes:
         raw: bytes = pack(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3), self.packer, version_1=False)

@@ -15,7 +15,8 @@ from dappled.decode.lightfield.aperture import at_corner
 from dappled.decode.lightfield.light_field import LightField
 from dappled.decode.lightfield.views import from_lenslet_slices
 from dappled.decode.optics.carriers import Carrier
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from tests.simulated.lytro import container, metadata
 

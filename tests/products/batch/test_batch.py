@@ -19,7 +19,7 @@ import pytest
 
 from dappled import codec, durable
 from dappled.cli import main
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, finding, told
 from dappled.flight import Frame, disk_error

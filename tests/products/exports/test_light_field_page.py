@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.mocks.scene import dng
 from dappled.mocks.scene.masked_camera import ISO, MAKE, MODEL, reference_camera
 from dappled.products.exports import light_files

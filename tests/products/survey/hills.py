@@ -8,7 +8,7 @@ from pathlib import Path
 
 from dappled.clock import RecordedClock
 from dappled.decode.geometry import Quaternion
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.flight import recording
 from dappled.mocks import simulation
 from dappled.mocks.autopilot.path import FlightPath, TruePose

@@ -25,8 +25,9 @@ if not words_only:
     from dappled.decode.calibration import Calibration, report
     from dappled.decode.calibration.law_choice import CALIBRATION, EXPLAINED_BINS, LawFit
     from dappled.drivers.raw import calibration_files, recipe_check
-    from dappled.drivers.raw.darkroom import Darkroom, Recipe
+    from dappled.drivers.raw.darkroom import Darkroom
     from dappled.drivers.raw.raw_file import exposure
+    from dappled.drivers.raw.recipe import Recipe
 
 BARE = Subject("bare frames")
 _MASKS = ("diagonal", "full")

@@ -16,7 +16,8 @@ if not words_only:
     from numpy.typing import NDArray
 
     from dappled.config import profiles
-    from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
+    from dappled.drivers.raw.darkroom import Darkroom, naming
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.products import chessboard
 
 

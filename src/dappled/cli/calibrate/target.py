@@ -21,7 +21,8 @@ if not words_only:
     from dappled.decode.depth.ranging import Target, fit_targets, target_shift
     from dappled.decode.lightfield import ViewStack
     from dappled.drivers.raw import calibration_files
-    from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
+    from dappled.drivers.raw.darkroom import Darkroom, naming
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.products import opened
     from dappled.products.opened import OpenedLightField
 

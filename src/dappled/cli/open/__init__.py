@@ -21,8 +21,8 @@ if not words_only:
     from dappled.daemon.console import offline, process
     from dappled.daemon.console.recorded import FlightFrames, FrameSource, LightFieldFrames
     from dappled.daemon.pipeline.decode_process import DecodeProcess
-    from dappled.drivers.raw.darkroom import Recipe
     from dappled.drivers.raw.picture_maker import PictureMaker
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.flight import layout
     from dappled.products import opened
     from dappled.products.mounting import Mounting

@@ -24,8 +24,8 @@ from dappled.errors import CallError, counted
 
 if not words_only:
     from dappled.cli.picture import places
-    from dappled.drivers.raw.darkroom import Recipe
     from dappled.drivers.raw.picture_maker import LensFrame, MadePicture, PictureMaker, ToldShadow, beside
+    from dappled.drivers.raw.recipe import Recipe
     from dappled.products import processes
     from dappled.products.handover import picture_files, reflectance
     from dappled.products.handover.reflectance import ReflectancePanel, ReflectancePicture

@@ -28,7 +28,7 @@ from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import systemd
 from dappled.decode.geometry import area
 from dappled.drivers.child_process import ProcessChannel
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError, report
 from dappled.large_blocks import reuse_large_blocks
 from dappled.shown import guard_output

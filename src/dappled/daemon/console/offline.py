@@ -23,7 +23,7 @@ from dappled.daemon.console.recorded import FrameSource
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.stream.wire import Message
 from dappled.decode.lightfield import LightField
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError, sentence
 
 log = logging.getLogger(__name__)

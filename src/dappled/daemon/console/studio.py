@@ -22,7 +22,8 @@ from dappled.decode.lightfield import LightField, ViewStack
 from dappled.decode.lightfield.light_field import slice_mosaic
 from dappled.decode.optics import Carrier, Lattice
 from dappled.decode.spectrum import Slices
-from dappled.drivers.raw.darkroom import Darkroom, Recipe
+from dappled.drivers.raw.darkroom import Darkroom
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 
 Made = TypeVar("Made")

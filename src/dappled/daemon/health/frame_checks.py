@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from dappled.config import profiles
 from dappled.daemon.pipeline.picture_facts import DIRECTIONS, fineness
 from dappled.drivers.raw import reading
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
-from dappled.drivers.raw.raw_file import MOST_CLIPPED, exposure
-from dappled.drivers.raw.reading import RawFile
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
+from dappled.drivers.raw.raw_file import MOST_CLIPPED, RawFile, exposure
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, Value, finding, of_subject
 

@@ -30,9 +30,9 @@ from dappled.decode.picture.shadow import shadow_at
 from dappled.drivers.camera import Blob
 from dappled.drivers.child_process import ChannelMessage, end_with_parent
 from dappled.drivers.raw import recipe_check
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.drivers.raw.frame_mosaic import mosaic_of
-from dappled.drivers.raw.recipe import LawDecision
+from dappled.drivers.raw.recipe import LawDecision, Recipe
 from dappled.encoded_pictures import file_of
 from dappled.errors import DappledError, sentence
 from dappled.findings import FRAME, Code, Finding, finding

@@ -17,8 +17,6 @@ from dappled.flight import Cause, FlightError, Shot
 from dappled.refusals import SHOTS_INTERVAL_S, RefusalLog
 from dappled.workers import Loop, OneThread
 
-__all__ = ["CaptureRequest", "ShotDecision", "Shutter", "ShutterStatistics"]
-
 log = logging.getLogger(__name__)
 CANNOT_FIRE = finding(Code.CAMERA_FIRED_OUTSIDE, Subject("camera"))
 _LONGEST_S = 86400

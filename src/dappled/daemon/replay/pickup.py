@@ -24,6 +24,7 @@ from dappled.daemon.pipeline.tagging import Zoom
 from dappled.daemon.replay.replay import RecordedTelemetry
 from dappled.drivers.camera import CameraError
 from dappled.drivers.raw import reading
+from dappled.drivers.raw.exposure_settings import ExposureSettings
 from dappled.drivers.raw.raw_file import read_exif
 from dappled.drivers.raw.recipe import camera_name
 from dappled.drivers.wired import matching
@@ -321,8 +322,8 @@ def _accompany(recorder: Recorder, source: FileSource, index: int, found: FoundF
         recorder.record_companion(index, found.base, blob, arrived_utc_ns=utc_ns)
 
 
-def _settings(path: Path) -> reading.ExposureSettings:
+def _settings(path: Path) -> ExposureSettings:
     try:
         return reading.read_metadata(path)
     except DappledError:
-        return reading.ExposureSettings()  # an unreadable frame is still recorded
+        return ExposureSettings()  # an unreadable frame is still recorded

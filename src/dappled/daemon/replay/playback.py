@@ -21,7 +21,7 @@ from dappled.daemon.stream import wire
 from dappled.daemon.stream.answers import Answers
 from dappled.daemon.stream.publisher import Publisher
 from dappled.drivers.camera import Identity
-from dappled.drivers.raw.darkroom import Recipe
+from dappled.drivers.raw.recipe import Recipe
 from dappled.drivers.replay import ReplayCamera
 from dappled.findings import Finding
 

@@ -18,7 +18,7 @@ from dappled.clock import Clock
 from dappled.closing import Closing
 from dappled.daemon.pipeline import recipes
 from dappled.daemon.pipeline.recipes import Names
-from dappled.drivers.raw.darkroom import FILES, Recipe
+from dappled.drivers.raw.recipe import FILES, Recipe
 from dappled.errors import DappledError
 from dappled.flight import LIVE, Ledger, LedgerReader, Result, is_closed, layout, provenance, seals
 from dappled.flight.seal_key import SealKey

@@ -5,19 +5,8 @@ into packets, `signing` signs and verifies.
 """
 
 from dappled.drivers.mavlink.channels import LinkError, Transport, parse
-from dappled.drivers.mavlink.framing import Framed, is_for
-from dappled.drivers.mavlink.links import (
-    LinkStatistics,
-    MavlinkLinks,
-    MavlinkMessage,
-    Packet,
-    PacketLog,
-    PacketParser,
-    PacketReceiver,
-    PacketSender,
-    mavlink,
-    pack,
-)
+from dappled.drivers.mavlink.framing import Framed, MavlinkMessage, PacketParser, is_for, mavlink, pack
+from dappled.drivers.mavlink.links import LinkStatistics, MavlinkLinks, Packet, PacketLog, PacketReceiver, PacketSender
 from dappled.drivers.mavlink.signing import (
     Signing,
     SigningError,

@@ -20,23 +20,6 @@ from dappled.drivers.mavlink.peers import OnePeer, Peers, Shown, Source
 from dappled.drivers.mavlink.streams import ByteStream, TcpServer, over_tcp
 from dappled.errors import DappledError
 
-__all__ = [
-    "FORBIDDEN",
-    "Address",
-    "ByteChannel",
-    "ByteStream",
-    "LinkError",
-    "MachineTransport",
-    "TcpServer",
-    "Transport",
-    "UdpIn",
-    "UdpOut",
-    "over_serial",
-    "over_tcp",
-    "parse",
-    "serial_address",
-]
-
 LinkKind = Literal["udpin", "udpout", "udpbcast", "tcp", "tcpin", "serial"]
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, udpbcast:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or /dev/ttyX[,BAUD]"
 DEFAULT_BAUD = 115200

@@ -6,23 +6,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.dialects.v20 import ardupilotmega
 
-# `mavlink` holds the message classes, for the whole project: version 2 on the wire, and ArduPilot's dialect, which
-# contains `common`.
-__all__ = [
-    "SIGNATURE_BYTES",
-    "Framed",
-    "Framer",
-    "MavlinkMessage",
-    "PacketParser",
-    "is_for",
-    "is_signed",
-    "mavlink",
-    "message_of",
-    "pack",
-    "packet_length",
-]
+mavlink = ardupilotmega
+"""The message classes, for the whole project: version 2, and the dialect of ArduPilot, which contains `common`."""
 
 MavlinkMessage = Any  # pymavlink's message classes have no common typed base
 SIGNATURE_BYTES = 13

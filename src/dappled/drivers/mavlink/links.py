@@ -12,27 +12,11 @@ from typing import Protocol
 
 from dappled.clock import Clock
 from dappled.drivers.mavlink.channels import Address, ByteChannel, LinkError, MachineTransport, Transport, parse
-from dappled.drivers.mavlink.framing import Framed, Framer, MavlinkMessage, PacketParser, is_signed, mavlink, pack
+from dappled.drivers.mavlink.framing import Framed, Framer, MavlinkMessage, is_signed, mavlink, pack
 from dappled.drivers.mavlink.log_budget import LogBudget
 from dappled.drivers.mavlink.signing import SignatureGuard, Signing, SigningStatistics
 from dappled.findings import Finding
 from dappled.workers import Loop, renice
-
-__all__ = [
-    "Framed",
-    "Framer",
-    "LinkError",
-    "LinkStatistics",
-    "MavlinkLinks",
-    "MavlinkMessage",
-    "Packet",
-    "PacketLog",
-    "PacketParser",
-    "PacketReceiver",
-    "PacketSender",
-    "mavlink",
-    "pack",
-]
 
 log = logging.getLogger(__name__)
 _REOPEN_S = 1.0

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry import Quaternion, Vector3
-from dappled.drivers.mavlink.links import MavlinkMessage, mavlink, pack
+from dappled.drivers.mavlink.framing import MavlinkMessage, mavlink, pack
 from dappled.errors import DappledError, first_line
 from dappled.findings import Code, Finding, Subject, finding
 

@@ -24,23 +24,6 @@ from dappled.drivers.mavlink.signature_book import NEW_STREAM_UNITS, UNITS_PER_S
 from dappled.errors import DappledError
 from dappled.findings import Finding
 
-__all__ = [
-    "AHEAD_UNITS",
-    "EPOCH_UNIX_S",
-    "UNITS_PER_S",
-    "SignatureGuard",
-    "Signing",
-    "SigningError",
-    "SigningStatistics",
-    "SigningTime",
-    "Trust",
-    "Unsigned",
-    "make_key",
-    "open_signing",
-    "read_key",
-    "timestamp_of",
-]
-
 log = logging.getLogger(__name__)
 Unsigned = Literal["refuse", "listen", "allow"]
 Streams: TypeAlias = dict[str, dict[Stream, int]]  # by the name of the key

@@ -35,9 +35,16 @@ from dappled.decode.spectrum.plane import Places, colour_index, coloured, find_d
 from dappled.decode.spectrum.transform import Source
 from dappled.drivers.raw import calibration_files, reading
 from dappled.drivers.raw.law_check import FrameLens, LawCheck, check_report
-from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, Exposure, exposure, not_linear, shares_of_white
-from dappled.drivers.raw.reading import RawFile
-from dappled.drivers.raw.recipe import FILES, FOLDER, LawDecision, Recipe, camera_name, of_flight
+from dappled.drivers.raw.raw_file import (
+    MOST_CLIPPED,
+    WHITE_SHARE,
+    Exposure,
+    RawFile,
+    exposure,
+    not_linear,
+    shares_of_white,
+)
+from dappled.drivers.raw.recipe import LawDecision, Recipe, camera_name
 from dappled.errors import DappledError
 from dappled.findings import Finding, Subject
 
@@ -89,19 +96,6 @@ def naming(path: Path | str) -> Iterator[None]:
         yield
     except DecodeError as error:
         raise DappledError(f"{path}: {error}") from error
-
-
-__all__ = [
-    "FILES",
-    "FOLDER",
-    "DappledError",
-    "Darkroom",
-    "DecodeResult",
-    "LawDecision",
-    "Recipe",
-    "known_to",
-    "of_flight",
-]
 
 
 @dataclass(frozen=True, slots=True)

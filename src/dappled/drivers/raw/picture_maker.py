@@ -22,9 +22,10 @@ from dappled.decode.picture.picture import DARK, UnmaskedPicture, picture_of
 from dappled.decode.picture.shadow import OwnShadow, Shadow, ShadowFrom, period_of
 from dappled.decode.picture.shadow_fit import ExpectedShadow, shadow_of, told_by
 from dappled.drivers.raw import reading, recipe_check
-from dappled.drivers.raw.darkroom import Darkroom, Recipe, naming
+from dappled.drivers.raw.darkroom import Darkroom, naming
 from dappled.drivers.raw.frame_mosaic import mosaic_of
 from dappled.drivers.raw.raw_file import MOST_CLIPPED, WHITE_SHARE, RawFile, shares_of_white
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Level, Subject, above_note, finding
 

@@ -35,8 +35,6 @@ from dappled.durable import plain_file
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Finding, finding
 
-__all__ = ["DappledError", "ExposureSettings", "RawFile", "RawSource", "read", "read_metadata"]
-
 _TIFF_STARTS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _DNG_VERSION, _MAX_SAMPLE = 50706, 281  # TIFF tags
 _LINEAR_FROM = 0.95  # a PNG's gamma: 1 is linear, 0.45455 is usual

@@ -20,8 +20,8 @@ from dappled import __version__, codec, confined, durable, file_lock
 from dappled.bounds.parsing import parse_json
 from dappled.closing import Closing
 from dappled.drivers.raw import recipe_check
-from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError, sentence
 from dappled.findings import Finding
 from dappled.flight import Frame, Tag

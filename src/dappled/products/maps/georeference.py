@@ -15,8 +15,8 @@ import numpy as np
 
 from dappled.decode.lightfield import LightField
 from dappled.drivers.raw import reading, recipe_check
-from dappled.drivers.raw.darkroom import Recipe
 from dappled.drivers.raw.picture_maker import LensFrame, ToldShadow, beside
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Finding, Subject, text
 from dappled.flight import FlightFolder

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 
 from dappled.config import profiles
-from dappled.drivers.raw.darkroom import Darkroom, DecodeResult, Recipe
+from dappled.drivers.raw.darkroom import Darkroom, DecodeResult
 from dappled.drivers.raw.picture_maker import LensFrame, PictureMaker, ToldShadow
+from dappled.drivers.raw.recipe import Recipe
 from dappled.errors import DappledError
 from dappled.findings import Finding
 from dappled.flight import FlightFolder, Frame, Tag

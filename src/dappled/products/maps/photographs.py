@@ -18,7 +18,7 @@ from dappled.decode.lightfield import LightField
 from dappled.decode.optics import Sensor
 from dappled.drivers.raw import developing
 from dappled.drivers.raw.picture_maker import MadePicture
-from dappled.drivers.raw.reading import RawFile
+from dappled.drivers.raw.raw_file import RawFile
 from dappled.errors import DappledError
 from dappled.findings import FRAME, Code, Evidence, Finding, Subject, finding
 from dappled.flight import Frame, LedgerReader, Tag, layout
