@@ -12,7 +12,7 @@ import logging
 import math
 import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, Self
 
 from dappled.clock import Clock
@@ -84,36 +84,28 @@ class SurveyFacts(Protocol):
         """Whether the body is at work on a shot, so that another would be taken later, and elsewhere."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class SpacingStatistics:
     """The photographs so far, `late` ones among them, those that were `refused` instead, and how far apart they are to
     be now (None: nobody knows). `trouble` says why none is taken, or that they come late. `began_ns` is monotonic."""
 
     wanted: Spacing
-    spacing_m: float | None
-    taken: int
-    refused: int
-    late: int
-    height: Height | None
-    trouble: Finding | None
-    began_ns: int
+    spacing_m: float | None = None
+    taken: int = 0
+    refused: int = 0
+    late: int = 0
+    height: Height | None = None
+    trouble: Finding | None = None
+    began_ns: int = 0
 
 
-@dataclass(slots=True)
-class _Way:
+@dataclass(slots=True, kw_only=True)
+class _Way(SpacingStatistics):
     """A series that runs. `last` is the place of the last photograph (radians, metres above sea level)."""
 
     source: str
-    wanted: Spacing
     at_once: bool
-    began_ns: int
     last: tuple[float, float, float] | None = None
-    spacing_m: float | None = None
-    height: Height | None = None
-    asked: int = 0
-    refused: int = 0
-    late: int = 0
-    trouble: Finding | None = None
     is_late: bool = False  # the last one was
     apart_m: float = 0.0
 
@@ -157,7 +149,7 @@ class DistanceTrigger(OneThread):
         with self._lock:
             if self._way is not None and (self._way.wanted, self._way.source) == (wanted, source):
                 return
-            self._way = _Way(source, wanted, at_once, self._clock.monotonic_ns())
+            self._way = _Way(wanted, began_ns=self._clock.monotonic_ns(), source=source, at_once=at_once)
         self._wake.set()
 
     def begin_configured(self, source: str) -> bool:
@@ -188,16 +180,7 @@ class DistanceTrigger(OneThread):
             if trouble is None and way.is_late:
                 spacing_m = way.spacing_m or 0.0
                 trouble = finding(Code.SERIES_LATE, _SERIES, apart_m=way.apart_m, spacing_m=spacing_m)
-            return SpacingStatistics(
-                way.wanted,
-                way.spacing_m,
-                way.asked - way.refused,
-                way.refused,
-                way.late,
-                way.height,
-                trouble,
-                way.began_ns,
-            )
+            return replace(way, trouble=trouble)
 
     def serve(self) -> float:
         """Take the photograph that is due; seconds until the next look. The thread's work."""
@@ -224,10 +207,10 @@ class DistanceTrigger(OneThread):
             missed = way.spacing_m is not None and math.isfinite(apart_m) and apart_m >= 2 * way.spacing_m
             if not missed and self._around.busy():
                 return _LOOK_S
-            way.asked += 1
-            request = CaptureRequest(way.source, KIND, way.asked, acknowledged=False)
+            way.taken += 1
+            request = CaptureRequest(way.source, KIND, way.taken + way.refused, acknowledged=False)
             accepted = self._shutter.request(request).accepted
-            way.refused += not accepted
+            way.taken, way.refused = way.taken - (not accepted), way.refused + (not accepted)
             too_far = bool(way.spacing_m and _LATE * way.spacing_m < apart_m < math.inf)
             way.is_late = missed or not accepted or too_far
             if way.is_late:

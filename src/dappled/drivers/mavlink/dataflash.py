@@ -51,8 +51,7 @@ def packets(
         clock, counting, told = _clock(path, rows, bounds)
         messages = [*_positions(path, rows, missing, told), *_attitudes(rows, missing)]
         for receiver, which in counting:
-            for fix in receiver.fixes(which):
-                messages += log_packets.receiver(fix, clock)
+            messages += receiver.messages(which, clock)
     log_packets.tell(path, [*told, *missing.findings(path)], report, cut=cut)
     yield from log_packets.packets(messages, clock)
 

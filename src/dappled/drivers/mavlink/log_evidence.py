@@ -15,7 +15,8 @@ from dappled.clock import TimeOfDayClock
 from dappled.decode.array_types import Floats
 from dappled.decode.geometry.camera_pose import matrix_of
 from dappled.drivers.mavlink import log_packets
-from dappled.drivers.mavlink.log_packets import FIX_3D, AutopilotLogError, BootMap, ReceiverFix, Timed
+from dappled.drivers.mavlink.framing import mavlink
+from dappled.drivers.mavlink.log_packets import FIX_3D, UNKNOWN_16, AutopilotLogError, BootMap, Timed
 from dappled.drivers.mavlink.sample_judge import (
     FASTEST_M_S,
     HIGHEST_M,
@@ -95,24 +96,23 @@ class Receiver:
         known = (self.fix_type >= FIX_3D) & (self.fix_type < _EXTRAPOLATED)
         return known & in_time(self.boots_us) & placed(self.lat, self.lon, self.alt)
 
-    def fixes(self, which: Chosen) -> Iterator[ReceiverFix]:
-        """Its messages, as far as they can be told."""
+    def messages(self, which: Chosen, clock: BootMap) -> Iterator[Timed]:
+        """A GPS_RAW_INT and a SYSTEM_TIME for each of its messages, as far as they can be told."""
         here = placed(self.lat, self.lon, self.alt)
-        for n in np.flatnonzero(which & in_time(self.boots_us)):
-            accuracy = tuple(self.accuracy[:, n].tolist())
-            hdop, vdop = float(self.hdop[n]), float(self.vdop[n])
-            fix = int(self.fix_type[n])
-            yield ReceiverFix(
-                int(self.boots_us[n]),
-                fix if here[n] and 0 <= fix < _EXTRAPOLATED else 0,
-                float(self.lat[n]) if here[n] else 0.0,
-                float(self.lon[n]) if here[n] else 0.0,
-                float(self.alt[n]) if here[n] else 0.0,
-                min(254, max(0, int(self.satellites[n]))) if math.isfinite(self.satellites[n]) else 255,
-                hdop if 0 <= hdop < _HIGHEST_DOP else 0.0,
-                vdop if 0 < vdop < _HIGHEST_DOP else None,
-                accuracy if all(0 <= one < HIGHEST_M for one in accuracy) else None,
-            )
+        for n in np.flatnonzero(which & in_time(self.boots_us)).tolist():
+            at, fix, satellites = int(self.boots_us[n]), int(self.fix_type[n]), float(self.satellites[n])
+            lat, lon, alt = (float(side[n]) if here[n] else 0.0 for side in (self.lat, self.lon, self.alt))
+            hdop, vdop, accuracy = float(self.hdop[n]), float(self.vdop[n]), self.accuracy[:, n].tolist()
+            message = mavlink.MAVLink_gps_raw_int_message(
+                at, fix if here[n] and 0 <= fix < _EXTRAPOLATED else 0,
+                round(lat * 1e7), round(lon * 1e7), round(alt * 1e3),
+                round(hdop * 100) if 0 <= hdop < _HIGHEST_DOP else 0,
+                round(vdop * 100) if 0 < vdop < _HIGHEST_DOP else UNKNOWN_16,
+                UNKNOWN_16, UNKNOWN_16, min(254, max(0, int(satellites))) if math.isfinite(satellites) else 255, 0,
+                *(round(1000 * one) if all(0 <= each < HIGHEST_M for each in accuracy) else 0 for one in accuracy),
+            )  # fmt: skip
+            yield at, message
+            yield at, mavlink.MAVLink_system_time_message(clock.utc_us(at), at // 1000)
 
     def _rank(self) -> tuple[float, float, float, int]:
         fixed = self.fixed

@@ -17,7 +17,7 @@ from dappled.errors import DappledError, first_line
 from dappled.findings import Code, Finding, Subject, finding
 
 FIX_3D = 3
-_UNKNOWN_16 = 2**16 - 1
+UNKNOWN_16 = 2**16 - 1
 _LATEST_US = 500_000  # a receiver's message is logged within that time, all but always
 _AGREEING = 0.75  # share of a receiver's messages that must give one time
 _STEADY = 0.95
@@ -41,21 +41,6 @@ def sound(path: Path, by: str) -> Iterator[None]:
         raise AutopilotLogError(f"{path} is damaged as a log of {by}, or made to exhaust memory: {error}") from None
     except (ValueError, TypeError, KeyError, IndexError, ArithmeticError, AttributeError) as error:
         raise AutopilotLogError(f"{path} is damaged as a log of {by} ({first_line(error)}): copy it again") from None
-
-
-@dataclass(frozen=True, slots=True)
-class ReceiverFix:
-    """What the receiver said at one time. `accuracy_m` is horizontal and vertical (m) and of the speed (m/s)."""
-
-    boot_us: int
-    fix_type: int
-    latitude_deg: float
-    longitude_deg: float
-    altitude_msl_m: float
-    satellites: int
-    hdop: float
-    vdop: float | None
-    accuracy: tuple[float, float, float] | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,26 +147,10 @@ def position(boot_us: int, place: tuple[float, float, float], above_home_m: floa
     latitude_deg, longitude_deg, altitude_m = place
     whole = round(latitude_deg * 1e7), round(longitude_deg * 1e7), round(altitude_m * 1e3), round(above_home_m * 1e3)
     speeds = (round(speed * 100) for speed in velocity_ned_m_s)
-    return boot_us, mavlink.MAVLink_global_position_int_message(boot_us // 1000, *whole, *speeds, _UNKNOWN_16)
+    return boot_us, mavlink.MAVLink_global_position_int_message(boot_us // 1000, *whole, *speeds, UNKNOWN_16)
 
 
 def attitude(boot_us: int, turned: Quaternion) -> Timed:
     """An ATTITUDE_QUATERNION without rates."""
     unknown = (float("nan"),) * 3
     return boot_us, mavlink.MAVLink_attitude_quaternion_message(boot_us // 1000, *turned, *unknown)
-
-
-def receiver(fix: ReceiverFix, clock: BootMap) -> Iterator[Timed]:
-    """A GPS_RAW_INT and a SYSTEM_TIME."""
-    at = fix.boot_us
-    of_mm = [0, 0, 0] if fix.accuracy is None else [round(1000 * value) for value in fix.accuracy]
-    vertical = _UNKNOWN_16 if fix.vdop is None else round(fix.vdop * 100)
-    places = round(fix.latitude_deg * 1e7), round(fix.longitude_deg * 1e7), round(fix.altitude_msl_m * 1e3)
-    yield (
-        at,
-        mavlink.MAVLink_gps_raw_int_message(
-            at, fix.fix_type, *places, round(fix.hdop * 100), vertical, _UNKNOWN_16, _UNKNOWN_16, fix.satellites,
-            0, *of_mm,
-        ),
-    )  # fmt: skip
-    yield at, mavlink.MAVLink_system_time_message(clock.utc_us(at), at // 1000)

@@ -59,8 +59,7 @@ def packets(
         clock, counting, told = _clock(path, log, bounds)
         messages = [*_positions(path, log, missing), *_attitudes(path, log, missing)]
         for receiver, which in counting:
-            for fix in receiver.fixes(which & receiver.fixed):
-                messages += log_packets.receiver(fix, clock)
+            messages += receiver.messages(which & receiver.fixed, clock)
         cut = _cut_short(durable.read_plain(path))
     log_packets.tell(path, [*told, *missing.findings(path)], report, cut=cut)
     yield from log_packets.packets(messages, clock)
