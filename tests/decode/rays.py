@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dappled.decode.optics.carriers import Lattice, Mask, Sensor, geometric
 
 Plane = NDArray[np.float32]
+Grid = NDArray[np.float64]
 FULL_APERTURE_MM = 6.7
 FOCAL_MM = 50.0
 FULL_F = FOCAL_MM / FULL_APERTURE_MM
@@ -38,10 +39,17 @@ class Texture:
         size *= rms / np.sqrt((size**2).sum() / 2)
         return cls(fy, fx, size * np.exp(2j * np.pi * rng.uniform(size=waves)), mean)
 
-    def at(self, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> NDArray[np.float64]:
+    def on(self, rows: NDArray[np.float64], columns: NDArray[np.float64]) -> Callable[[float, float], Grid]:
+        """What gives the texture at these places, moved down and across by so much."""
         left = np.exp(2j * np.pi * np.outer(rows, self.fy))
+        left = np.hstack([left.real, -left.imag])
         right = np.exp(2j * np.pi * np.outer(self.fx, columns)) * self.amplitude[:, None]
-        return np.asarray(self.mean + (left @ right).real, dtype=np.float64)
+
+        def at(down: float, across: float) -> Grid:
+            turned = right * np.exp(-2j * np.pi * (down * self.fy + across * self.fx))[:, None]
+            return np.asarray(self.mean + left @ np.vstack([turned.real, turned.imag]), dtype=np.float64)
+
+        return at
 
 
 @dataclass(frozen=True)
@@ -77,11 +85,10 @@ class Camera:
         aperture = FOCAL_MM / f_number
         angles = (np.arange(self.beams) - (self.beams - 1) / 2) / self.beams * aperture
         total = np.zeros((height, width))
+        seen = _seen(layers, np.arange(float(height)), np.arange(float(width)))
         for v in angles:
             for u in angles:
-                m_y, m_x = (1 - alpha) * y[:, None] + alpha * v, (1 - alpha) * x[None, :] + alpha * u
-                views = self._views(layers, np.arange(float(height)), np.arange(float(width)), (v, u))
-                total += views * self._transmission(m_y, m_x)
+                total += seen(v, u) * self._transmission((1 - alpha) * y + alpha * v, (1 - alpha) * x + alpha * u)
         return np.asarray(total / self.beams**2, dtype=np.float32)
 
     def truth(
@@ -94,39 +101,36 @@ class Camera:
         """(5, 5, h, w) the views on a decoder's grid: each the mean of its own beams, where there are 5 n × 5 n."""
         rows, columns = np.arange(shape[0]) * grid[0, 0], np.arange(shape[1]) * grid[1, 1]
         cells = (np.arange(self.beams) - (self.beams - 1) / 2).reshape(5, -1) / self.beams * FOCAL_MM / f_number
+        seen = _seen(layers, rows, columns)
         return np.array(
-            [
-                [
-                    np.mean([self._views(layers, rows, columns, (v, u)) for v in down for u in across], axis=0)
-                    for across in cells
-                ]
-                for down in cells
-            ]
+            [[np.mean([seen(v, u) for v in down for u in across], axis=0) for across in cells] for down in cells]
         )
 
-    def _views(
-        self,
-        layers: Sequence[tuple[Texture, float]],
-        rows: NDArray[np.float64],
-        columns: NDArray[np.float64],
-        theta_mm: tuple[float, float],
-    ) -> NDArray[np.float64]:
-        step = 5 / FULL_APERTURE_MM
-        views = [
-            texture.at(rows - shift * theta_mm[0] * step, columns - shift * theta_mm[1] * step)
-            for texture, shift in layers
-        ]
-        return np.asarray(sum(views), dtype=np.float64)
-
-    def _transmission(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _transmission(self, y: NDArray[np.float64], x: NDArray[np.float64]) -> Grid:
         c, s = np.cos(self.rotation_rad), np.sin(self.rotation_rad)
-        turned = c * y + s * x + self.shift_mm[0], -s * y + c * x + self.shift_mm[1]
-        f = self.mask.frequency_per_mm
+        turned = (c * y + self.shift_mm[0], s * x), (-s * y + self.shift_mm[1], c * x)
+        f, multiples = self.mask.frequency_per_mm, self.mask.multiples
         if self.mask.pattern == "diagonal":
-            products = [np.prod([np.cos(2 * np.pi * q * f * t) for t in turned], axis=0) for q in self.mask.multiples]
+            products = [np.prod([_cosines(a, b, [q * f]) for a, b in turned], axis=0) for q in multiples]
             return np.asarray(1 + sum(products), dtype=np.float64)
-        sums = [1 + sum(np.cos(2 * np.pi * q * f * t) for q in self.mask.multiples) for t in turned]
+        sums = [1 + _cosines(a, b, [q * f for q in multiples]) for a, b in turned]
         return np.asarray(sums[0] * sums[1], dtype=np.float64)
+
+
+def _seen(
+    layers: Sequence[tuple[Texture, float]], rows: NDArray[np.float64], columns: NDArray[np.float64]
+) -> Callable[[float, float], Grid]:
+    """What gives the light at these pixels from a point (v, u) of the aperture, in mm."""
+    textures = [(texture.on(rows, columns), shift * 5 / FULL_APERTURE_MM) for texture, shift in layers]
+    return lambda v, u: np.asarray(sum(at(step * v, step * u) for at, step in textures), dtype=np.float64)
+
+
+def _cosines(a: NDArray[np.float64], b: NDArray[np.float64], frequencies: Sequence[float]) -> Grid:
+    """(len(a), len(b)) Σ cos 2πf(a + b), as a product of matrices."""
+    turns = [2 * np.pi * f for f in frequencies]
+    rows = np.array([of(turn * a) for turn in turns for of in (np.cos, np.sin)])
+    columns = np.array([sign * of(turn * b) for turn in turns for sign, of in ((1, np.cos), (-1, np.sin))])
+    return np.asarray(rows.T @ columns, dtype=np.float64)
 
 
 def psnr(found: NDArray[np.floating], truth: NDArray[np.floating], border: int = 4) -> float:

@@ -6,6 +6,7 @@ of the middle view is seen by a view with steps (sy, sx) at (y + D·sy, x + D·s
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,15 +68,20 @@ def boards(seed: int, side: int, reach: float, count: int = 12) -> list[Board]:
 def paint(layers: list[Board], shape: tuple[int, int], views: int, *, seed: int = 0) -> tuple[ViewStack, Floats]:
     """(views × views of the boards as a stack, true disparity (h, w) of the middle)."""
     steps = centred(views)
-    textures = {
-        n: ndimage.spline_filter(noise(seed + n), order=3, mode="grid-wrap") for n in {b.texture for b in layers}
-    }
+    textures = {n: _splines(seed + n) for n in {b.texture for b in layers}}
     out = np.empty((views, views, *shape), dtype=np.float32)
     for i, sy in enumerate(steps):
         for j, sx in enumerate(steps):
             out[i, j], _ = _see(layers, textures, shape, sy, sx)
     _, truth = _see(layers, textures, shape, 0.0, 0.0)
     return ViewStack(out, steps, steps), truth
+
+
+@functools.cache
+def _splines(seed: int) -> Floats:
+    made = np.asarray(ndimage.spline_filter(noise(seed), order=3, mode="grid-wrap"))
+    made.flags.writeable = False
+    return made
 
 
 def _see(

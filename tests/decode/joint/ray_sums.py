@@ -91,7 +91,7 @@ class RaySum:
     def expose(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """(plane (H, W), true views (n, n, H, W), NaN where the stop's cell is closed)."""
         high, wide = (side * FINER for side in self.shape)
-        fy, fx = np.fft.fftfreq(high)[:, None] * FINER, np.fft.rfftfreq(wide)[None] * FINER
+        fy, fx = np.fft.fftfreq(high) * FINER, np.fft.rfftfreq(wide) * FINER
         places, view = self.stop
         textures = self._textures()
         alpha = DISTANCE_MM / FOCAL_MM
@@ -99,10 +99,10 @@ class RaySum:
         plane = np.zeros(self.shape)
         views = np.zeros((self.views**2, *self.shape))
         for (v, u), cell in zip(places, view, strict=True):
-            moved = sum(
-                spectrum * np.exp(-2j * np.pi * disparity * self.kappa * (fy * v + fx * u))
-                for disparity, spectrum in textures
-            )
+            moved = np.zeros((high, len(fx)), dtype=np.complex128)
+            for disparity, spectrum in textures:
+                turn = -2j * np.pi * disparity * self.kappa
+                moved += spectrum * np.exp(turn * v * fy)[:, None] * np.exp(turn * u * fx)
             light = np.fft.irfft2(moved, s=(high, wide))[::FINER, ::FINER]
             stop_mm = FOCAL_MM / self.f_number
             axes = [

@@ -79,9 +79,10 @@ class Shot:
         cycles = 2 * np.pi * PER_MM * self.scale
         down, across = cycles * (y + self.shift_mm[0]), cycles * (x + self.shift_mm[1])
         sums = []
-        for a, b in ((cos * down, sin * across), (-sin * down, cos * across)):
-            parts = [np.outer(np.cos(q * a), np.cos(q * b)) - np.outer(np.sin(q * a), np.sin(q * b)) for q in (1, 2)]
-            sums.append(1 + parts[0] + parts[1])
+        for a, b in ((cos * down, sin * across), (-sin * down, cos * across)):  # 1 + Σ cos q(a + b), as a product
+            rows = [np.ones_like(a), *(of(q * a) for q in (1, 2) for of in (np.cos, np.sin))]
+            columns = [np.ones_like(b), *(sign * of(q * b) for q in (1, 2) for sign, of in ((1, np.cos), (-1, np.sin)))]
+            sums.append(np.array(rows).T @ np.array(columns))
         return np.asarray((sums[0] * sums[1] + 0.375) / 1.375)
 
     def noise(self) -> Grid:
