@@ -73,14 +73,18 @@ class Forks:
             self._process.wait(60)
             self._asked = self._process = None
 
+    @property
+    def begun(self) -> bool:
+        """Whether the process that forks runs."""
+        return self._asked is not None
+
     def begin(self) -> None:
-        """Start the process that forks, where it does not run yet."""
-        if self._asked is None:
-            self._loaded_in = _at_start(os.environ)
-            self._asked, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-            with there:
-                words = [sys.executable, "-P", __file__, str(there.fileno()), " " * _ROOM_BYTES]
-                self._process = subprocess.Popen(words, pass_fds=(there.fileno(),), stdin=subprocess.DEVNULL)
+        """Start the process that forks."""
+        self._loaded_in = _at_start(os.environ)
+        self._asked, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with there:
+            words = [sys.executable, "-P", __file__, str(there.fileno()), " " * _ROOM_BYTES]
+            self._process = subprocess.Popen(words, pass_fds=(there.fileno(),), stdin=subprocess.DEVNULL)
 
     def _fork(self, process: Any, told: dict[str, Any]) -> bool:
         ends = [

@@ -43,7 +43,8 @@ def held() -> Held:
             found.add(("file", f"{name} {target}"))
     for task in os.listdir("/proc/self/task"):
         try:
-            found |= {("process", child) for child in Path(f"/proc/self/task/{task}/children").read_text().split()}
+            with open(f"/proc/self/task/{task}/children", "rb", buffering=0) as file:
+                found |= {("process", child.decode()) for child in file.read().split()}
         except OSError:  # a thread that has ended since, or a kernel that does not tell
             continue
     return frozenset(found)
@@ -64,10 +65,11 @@ class Watch:
 
     def left(self, before: Held) -> Held:
         """What is there and was not before, after as long as it may take to end."""
-        if any(kind == "file" for kind, _ in self._left(before)):
+        left = self._left(before)
+        if any(kind == "file" for kind, _ in left):
             gc.collect()  # sqlite3's connections are cycles: when they are closed by themselves is chance
         until = time.monotonic() + GRACE_S
-        while (left := self._left(before)) and time.monotonic() < until:
+        while left and (left := self._left(before)) and time.monotonic() < until:
             threading.Event().wait(0.01)
         return left
 
