@@ -135,7 +135,7 @@ def test_a_scene_without_a_mask_shows_no_lattice_however_regular_its_things_are(
     """Fences, roofs and rows of crops near the carriers' own periods, each its own way, over parts of the frame."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[: SENSOR.shape[0], : SENSOR.shape[1]].astype(np.float64)
-    plane = Texture.random(rng).at(rows[:, 0], columns[0])
+    plane = Texture.random(rng).on(rows[:, 0], columns[0])(0.0, 0.0)
     predicted = _told(0.0).predict(FOCAL_MM)
     near: list[Carrier] = [c for c in predicted if max(abs(c.ky), abs(c.kx)) == 1]
     for c in near:
