@@ -184,9 +184,6 @@ class LedgerReader(Database):
     def poses(self) -> dict[int, Pose]:
         return {index: self._load(Pose, text) for index, text in self._rows("SELECT idx, record FROM poses")}
 
-    def pose(self, index: int) -> Pose | None:
-        return self._record(Pose, "SELECT record FROM poses WHERE idx = ?", index)
-
     def tags(self) -> dict[int, Tag]:
         return {index: self._load(Tag, text) for index, text in self._rows("SELECT idx, record FROM tags")}
 
