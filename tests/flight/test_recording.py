@@ -332,7 +332,6 @@ def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path
     frame = deliver(flight, 0, b"raw")
     flight.note_image(0)
     assert flight.index.flights() == {name: None}
-    assert flight.index.utc_correction_ns(name) is None
     assert flight.ledger.utc_correction_ns() is None
     correction_ns = START_UTC_NS - uptime_ns
     flight.learn_utc(correction_ns, 10**6, "SYSTEM_TIME")
@@ -342,8 +341,9 @@ def test_a_flight_without_utc_is_named_by_boot_and_put_right_later(flights: Path
     (flights / "index.sqlite").unlink()  # the ledger knows it too
     second = begin_later(flights)
     assert second.index.flights() == {name: START_UTC_NS, second.folder.name: LATER_UTC_NS}
-    assert second.index.utc_correction_ns(name) == correction_ns
-    assert second.index.utc_correction_ns(second.folder.name) == 0
+    with LedgerReader.open(flight.folder.ledger) as ledger:
+        assert ledger.utc_correction_ns() == correction_ns
+    assert second.ledger.utc_correction_ns() == 0
     assert second.index.lookup(0) == IndexEntry(0, name, frame.name, "safe")
     second.close()
     assert flight_report.balance(flight.folder.path).began_utc_ns == START_UTC_NS

@@ -31,8 +31,7 @@ PRAGMA application_id={_APPLICATION_ID};
 PRAGMA user_version={_VERSION};
 CREATE TABLE flights (
     number INTEGER PRIMARY KEY, name TEXT NOT NULL UNIQUE, start_utc_ns INTEGER, sealed INTEGER NOT NULL DEFAULT 0,
-    highest INTEGER,                   -- image index that anything in a sealed flight mentions, strays too
-    utc_correction_ns INTEGER          -- to be added to every utc_ns of this flight; NULL: UTC was never known
+    highest INTEGER                    -- image index that anything in a sealed flight mentions, strays too
 ) STRICT;
 CREATE TABLE images (
     idx INTEGER PRIMARY KEY, flight TEXT NOT NULL REFERENCES flights (name), frame TEXT, state TEXT NOT NULL
@@ -79,16 +78,13 @@ class ImageIndex(Database):
             return FlightError(f"cannot open the index {self.path}: {error}; check its folder")
         return FlightError(f"cannot use the index {self.path}: {error}; move it away, and it will be rebuilt")
 
-    def add_flight(self, name: str, start_utc_ns: int | None, utc_correction_ns: int | None = 0) -> None:
-        """Add a flight that starts at this UTC. Where UTC is not known yet (None), call this again later with the start
-        and with what must be added to the flight's own stamps."""
+    def add_flight(self, name: str, start_utc_ns: int | None) -> None:
+        """Add a flight that starts at this UTC. Where UTC is not known yet (None), call this again later."""
         self._rows(
-            "INSERT INTO flights (name, start_utc_ns, utc_correction_ns) VALUES (?, ?, ?) ON CONFLICT (name) DO UPDATE "
-            "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns), "
-            "utc_correction_ns = coalesce(excluded.utc_correction_ns, utc_correction_ns)",
+            "INSERT INTO flights (name, start_utc_ns) VALUES (?, ?) ON CONFLICT (name) DO UPDATE "
+            "SET start_utc_ns = coalesce(excluded.start_utc_ns, start_utc_ns)",
             name,
             start_utc_ns,
-            None if start_utc_ns is None else utc_correction_ns,
         )
 
     def put(self, entry: IndexEntry) -> None:
@@ -119,11 +115,6 @@ class ImageIndex(Database):
         """The flights in the order they were flown, with their starts (UTC, ns) where known."""
         return dict(self._rows("SELECT name, start_utc_ns FROM flights ORDER BY number"))
 
-    def utc_correction_ns(self, name: str) -> int | None:
-        """What to add to a flight's stamps to get UTC: 0 where its machine knew UTC, None where it never learnt it."""
-        rows = self._rows("SELECT utc_correction_ns FROM flights WHERE name = ?", name)
-        return rows[0][0] if rows else None
-
     def sealed(self) -> set[str]:
         """The flights that are closed and fully indexed."""
         return {row[0] for row in self._rows("SELECT name FROM flights WHERE sealed")}
@@ -139,7 +130,7 @@ class ImageIndex(Database):
         with LedgerReader.open(folder.ledger) as ledger:
             correction_ns, began_utc_ns = ledger.utc_correction_ns(), ledger.began_utc_ns()
             start_utc_ns = None if correction_ns is None or began_utc_ns is None else began_utc_ns + correction_ns
-            self.add_flight(folder.name, start_utc_ns, correction_ns)
+            self.add_flight(folder.name, start_utc_ns)
             frames = {frame.index: frame.name for frame in ledger.frames()}
             for row in ledger.shots():
                 index = row.shot.index

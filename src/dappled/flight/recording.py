@@ -225,13 +225,13 @@ class Recording:
 
     def learn_utc(self, correction_ns: int, sigma_ns: int, source: str) -> None:
         """Store what is to be added to every stamp of this flight, earlier ones too, now that UTC is known. Stamps and
-        names stay as they are; ledger and index hold the correction. Raises FlightError."""
+        names stay as they are: the ledger holds the correction. Raises FlightError."""
         fact = {"correction_ns": correction_ns, "sigma_ns": sigma_ns, "source": source}
         self.ledger.set_fact("utc_correction", fact)
         learned = finding(Code.CLOCK_UTC_LEARNED, Subject("clock"), correction_s=correction_ns / 1e9, source=source)
         self.ledger.add_event("utc", learned)
         began_utc_ns = self.ledger.facts()["began_utc_ns"]
-        self.index.add_flight(self.folder.name, began_utc_ns + correction_ns, correction_ns)
+        self.index.add_flight(self.folder.name, began_utc_ns + correction_ns)
 
     def close(self) -> list[Finding]:
         """End the flight. Shots still open become failed. Returns what was found.
