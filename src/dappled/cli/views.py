@@ -103,7 +103,7 @@ def _parallax(found: OpenedLightField) -> list[prints.Bytes]:
 
 def _focus(found: OpenedLightField) -> list[prints.Bytes]:
     """Pictures focused on planes through the scene, there and back."""
-    pictures = focal_stack(found.stack, through_scene(found), workers=found.workers).pictures
+    pictures = focal_stack(found.stack, through_scene(found), workers=found.workers)
     white = prints.white_of([*pictures])
     drawn = [prints.toned(one, white) for one in pictures]
     return [*drawn, *drawn[-2:0:-1]]

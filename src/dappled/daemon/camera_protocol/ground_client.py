@@ -28,8 +28,8 @@ class GroundStationError(DappledError):
 class Outcome:
     """How one requested photograph ended.
 
-    `index` and `captured` (message 263) are None where none was reported; `reason` is a sentence for a photograph that
-    failed. `ack_ms`: from the request to the acknowledgement.
+    `index` is None where none was reported; `reason` is a sentence for a photograph that failed.
+    `ack_ms`: from the request to the acknowledgement.
     """
 
     sequence: int
@@ -37,7 +37,6 @@ class Outcome:
     ok: bool
     reason: str | None
     ack_ms: float | None
-    captured: MavlinkMessage | None
 
 
 class GroundClient:
@@ -172,7 +171,7 @@ class GroundClient:
         with self._listening() as heard:
             result, ack_ms = self.command(mavlink.MAV_CMD_IMAGE_START_CAPTURE, 0, 0, 1, sequence)
             if result != mavlink.MAV_RESULT_ACCEPTED:
-                return Outcome(sequence, None, False, _refusal(result, heard), ack_ms, None)
+                return Outcome(sequence, None, False, _refusal(result, heard), ack_ms)
             until_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
             while (left_ns := until_ns - self._clock.monotonic_ns()) > 0:
                 wait_s = min(_ASK_AGAIN_S, left_ns / 1e9)
@@ -182,11 +181,11 @@ class GroundClient:
                 if captured is not None:
                     ok = captured.capture_result == 1
                     reason = None if ok else "the camera reports that it failed"
-                    return Outcome(sequence, int(captured.image_index), ok, reason, ack_ms, captured)
+                    return Outcome(sequence, int(captured.image_index), ok, reason, ack_ms)
                 self.command(
                     mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_CAMERA_IMAGE_CAPTURED, float(expected)
                 )
-        return Outcome(sequence, None, False, f"the camera reported nothing about it for {timeout_s:g} s", ack_ms, None)
+        return Outcome(sequence, None, False, f"the camera reported nothing about it for {timeout_s:g} s", ack_ms)
 
     def _mine(self, message: MavlinkMessage) -> bool:
         own = self._links.sender

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dappled.decode.calibration.law_search import LawOdds, search_laws
+from dappled.decode.calibration.law_search import search_laws
 from dappled.decode.errors import DecodeError, NoCarriers
 from dappled.decode.lightfield.aperture import relative_transfer
 from dappled.decode.optics import Carrier, Lattice, Mask, MaskedOptics, Order
@@ -28,7 +28,7 @@ _CLEAR = 6.5  # times the level around: noise moves a carrier so strong by less 
 class FrameLattice:
     """What one calibration frame shows: its lattice, the carriers seen, and each slice's factor on the mean's.
 
-    `relative` complex (K,) belongs to `orders`, DC first. `odds` is what the frame says of each law. `focal_sigma_mm`
+    `relative` complex (K,) belongs to `orders`, DC first. `focal_sigma_mm`
     is the standard error of its focal length. `weak` says that its carriers are so weak that noise moves them.
     """
 
@@ -39,7 +39,6 @@ class FrameLattice:
     found: tuple[tuple[Carrier, Measured], ...]
     orders: tuple[Order, ...]
     relative: NDArray[np.complex128]
-    odds: tuple[LawOdds, ...] = ()
     focal_sigma_mm: float = 0.0
     weak: Finding | None = None
 
@@ -83,7 +82,6 @@ def frame_lattice(
         tuple(found),
         tuple((c.ky, c.kx) for c in carriers),
         relative_transfer(values),
-        search.odds,
         weak=_weak(spectrum, found, focal_length_mm, f_number),
     )
 

@@ -146,14 +146,6 @@ def disc(stack: ViewStack, diameter: float, centre: tuple[float, float] = (0.0, 
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class FocalStack:
-    """`pictures` float32 (D, h, w) or (D, h, w, 3), focused on `disparities` (D,)."""
-
-    pictures: NDArray[np.float32]
-    disparities: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class AllInFocus:
     """`picture` (h, w(, 3)): each pixel from the picture of the stack that is sharpest there. `index` int16 (h, w) says
     which, −1 where nothing is sharp: there the picture is the stack's middle one."""
@@ -164,17 +156,16 @@ class AllInFocus:
 
 def focal_stack(
     stack: ViewStack, disparities: Sequence[float] | NDArray[np.float64], *, workers: int = 1
-) -> FocalStack:
-    """The pictures focused on each disparity. Raises DecodeError for none."""
+) -> NDArray[np.float32]:
+    """The pictures float32 (D, h, w) or (D, h, w, 3) focused on each disparity. Raises DecodeError for none."""
     if len(disparities) == 0:
         raise DecodeError("a focal stack needs at least one plane")
-    made = np.stack([shift_and_add(stack, float(d), workers=workers) for d in disparities])
-    return FocalStack(made, np.asarray(disparities, dtype=np.float64))
+    return np.stack([shift_and_add(stack, float(d), workers=workers) for d in disparities])
 
 
-def all_in_focus(stack: FocalStack) -> AllInFocus:
-    """The sharpest of the stack at every pixel: the largest local energy of the Laplacian."""
-    pictures = np.nan_to_num(stack.pictures)
+def all_in_focus(stack: NDArray[np.float32]) -> AllInFocus:
+    """The sharpest of a focal stack at every pixel: the largest local energy of the Laplacian."""
+    pictures = np.nan_to_num(stack)
     grey = pictures.mean(axis=3) if pictures.ndim == 4 else pictures
     energy = np.stack([ndimage.laplace(p, mode="nearest") for p in grey]) ** 2
     for axis in (1, 2):

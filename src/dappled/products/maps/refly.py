@@ -43,13 +43,12 @@ class FlightLine:
 @dataclass(frozen=True, slots=True)
 class Refly:
     """A mission over a survey's holes. `altitude_m` is above home, `home` (latitude, longitude, metres above sea
-    level), `trigger_m` the distance between two photographs, `line_m` that between two lines. The body is known to take
+    level), `trigger_m` the distance between two photographs. The body is known to take
     a photograph in `body_s`; None where that isn't known."""
 
     lines: tuple[FlightLine, ...]
     altitude_m: float
     trigger_m: float
-    line_m: float
     speed_m_s: float
     home: tuple[float, float, float]
     body_s: float | None = None
@@ -122,7 +121,6 @@ def plan(
         tuple(FlightLine(_degrees(seen, begin), _degrees(seen, end)) for begin, end in lines),
         altitude,
         trigger,
-        line,
         speed,
         (first.latitude_deg, first.longitude_deg, base),
         body_s,
