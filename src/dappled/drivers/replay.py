@@ -35,12 +35,12 @@ class ReplayCamera(PlainCamera):
         """`clock` stamps what the recording has no stamp for; in a replay it is the recording's own clock."""
         super().__init__()
         self._shots = {recorded.shot: recorded for recorded in shots}
-        self._identity, self._clock = identity, clock or SystemClock()
+        self.identity, self._clock = identity, clock or SystemClock()
         self._playing = False
 
     def start(self) -> None:
         self._playing = True
-        self.report(StateChanged("ready", "", self._clock.monotonic_ns(), self._identity))
+        self.report(StateChanged("ready", "", self._clock.monotonic_ns(), self.identity))
 
     def fire(self, shot: int) -> None:
         """Report the recorded events of this shot at once."""
@@ -65,11 +65,6 @@ class ReplayCamera(PlainCamera):
         arrived_ns = recorded.arrived_monotonic_ns or now_ns
         blob = Blob(fd, os.fstat(fd).st_size)
         self.report(Arrival(shot, recorded.camera_name, blob, arrived_ns, recorded.facts))
-
-    @property
-    def identity(self) -> Identity:
-        """The body of the recording."""
-        return self._identity
 
     def stop(self) -> None:
         self._playing = False

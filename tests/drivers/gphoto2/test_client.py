@@ -747,7 +747,7 @@ def test_a_silent_body_on_usb_has_its_port_reset(body: SimulatedBody, monkeypatc
         camera.fire(1)
         until_state(camera, "busy")
         assert camera.identity is not None
-        camera._identity = replace(camera.identity, port="usb:001,005")  # as if it were there
+        camera.identity = replace(camera.identity, port="usb:001,005")  # as if it were there
         assert "port reset" in failed(camera, 1)
         assert resets == ["usb:001,005"]
         body.fault("clear")

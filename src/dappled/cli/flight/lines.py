@@ -99,12 +99,8 @@ def of_report(found: Balance, sources: Sequence[SourceReport]) -> Iterator[str]:
         yield f"  {counted(found.companions, 'file', 6)} beside frames, such as the JPEG of a raw frame"
     if found.strays:
         yield f"  {counted(found.strays, 'file', 6)} without a shot"
-    yield from (f"  {'card':>13}: {findings.told(one)}" for one in found.card[:_SHOWN])
-    if len(found.card) > _SHOWN:
-        yield f"  {'':13}  and {len(found.card) - _SHOWN} more (--json names all)"
-    yield from (f"  {'stood':>13}: {_span(one)}: {findings.told(one.finding)}" for one in found.stood[:_SHOWN])
-    if len(found.stood) > _SHOWN:
-        yield f"  {'':13}  and {len(found.stood) - _SHOWN} more (--json names all)"
+    yield from _first("card", [str(findings.told(one)) for one in found.card])
+    yield from _first("stood", [f"{_span(one)}: {findings.told(one.finding)}" for one in found.stood])
     yield from (f"lost: {findings.told(one)}" for one in found.lost_triggers)
     if found.balanced and not found.wishes:
         yield "NO SHOT in this flight: there are no counts to compare"
@@ -123,11 +119,16 @@ def _of_verdicts(found: Balance) -> Iterator[str]:
     if found.judged:
         yield f"  {'judged':>13}: {', '.join(f'{count} {state}' for state, count in found.judged.items())}"
         for state, why in (("bad", found.bad), ("unknown", found.unknown)):
-            yield from (f"  {state:>13}: {findings.told(one)}" for one in why[:_SHOWN])
-            if len(why) > _SHOWN:
-                yield f"  {'':13}  and {len(why) - _SHOWN} more {state} ones (--json names all)"
+            yield from _first(state, [str(findings.told(one)) for one in why], f" {state} ones")
     if found.mask:
         yield f"  {'mask':>13}: {findings.told(found.mask)}"
+
+
+def _first(title: str, said: Sequence[str], of: str = "") -> Iterator[str]:
+    """The first lines of a list under its title, and how many more there are."""
+    yield from (f"  {title:>13}: {one}" for one in said[:_SHOWN])
+    if len(said) > _SHOWN:
+        yield f"  {'':13}  and {len(said) - _SHOWN} more{of} (--json names all)"
 
 
 def _span(one: StoodFinding) -> str:

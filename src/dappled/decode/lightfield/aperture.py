@@ -26,9 +26,9 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial.chebyshev import chebval
 from numpy.typing import NDArray
-from scipy import special
 
 from dappled.decode.optics import Lattice, Order
+from dappled.decode.optics.visibility import round_stop
 from dappled.findings import FRAME, Code, Finding, finding
 
 Shape = Literal["beams", "filled", "round"]
@@ -108,9 +108,7 @@ class Aperture:
             if self.shape == "filled":
                 along *= np.sinc(frequencies / self.views)
             return np.asarray(along.prod(axis=-1), dtype=np.complex128)
-        turns = np.pi * np.hypot(*np.asarray(angular).T)
-        whole = 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0)
-        return np.where(turns > 0, whole, 1.0).astype(np.complex128)
+        return round_stop(np.asarray(angular)).astype(np.complex128)
 
 
 def _middles(n: int) -> NDArray[np.float64]:

@@ -90,7 +90,11 @@ def order_strengths(
     else:
         swept = mask.frequency_per_mm * mask_distance_mm / f_number * k  # κ·k cycles over the stop
         stops = np.array(
-            [shape(swept * (1 + off)) for shape in (_round, _square) for off in np.linspace(-_ROUNDING, _ROUNDING, 9)]
+            [
+                shape(swept * (1 + off))
+                for shape in (round_stop, _square)
+                for off in np.linspace(-_ROUNDING, _ROUNDING, 9)
+            ]
         )
         stop_least, stop_most = np.abs(stops).min(axis=0), np.abs(stops).max(axis=0)
         stop_least = np.where((stops.max(axis=0) > 0) & (stops.min(axis=0) < 0), 0.0, stop_least)  # a null in between
@@ -173,7 +177,7 @@ def under_stops(
     if f_number is None:
         f_number, sizes = 1.0, np.geomspace(1 / _ANY_F_NUMBER[1], 1 / _ANY_F_NUMBER[0], 4 * _SIZES)
     swept = mask.frequency_per_mm * mask_distance_mm / f_number * k
-    shapes = [_round, _square, *(_polygon(blades, turn) for blades in _BLADES for turn in (0.0, 0.5))]
+    shapes = [round_stop, _square, *(_polygon(blades, turn) for blades in _BLADES for turn in (0.0, 0.5))]
     stops = np.array([np.abs(shape(swept * size)) for shape in shapes for size in sizes]) * pattern * pixels
     film, diffraction = _on_the_way(mask, k, mask_distance_mm)
     lost = np.where(np.abs(k).max(axis=1) > _LITTLE_LOST, np.abs(film) * diffraction, 1.0)
@@ -209,7 +213,8 @@ def _drawable(mask: Mask, multiple: int) -> bool:
     return multiple * mask.frequency_per_mm <= limit * (1 + 1e-9)
 
 
-def _round(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+def round_stop(cycles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The transform of a disc of diameter 1, 1 at 0, at places (n, 2) in cycles over it."""
     turns = np.pi * np.hypot(*cycles.T)
     return np.asarray(np.where(turns > 0, 2 * special.j1(turns) / np.where(turns > 0, turns, 1.0), 1.0))
 

@@ -112,7 +112,7 @@ class GPhoto2Camera(QueuedCamera):
         self._pending: dict[int, int | None] = {}  # shots that the process has, in order: when it fired each
         self._carryover = Carryover()  # used by the supervising thread alone
         self._live = _Live()  # guarded by the lock
-        self._identity: Identity | None = None
+        self.identity: Identity | None = None  # the body that was opened last
         self._known_settings: tuple[Setting, ...] = ()
         self._folder: Path | None = None  # files are written in it while they come; None: to memory
         self._looked_last = False  # the process ended by itself when it was asked to: it has named what stays
@@ -148,11 +148,6 @@ class GPhoto2Camera(QueuedCamera):
             else:
                 reason = "the camera's process is not running"
         self.report(ShotFailed(shot, reason, self._clock.monotonic_ns()))
-
-    @property
-    def identity(self) -> Identity | None:
-        """The body that was opened last."""
-        return self._identity
 
     def settings(self) -> tuple[Setting, ...]:
         """The settings as last read, from memory; empty while none were read."""
@@ -207,7 +202,7 @@ class GPhoto2Camera(QueuedCamera):
         with self._lock:
             if not ended and self._process is not None:
                 self._process.kill()
-        listed = (ended and self._looked_last) or self._identity is None or self._settings.capture_target != "card"
+        listed = (ended and self._looked_last) or self.identity is None or self._settings.capture_target != "card"
         if not listed and not stopped_before:
             self.report(Noticed(finding(Code.CARD_NOT_LISTED, Subject("card")), self._clock.monotonic_ns()))
         self._loop.stop(_KILL_S)
@@ -290,12 +285,12 @@ class GPhoto2Camera(QueuedCamera):
 
     def _reset_port(self) -> str:
         """Reset a silent body on USB, as if its cable had been pulled; return words on the result."""
-        if self._identity is None or not self._identity.port.startswith("usb:"):
+        if self.identity is None or not self.identity.port.startswith("usb:"):
             return ""
         from dappled.drivers import usb_bus  # noqa: PLC0415  # see `daemon.after_ready`
 
         try:
-            usb_bus.reset(self._identity.port)
+            usb_bus.reset(self.identity.port)
         except CameraError as error:
             return f" ({error})"
         return ", the camera's USB port reset"
@@ -325,7 +320,7 @@ class GPhoto2Camera(QueuedCamera):
             with self._lock:
                 self._pending.pop(event.shot, None)  # type: ignore[arg-type]  # an Arrival's None is excluded above
         elif isinstance(event, StateChanged):
-            self._identity = event.identity or self._identity
+            self.identity = event.identity or self.identity
         elif isinstance(event, SettingsChanged):
             self._known_settings = event.settings
         self._carryover = self._carryover.heard(event)

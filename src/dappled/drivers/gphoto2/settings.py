@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from dappled.drivers.camera import CameraError, check_options
+from dappled.drivers.camera import CameraError, check_options, seconds_option
 
 CaptureTarget = Literal["card", "ram"]
 NO_HOME = {"HOME": "/nonexistent", "TZ": "UTC0"}
@@ -69,7 +69,4 @@ def _timeouts(given: object) -> Timeouts:
     if not isinstance(given, Mapping):
         raise CameraError(f"camera.timeouts must be a table, not {given!r}")
     check_options(given, [each.name for each in fields(Timeouts)], "camera.timeouts")
-    for name, value in given.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
-            raise CameraError(f"camera.timeouts.{name} must be a number of seconds above 0, not {value!r}")
-    return Timeouts(**given)
+    return Timeouts(**{name: seconds_option({"timeouts": given}, name, 0.0) for name in given})

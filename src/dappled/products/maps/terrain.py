@@ -7,6 +7,7 @@ heights show houses upright.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from dappled import durable
-from dappled.decode.array_types import Floats
+from dappled.decode.array_types import Floats, Singles
 from dappled.products.maps import cog, hyperstereo, las_files, map_grid
 from dappled.products.maps.earth import Projection
 from dappled.products.maps.georeference import Progress, Survey
@@ -83,16 +84,20 @@ def searched(made: Survey, given: Floats, lowest_m: float | None, highest_m: flo
 def write_raster(made: Survey, terrain: TerrainModel, path: Path) -> Path:
     """Write a COG with the bands height, sigma and, where terrain was given, difference; metres, NaN where unknown."""
     surface = terrain.surface
-    bands = [surface.height_m, surface.sigma_m]
-    names = ["height above sea level, m", "sigma of a height by itself, m"]
-    if terrain.difference_m is not None:
-        bands.append(terrain.difference_m)
-        names.append("difference to the given terrain, m")
+    bands = {"height above sea level, m": surface.height_m, "sigma of a height by itself, m": surface.sigma_m}
     tags = {
         **made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{surface.level_sigma_m:.3f}",
         "DAPPLED_CORRELATED_M": f"{hyperstereo.WINDOW * surface.grid.step_x:.4g}",
     }  # fmt: skip
-    cog.write(path, surface.grid, np.stack(bands, axis=-1), tags, tuple(names))
+    return write_bands(path, surface.grid, bands, terrain.difference_m, tags)
+
+
+def write_bands(
+    path: Path, grid: MapGrid, bands: Mapping[str, Singles], difference_m: Singles | None, tags: Mapping[str, str]
+) -> Path:
+    """Write a COG of bands by their names and, where terrain was given, the difference to it."""
+    named = dict(bands) if difference_m is None else {**bands, "difference to the given terrain, m": difference_m}
+    cog.write(path, grid, np.stack(list(named.values()), axis=-1), tags, tuple(named))
     return path
 
 

@@ -22,11 +22,12 @@ from dappled.decode.array_types import Floats, Singles
 from dappled.decode.depth.depth_map import CONTRAST_WINDOW
 from dappled.errors import DappledError
 from dappled.findings import Code, Finding, Subject, finding
-from dappled.products.maps import cog, map_grid
+from dappled.products.maps import map_grid
 from dappled.products.maps.georeference import Progress, Survey
 from dappled.products.maps.ground import Flat, level_shown
 from dappled.products.maps.map_grid import MapGrid
 from dappled.products.maps.photographs import Photograph
+from dappled.products.maps.terrain import write_bands
 from dappled.products.survey.frame_depths import InverseDepth
 
 CELL = CONTRAST_WINDOW / 2  # of a map's cells, in samples: a depth map has no finer detail than its windows
@@ -120,20 +121,15 @@ def _sampled(one: Photograph, depth: InverseDepth) -> Photograph:
 def write_raster(made: Survey, terrain: FrameTerrain, path: Path) -> Path:
     """Write a COG with the bands height, σ, σ of one frame (Eq 5), frames and, where terrain was given, difference;
     metres, NaN where unknown."""
-    bands = [terrain.height_m, terrain.sigma_m, terrain.single_sigma_m, terrain.frames]
-    names = [
-        "height above sea level, m", "sigma of a height by itself, m", "sigma of one frame (Eq 5), m",
-        "frames that told the height",
-    ]  # fmt: skip
-    if terrain.difference_m is not None:
-        bands.append(terrain.difference_m)
-        names.append("difference to the given terrain, m")
+    bands = {
+        "height above sea level, m": terrain.height_m, "sigma of a height by itself, m": terrain.sigma_m,
+        "sigma of one frame (Eq 5), m": terrain.single_sigma_m, "frames that told the height": terrain.frames,
+    }  # fmt: skip
     tags = {
         **made.tags(), "DAPPLED_LEVEL_SIGMA_M": f"{terrain.level_sigma_m:.3f}", "DAPPLED_DISTANCES": terrain.source,
         "DAPPLED_CORRELATED_M": f"{terrain.window_m:.4g}",
     }  # fmt: skip
-    cog.write(path, terrain.grid, np.stack(bands, axis=-1), tags, tuple(names))
-    return path
+    return write_bands(path, terrain.grid, bands, terrain.difference_m, tags)
 
 
 def summary(made: Survey, terrain: FrameTerrain) -> dict[str, Any]:
