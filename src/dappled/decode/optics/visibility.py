@@ -89,13 +89,8 @@ def order_strengths(
         stop_least, stop_most = np.zeros(len(k)), np.ones(len(k))
     else:
         swept = mask.frequency_per_mm * mask_distance_mm / f_number * k  # κ·k cycles over the stop
-        stops = np.array(
-            [
-                shape(swept * (1 + off))
-                for shape in (round_stop, _square)
-                for off in np.linspace(-_ROUNDING, _ROUNDING, 9)
-            ]
-        )
+        offs = np.linspace(-_ROUNDING, _ROUNDING, 9)
+        stops = np.array([shape(swept * (1 + off)) for shape in (round_stop, _square) for off in offs])
         stop_least, stop_most = np.abs(stops).min(axis=0), np.abs(stops).max(axis=0)
         stop_least = np.where((stops.max(axis=0) > 0) & (stops.min(axis=0) < 0), 0.0, stop_least)  # a null in between
     frequencies = k @ lattice.matrix()
