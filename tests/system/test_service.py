@@ -235,6 +235,7 @@ def test_what_is_amiss_is_told_in_every_place(manager: socket.socket, tmp_path: 
         asked = dappled("status", f"ipc://{tmp_path}/r/slices", "--timeout", "30")
         assert f"stop      {text}" in asked.stdout, asked.stderr
         with httpx.Client(base_url=f"http://127.0.0.1:{pages}", timeout=30) as page:
+            eventually(lambda: page.get("/api/state").json()["health"], "the console has heard of the health")
             state = page.get("/api/state").json()
             assert any(text in problem for problem in problems(state["health"]))
             assert re.search(r'^dappled_finding{code="disk.nearly_full"} 2', page.get("/metrics").text, re.MULTILINE)
