@@ -137,7 +137,7 @@ def examine(
 
     Raises ConfigError where a key is missing that has no default.
     """
-    hints = _hints(cls)
+    hints = _hints(cls)  # type: ignore[arg-type]  # a class is hashable
     fields = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]  # cls is a dataclass
     findings = []
     for key in table:
