@@ -18,7 +18,7 @@ from dappled.decode.geometry.footprint import RectifiedFrame
 from dappled.errors import DappledError
 from tests import globe
 
-NS = {"k": placement.KML_NAMESPACE}
+NS = {"k": "http://www.opengis.net/kml/2.2"}
 POSE: dict[str, Any] = {
     "latitude_deg": 0.0,
     "longitude_deg": 10.0,

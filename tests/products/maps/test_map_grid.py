@@ -36,7 +36,7 @@ from tests import globe
 from tests.products.maps.test_eye import GRID, SHAPE, eye_at
 from tests.products.maps.test_ground import hill
 
-KML = {"k": kmz.KML, "gx": kmz.GX}
+KML = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
 
 
 def painted(eye: Eye, ground: Ground, colour: bool = False) -> NDArray[np.float32]:
@@ -230,7 +230,7 @@ def test_a_kmz_is_north_up_and_lies_where_the_frame_looked(tmp_path: Path) -> No
     eye, ground = eye_at(height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)))
     root, pictures = overlays(map_files.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
-    (overlay,) = root.iter(f"{{{kmz.KML}}}GroundOverlay")
+    (overlay,) = root.iter(f"{{{KML['k']}}}GroundOverlay")
     assert [child.tag.rpartition("}")[2] for child in overlay] == ["name", "Icon", "LatLonBox"]
     edges = box(overlay)
     assert list(edges) == ["north", "south", "east", "west"]
@@ -257,7 +257,7 @@ def test_across_the_antimeridian_there_are_two_overlays_and_a_cut_footprint(tmp_
     eye, ground = eye_at(-17.0, 179.99999, height_m=100.0), Flat(0.0)
     made = survey(photograph(eye, painted(eye, ground)), crs="EPSG:32760")
     root, pictures = overlays(map_files.mosaic_kmz(made, tmp_path / "m.kmz", gain=1.0))
-    west, east = (box(one) for one in root.iter(f"{{{kmz.KML}}}GroundOverlay"))
+    west, east = (box(one) for one in root.iter(f"{{{KML['k']}}}GroundOverlay"))
     assert (west["east"], east["west"]) == (180.0, -180.0)
     assert 179.999 < west["west"] < 180
     assert -180 < east["east"] < -179.999
@@ -292,13 +292,13 @@ def test_a_large_picture_becomes_a_tree_of_tiles(tmp_path: Path) -> None:
         page = open_pages.pop()
         reached.add(page)
         folder = page.rpartition("/")[0]
-        for href in pages[page].iter(f"{{{kmz.KML}}}href"):
+        for href in pages[page].iter(f"{{{KML['k']}}}href"):
             target = f"{folder}/{href.text}" if folder else str(href.text)
             assert target in names
             if target.endswith(".kml"):
                 open_pages.append(target)
-        links = list(pages[page].iter(f"{{{kmz.KML}}}NetworkLink"))
-        leaves += [box(one) for one in pages[page].iter(f"{{{kmz.KML}}}GroundOverlay") if not links]
+        links = list(pages[page].iter(f"{{{KML['k']}}}NetworkLink"))
+        leaves += [box(one) for one in pages[page].iter(f"{{{KML['k']}}}GroundOverlay") if not links]
     assert reached == set(pages)
     area = sum((one["east"] - one["west"]) * (one["north"] - one["south"]) for one in leaves)
     assert area == pytest.approx(rows * columns * 1e-12, rel=1e-4)  # the finest tiles cover everything once

@@ -16,11 +16,12 @@ from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from dappled import kml
 from dappled.bounds.parsing import parse_json
 from dappled.daemon.console import access, pictures
 from dappled.daemon.console.access import Access, Refusal, RequestGuard, refused
 from dappled.daemon.console.feed import Feed, FeedError
-from dappled.daemon.console.placement import KML_MEDIA_TYPE, Background, latest_kml, network_link_kml
+from dappled.daemon.console.placement import Background, latest_kml, network_link_kml
 from dappled.daemon.console.process import ConsoleRequestError, DaemonQuestions
 from dappled.daemon.console.studio import Studio
 from dappled.daemon.health import metrics
@@ -269,7 +270,7 @@ class ConsoleApp:
 
     async def _kml_link(self, request: Request) -> Response:
         self._hub.globe_asked()
-        return Response(network_link_kml(self._absolute(request, "/kml/latest.kml")), media_type=KML_MEDIA_TYPE)
+        return Response(network_link_kml(self._absolute(request, "/kml/latest.kml")), media_type=kml.MEDIA_TYPE)
 
     async def _kml_latest(self, request: Request) -> Response:
         self._hub.globe_asked()
@@ -280,7 +281,7 @@ class ConsoleApp:
             except FeedError:  # it is not decoded: the globe shows the track alone
                 one = None
         picture = self._absolute(request, f"/kml/{frame}.png")
-        return Response(latest_kml(f"frame {frame}", picture, one, self._feed.track()), media_type=KML_MEDIA_TYPE)
+        return Response(latest_kml(f"frame {frame}", picture, one, self._feed.track()), media_type=kml.MEDIA_TYPE)
 
     async def _kml_picture(self, request: Request) -> Response:
         self._hub.globe_asked()

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import numpy as np
 
@@ -19,9 +18,8 @@ from dappled.bounds.pictures import open_picture
 from dappled.decode.geometry import camera_pose
 from dappled.decode.geometry.footprint import OrientedFrame, RectifiedFrame
 from dappled.errors import DappledError, first_line
+from dappled.kml import box, node, overlay, page
 
-KML_NAMESPACE = "http://www.opengis.net/kml/2.2"
-KML_MEDIA_TYPE = "application/vnd.google-earth.kml+xml"
 _WORLD_BYTES = 4096
 _WORLD = {".png": ".pgw", ".jpg": ".jgw", ".jpeg": ".jgw"}
 
@@ -87,50 +85,20 @@ def oriented_frame(
 
 def network_link_kml(href: str) -> bytes:
     """A document that a globe opens once; the globe then reads `href` every two seconds."""
-    root, document = _document()
-    link = _add(document, "NetworkLink")
-    _add(link, "name", "dappled, the latest frame")
-    target = _add(link, "Link")
-    _add(target, "href", href)
-    _add(target, "refreshMode", "onInterval")
-    _add(target, "refreshInterval", "2")
-    return _bytes(root)
+    target = node("Link", node("href", href), node("refreshMode", "onInterval"), node("refreshInterval", "2"))
+    return page(node("name", "dappled"), node("NetworkLink", node("name", "dappled, the latest frame"), target))
 
 
 def latest_kml(
     name: str, picture: str, frame: RectifiedFrame | None, track: Sequence[tuple[float, float, float]]
 ) -> bytes:
     """The frame's picture as an overlay, and the track of (longitude, latitude, altitude above sea level)."""
-    root, document = _document()
+    shown = [node("name", "dappled")]
     if frame is not None:
-        overlay = _add(document, "GroundOverlay")
-        _add(overlay, "name", name)
-        _add(_add(overlay, "Icon"), "href", picture)
-        box = _add(overlay, "LatLonBox")
-        for side in ("north", "south", "east", "west"):
-            _add(box, side, f"{getattr(frame, side):.9f}")
+        sides = {"north": frame.north, "south": frame.south, "east": frame.east, "west": frame.west}
+        shown.append(overlay(name, picture, box("LatLonBox", sides)))
     if len(track) > 1:
-        mark = _add(document, "Placemark")
-        _add(mark, "name", "track")
-        line = _add(mark, "LineString")
-        _add(line, "altitudeMode", "absolute")
-        _add(line, "coordinates", " ".join(f"{lon:.8f},{lat:.8f},{alt:.2f}" for lon, lat, alt in track))
-    return _bytes(root)
-
-
-def _document() -> tuple[ET.Element, ET.Element]:
-    root = ET.Element("kml", xmlns=KML_NAMESPACE)
-    document = _add(root, "Document")
-    _add(document, "name", "dappled")
-    return root, document
-
-
-def _add(parent: ET.Element, name: str, text: str | None = None) -> ET.Element:
-    child = ET.SubElement(parent, name)
-    child.text = text
-    return child
-
-
-def _bytes(root: ET.Element) -> bytes:
-    text: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text
+        places = node("coordinates", " ".join(f"{lon:.8f},{lat:.8f},{alt:.2f}" for lon, lat, alt in track))
+        line = node("LineString", node("altitudeMode", "absolute"), places)
+        shown.append(node("Placemark", node("name", "track"), line))
+    return page(*shown)

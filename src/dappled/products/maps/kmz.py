@@ -7,12 +7,12 @@ every viewer draws it.
 from __future__ import annotations
 
 import io
-import xml.etree.ElementTree as ET
 import zipfile
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +20,9 @@ from PIL import Image as Pictures
 
 from dappled import durable
 from dappled.encoded_pictures import file_of
+from dappled.kml import box, node, overlay, page
 from dappled.products.maps.map_grid import MapGrid
 
-KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 TILE = 1024
 _STRIP = 32  # rows that are shrunk at a time
 Pixels = NDArray[np.uint8]
@@ -46,23 +46,21 @@ def write(path: Path, name: str, overlays: Sequence[Overlay]) -> None:
 
     Raises OSError.
     """
-    ET.register_namespace("", KML)
-    ET.register_namespace("gx", GX)
     files: dict[str, bytes] = {}
-    root = ET.Element(_k("kml"))
-    document = ET.SubElement(root, _k("Document"))
-    ET.SubElement(document, _k("name")).text = name
-    for number, overlay in enumerate(overlays):
-        if overlay.grid is None:
-            document.append(_quad(overlay, _picture(files, f"{number}", overlay.picture)))
+    shown = [node("name", name)]
+    for number, one in enumerate(overlays):
+        if one.grid is None:
+            corners = " ".join(f"{lon:.10f},{lat:.10f}" for lon, lat in one.quad)
+            quad = node("gx:LatLonQuad", node("coordinates", corners))
+            shown.append(overlay(one.name, _picture(files, f"{number}", one.picture), quad))
             continue
-        for side, (grid, picture) in enumerate(_sides(overlay.grid, overlay.picture)):
+        for side, (grid, picture) in enumerate(_sides(one.grid, one.picture)):
             place = f"{number}-{side}"
             if max(grid.shape) > TILE:
-                document.append(_tree(files, place, Overlay(overlay.name, picture, grid), _FOLDER))
+                shown.append(_tree(files, place, Overlay(one.name, picture, grid), _FOLDER))
             else:
-                document.append(_box(overlay.name, grid, _picture(files, place, picture)))
-    pages = {"doc.kml": _text(root), **files}  # the first .kml in the archive is the one that is opened
+                shown.append(overlay(one.name, _picture(files, place, picture), _bounded("LatLonBox", grid)))
+    pages = {"doc.kml": page(*shown), **files}  # the first .kml in the archive is the one that is opened
     durable.write_file(path, _zipped(pages))
 
 
@@ -85,27 +83,17 @@ def _sides(grid: MapGrid, picture: Pixels) -> list[tuple[MapGrid, Pixels]]:
     return made
 
 
-def _tree(files: dict[str, bytes], place: str, overlay: Overlay, folder: str = "") -> ET.Element:
+def _tree(files: dict[str, bytes], place: str, one: Overlay, folder: str = "") -> Element:
     """A super-overlay: a link to a page with a coarse picture of the whole and links to its four quarters, and so on.
 
     `folder` is the path from the link's file to the folder of all pages and pictures.
     """
-    grid, picture = overlay.grid, overlay.picture
+    grid, picture = one.grid, one.picture
     assert grid is not None
-    link = ET.Element(_k("NetworkLink"))
-    link.append(_element("name", overlay.name))
-    link.append(_region(grid))
-    target = ET.SubElement(link, _k("Link"))
-    target.append(_element("href", f"{folder}{place}.kml"))
-    target.append(_element("viewRefreshMode", "onRegion"))
-    root = ET.Element(_k("kml"))
-    document = ET.SubElement(root, _k("Document"))
-    document.append(_region(grid))  # GDAL looks for it here
     step = -(-max(grid.shape) // TILE)
-    drawn = _box(overlay.name, grid, _picture(files, f"{_FOLDER}{place}", _shrunk(picture, step)).removeprefix(_FOLDER))
-    drawn.insert(1, _region(grid))
-    drawn.insert(2, _element("drawOrder", str(len(place))))
-    document.append(drawn)
+    coarse = _picture(files, f"{_FOLDER}{place}", _shrunk(picture, step)).removeprefix(_FOLDER)
+    more = _region(grid), node("drawOrder", str(len(place)))
+    shown = [_region(grid), overlay(one.name, coarse, _bounded("LatLonBox", grid), *more)]  # GDAL looks here for it
     if step > 1:
         middle = [-(-side // 2) for side in grid.shape]
         for quarter, (row, column) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
@@ -113,46 +101,20 @@ def _tree(files: dict[str, bytes], place: str, overlay: Overlay, folder: str = "
             columns = slice(middle[1] * column, grid.shape[1] if column else middle[1])
             piece = picture[rows, columns]
             if piece.size and piece[..., -1].any():
-                inner = Overlay(overlay.name, piece, grid.part(rows, columns))
-                document.append(_tree(files, f"{place}{quarter}", inner))
-    files[f"{_FOLDER}{place}.kml"] = _text(root)
-    return link
+                shown.append(_tree(files, f"{place}{quarter}", Overlay(one.name, piece, grid.part(rows, columns))))
+    files[f"{_FOLDER}{place}.kml"] = page(*shown)
+    target = node("Link", node("href", f"{folder}{place}.kml"), node("viewRefreshMode", "onRegion"))
+    return node("NetworkLink", node("name", one.name), _region(grid), target)
 
 
-def _box(name: str, grid: MapGrid, href: str) -> ET.Element:
-    overlay = ET.Element(_k("GroundOverlay"))
-    overlay.append(_element("name", name))
-    ET.SubElement(overlay, _k("Icon")).append(_element("href", href))
-    overlay.append(_bounded("LatLonBox", grid))
-    return overlay
+def _bounded(tag: str, grid: MapGrid) -> Element:
+    return box(tag, dict(zip(("west", "south", "east", "north"), grid.bounds, strict=True)))
 
 
-def _bounded(tag: str, grid: MapGrid) -> ET.Element:
-    box = ET.Element(_k(tag))
-    west, south, east, north = grid.bounds
-    for key, value in (("north", north), ("south", south), ("east", east), ("west", west)):  # in the schema's order
-        box.append(_element(key, _degrees(value)))
-    return box
-
-
-def _quad(overlay: Overlay, href: str) -> ET.Element:
-    element = ET.Element(_k("GroundOverlay"))
-    element.append(_element("name", overlay.name))
-    ET.SubElement(element, _k("Icon")).append(_element("href", href))
-    quad = ET.SubElement(element, f"{{{GX}}}LatLonQuad")
-    corners = " ".join(f"{_degrees(lon)},{_degrees(lat)}" for lon, lat in overlay.quad)
-    quad.append(_element("coordinates", corners))
-    return element
-
-
-def _region(grid: MapGrid) -> ET.Element:
+def _region(grid: MapGrid) -> Element:
     """The area that must be in view, and its least size on the screen (px), before a viewer loads a tile."""
-    region = ET.Element(_k("Region"))
-    region.append(_bounded("LatLonAltBox", grid))
-    lod = ET.SubElement(region, _k("Lod"))
-    lod.append(_element("minLodPixels", "256"))
-    lod.append(_element("maxLodPixels", "-1"))
-    return region
+    lod = node("Lod", node("minLodPixels", "256"), node("maxLodPixels", "-1"))
+    return node("Region", _bounded("LatLonAltBox", grid), lod)
 
 
 def _picture(files: dict[str, bytes], place: str, picture: Pixels) -> str:
@@ -189,21 +151,3 @@ def _zipped(files: dict[str, bytes]) -> bytes:
             info.external_attr = 0o644 << 16
             archive.writestr(info, data)
     return memory.getvalue()
-
-
-def _text(root: ET.Element) -> bytes:
-    return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True))
-
-
-def _element(tag: str, text: str) -> ET.Element:
-    element = ET.Element(_k(tag))
-    element.text = text
-    return element
-
-
-def _k(tag: str) -> str:
-    return f"{{{KML}}}{tag}"
-
-
-def _degrees(value: float) -> str:
-    return f"{value:.10f}"
