@@ -20,7 +20,7 @@ from dappled.flight.records import DOUBT, LATER_DOUBT
 from dappled.products.geotags import exif_gps, sidecars
 from dappled.products.geotags.exif_gps import ExifError
 from dappled.products.geotags.marks import Marked
-from dappled.products.maps.earth import Geoid, geojson_line
+from dappled.products.maps.earth import Geoid, geojson_collection, geojson_feature, geojson_line
 from dappled.products.mounting import Mounting
 
 
@@ -220,33 +220,25 @@ def geojson(placed: Sequence[Placed]) -> str:
     features: list[dict[str, Any]] = []
     if len(known) > 1:
         line = geojson_line([_coordinates(camera) for _, camera in known])
-        features.append({"type": "Feature", "properties": {"name": "track"}, "geometry": line})
+        features.append(geojson_feature(line, name="track"))
     for one, camera in known:
         turned = _ypr(camera) if camera.pix4d else (None, None, None)
-        features.append(
-            {
-                "type": "Feature",
-                "properties": {
-                    "name": one.file_name,
-                    "index": one.frame.index,
-                    "utc_ns": one.utc_ns,
-                    "time_source": one.tag.time_source,
-                    "doubts": codec.plain(one.tag.doubts),
-                    "pose_source": one.tag.pose.source,
-                    "altitude_msl_m": camera.altitude_msl_m,
-                    "height_above_home_m": camera.height_above_home_m,
-                    "position_sigma_m": one.tag.pose.position_sigma_m,
-                    "vertical_sigma_m": one.tag.pose.vertical_sigma_m,
-                    "gnss": codec.plain(one.tag.pose.gnss),
-                    **dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), turned, strict=True)),
-                },
-                "geometry": {
-                    "type": "Point",
-                    "coordinates": _coordinates(camera),
-                },
-            }
-        )
-    return json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False, indent=1) + "\n"
+        about = {
+            "name": one.file_name,
+            "index": one.frame.index,
+            "utc_ns": one.utc_ns,
+            "time_source": one.tag.time_source,
+            "doubts": codec.plain(one.tag.doubts),
+            "pose_source": one.tag.pose.source,
+            "altitude_msl_m": camera.altitude_msl_m,
+            "height_above_home_m": camera.height_above_home_m,
+            "position_sigma_m": one.tag.pose.position_sigma_m,
+            "vertical_sigma_m": one.tag.pose.vertical_sigma_m,
+            "gnss": codec.plain(one.tag.pose.gnss),
+            **dict(zip(("yaw_deg", "pitch_deg", "roll_deg"), turned, strict=True)),
+        }
+        features.append(geojson_feature({"type": "Point", "coordinates": _coordinates(camera)}, **about))
+    return json.dumps(geojson_collection(features), allow_nan=False, indent=1) + "\n"
 
 
 def _coordinates(camera: CameraPose) -> list[float]:

@@ -13,7 +13,7 @@ from scipy import ndimage
 from dappled.decode.array_types import Floats
 from dappled.errors import CallError
 from dappled.products.extras import need
-from dappled.products.maps.earth import Projection, geojson_line
+from dappled.products.maps.earth import Projection, geojson_collection, geojson_feature, geojson_line
 from dappled.products.maps.heights import HeightRaster
 from dappled.products.whole_files import write_json
 
@@ -82,12 +82,8 @@ def write(contours: Sequence[Contour], projection: Projection, interval_m: float
     latitude, longitude = projection.to_geodetic(east, north)
     places = np.round(np.stack([longitude, latitude], axis=1), 8)
     lines = np.split(places, np.cumsum([len(one.line) for one in contours])[:-1]) if contours else []
-    features = [
-        {
-            "type": "Feature",
-            "properties": {"height_m": one.height_m, "major": round(one.height_m / interval_m) % _MAJOR == 0},
-            "geometry": geojson_line(line.tolist()),
-        }
-        for one, line in zip(contours, lines, strict=True)
-    ]
-    write_json(path, {"type": "FeatureCollection", "features": features}, indent=None)
+    features = []
+    for one, line in zip(contours, lines, strict=True):
+        major = round(one.height_m / interval_m) % _MAJOR == 0
+        features.append(geojson_feature(geojson_line(line.tolist()), height_m=one.height_m, major=major))
+    write_json(path, geojson_collection(features), indent=None)

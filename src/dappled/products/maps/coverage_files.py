@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from dappled.errors import counted
 from dappled.products.extras import need
 from dappled.products.maps import cog
 from dappled.products.maps.coverage import Coverage
-from dappled.products.maps.earth import Projection
+from dappled.products.maps.earth import Projection, geojson_collection, geojson_feature
 from dappled.products.maps.map_grid import unwrapped
 from dappled.products.whole_files import write_json
 
@@ -41,12 +42,11 @@ def write_raster(covered: Coverage, path: Path, *, least: int) -> None:
 def write_geojson(covered: Coverage, projection: Projection, path: Path, *, least: int) -> None:
     """Polygons of equal counts in the area ("frames", up to `MOST_SHOWN`), and of the holes ("hole": true)."""
     counts = np.minimum(covered.frames, MOST_SHOWN).astype(np.int32)
-    features = [
-        feature
-        for where, hole in ((covered.planned & ~covered.holes(least), False), (covered.holes(least), True))
-        for feature in _features(covered, projection, counts, where, hole=hole)
-    ]
-    write_json(path, {"type": "FeatureCollection", "features": features}, indent=None)
+    seen, holes = covered.planned & ~covered.holes(least), covered.holes(least)
+    features = chain.from_iterable(
+        _features(covered, projection, counts, where, hole=hole) for where, hole in ((seen, False), (holes, True))
+    )
+    write_json(path, geojson_collection(features), indent=None)
 
 
 def _features(
@@ -60,11 +60,8 @@ def _features(
             whole = unwrapped(longitude, float(longitude[0]))
             rings.append(np.round(np.stack([whole, latitude], axis=1), 8).tolist())
         area_m2 = sum(_area(np.array(ring)) for ring in shape["coordinates"])
-        yield {
-            "type": "Feature",
-            "properties": {"frames": int(value), "hole": hole, "area_m2": round(abs(area_m2), 2)},
-            "geometry": {"type": "Polygon", "coordinates": rings},
-        }
+        polygon = {"type": "Polygon", "coordinates": rings}
+        yield geojson_feature(polygon, frames=int(value), hole=hole, area_m2=round(abs(area_m2), 2))
 
 
 def _area(ring: Floats) -> float:

@@ -7,7 +7,7 @@ poles) of its first frame. PROJ must be able to carry out every transformation i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -107,6 +107,16 @@ def wrapped(longitude_deg: Degrees) -> Degrees:
     (-179.5, 179.0, -180.0)
     """
     return (longitude_deg + 180) % 360 - 180
+
+
+def geojson_feature(geometry: dict[str, Any], /, **properties: Any) -> dict[str, Any]:
+    """A feature of GeoJSON (RFC 7946)."""
+    return {"type": "Feature", "properties": properties, "geometry": geometry}
+
+
+def geojson_collection(features: Iterable[dict[str, Any]]) -> dict[str, Any]:
+    """What a file of GeoJSON holds."""
+    return {"type": "FeatureCollection", "features": list(features)}
 
 
 def geojson_line(line: Sequence[list[float]]) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from dappled import codec
 from dappled.decode.array_types import Floats
 from dappled.products.maps import cog, kmz, map_grid
-from dappled.products.maps.earth import GEODETIC, Projection
+from dappled.products.maps.earth import GEODETIC, Projection, geojson_collection, geojson_feature
 from dappled.products.maps.georeference import Survey
 from dappled.products.maps.ground import Ground
 from dappled.products.maps.kmz import Overlay
@@ -102,7 +102,7 @@ def _bands(chosen: Sequence[Photograph]) -> int:
 def write_footprints(made: Survey, output: Path) -> Path:
     """Write footprints.geojson: what each frame covers."""
     features = [feature(one, made.ground, made.projection, made.facts.get(one.name, {})) for one in made.photographs]
-    return write_json(output / "footprints.geojson", {"type": "FeatureCollection", "features": features})
+    return write_json(output / "footprints.geojson", geojson_collection(features))
 
 
 def report(made: Survey, files: Sequence[Path]) -> dict[str, Any]:
@@ -127,11 +127,8 @@ def feature(photograph: Photograph, ground: Ground, projection: Projection, fact
     latitude, longitude = projection.to_geodetic(met[:, 0], met[:, 1])
     _, camera = projection.to_geodetic(*photograph.eye.centre[:2])
     ring = np.stack([unwrapped(longitude, float(camera)), latitude], axis=1)
-    return {
-        "type": "Feature",
-        "properties": {"name": photograph.name, "utc_ns": photograph.utc_ns, "ground": ground.name, **facts},
-        "geometry": _polygon(ring),
-    }
+    about = {"name": photograph.name, "utc_ns": photograph.utc_ns, "ground": ground.name, **facts}
+    return geojson_feature(_polygon(ring), **about)
 
 
 def _polygon(ring: Floats) -> dict[str, Any]:
