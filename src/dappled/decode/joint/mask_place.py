@@ -65,7 +65,7 @@ _WITNESSES = 60  # patches that tell in flight whether there is a mask
 _FEWEST = 12  # patches, for an answer at all
 _AT_A_TIME = 50  # patches
 _FAINT = 0.3  # of the mean texture: fainter patches are not scaled up to it, noise and all
-_TRIED = 3  # of so many frequencies one is looked at to choose the kind of witnesses
+_TRIED = 3  # of so many frequencies one is looked at to choose the kind of all patches together
 _STEPS = 48  # of a period: how finely moves are tried, up to half a period
 _MOST, _CHANGES = 0.007, 81  # of a turn in radians and of the scale, to either side, and how many are tried
 _ROUNDS = 8  # of Newton's method, from the best that was tried
@@ -192,7 +192,7 @@ class PlaceSearch:
             witness.patches,
             self.workers,
         )
-        frame, spectra, reach = seen.frame, seen.spectra, self.reach
+        frame, spectra, reach, few = seen.frame, seen.spectra, self.reach, slice(None, None, _TRIED)
         away = self._away(seen)
         place: MaskPlace | None = None
         likely = -np.inf
@@ -204,12 +204,13 @@ class PlaceSearch:
                 frame = replace(frame, ranges={**frame.ranges, **more.ranges}, folds={**frame.folds, **more.folds})
             kinds = [kind for kind in KINDS if kind.range == some]
             rests = rests_of(frame, seen.spectrum, seen.own, seen.mean, kinds)
-            wholes = list(wholes_of(frame, rests, range(len(kinds))))
-            found = likelihoods(wholes, spectra, frame.weights, workers).sum(axis=1)
+            tried = wholes_of(frame, rests, range(len(kinds)), few)
+            found = likelihoods(tried, spectra[few], frame.weights[few], workers).sum(axis=1)
             if found.max() <= likely:
                 break
             likely = float(found.max())
-            differences, terms = _terms(seen, wholes[int(found.argmax())], workers)
+            (whole,) = wholes_of(frame, rests, [int(found.argmax())])
+            differences, terms = _terms(seen, whole, workers)
             place = _Likelihood(differences, terms, away).place(moved=moved)
             if some == USUAL and not place.far().moved:
                 kind = kinds[int(found.argmax())]

@@ -77,7 +77,7 @@ _FEW_AT_A_TIME = 64  # where little is done to each number, so that what is work
 _TRIED = 3  # of so many frequencies one is looked at to choose the kind
 _UNSURE_NATS = 300.0  # by those: less is no choice
 _HYPOTHESES = 17  # disparities over a range, an eighth of the reach apart
-_AT_REST = 5  # over one next to 0: slices tell no more of them
+_AT_REST, _MOTIONLESS = 5, 3  # over one next to 0: slices tell no more of them
 # In reaches: disparities of what folds in from beyond the band.
 _FOLDED = {AT_REST: np.linspace(-STILL, STILL, 3), USUAL: np.linspace(-0.6, 0.6, 5)}
 _INDEPENDENT = 0.5  # of a patch's samples are measurements of their own: patches overlap, windows correlate
@@ -173,7 +173,7 @@ class FrameModel:
 
         def make(number: int) -> None:
             near, far = RANGES[number]
-            count = _AT_REST if number in (AT_REST, MOTIONLESS_RANGE) else _HYPOTHESES
+            count = {AT_REST: _AT_REST, MOTIONLESS_RANGE: _MOTIONLESS}.get(number, _HYPOTHESES)
             found[number] = DisparityRange.of(model, frequencies, near * reach, far * reach, count)
             if number in _FOLDED:
                 folds[number] = model.folds(frequencies, _FOLDED[number] * reach)
