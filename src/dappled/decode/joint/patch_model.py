@@ -54,9 +54,6 @@ _USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
 _MOVED_NATS = 2.0
 # Of one patch: straight edges at rest have up to 13, things that move by 0.9 px from view to view 24 and more.
 MOVES_NATS = 16.0
-# Of a patch of a calm frame, four fifths of whose patches have less than `_MOVED_NATS`. Of terrain from the air 3 %
-# have more, most of them at the frame's edges. A frame of which a third moves by 0.9 px from view to view is not calm.
-CALM_NATS, _CALM_SHARE = 4.0, 0.8
 # Edges between depths look like it, too. Chosen by hand: a thing 18 px from view to view before a board at 0.5 px has
 # 32.8 dB with this kind, 28.1 without.
 _ALONE_NATS = 500.0
@@ -456,11 +453,6 @@ def moved_nats(frame: FrameModel, rests: Rests, spectra: Complexes) -> Floats:
 def is_motionless(moved: Floats) -> bool:
     """Whether a frame without parallax has none that any patch could tell: by `moved_nats` of its patches."""
     return float(np.median(moved)) < _MOVED_NATS
-
-
-def is_calm(moved: Floats) -> bool:
-    """Whether nearly nothing of a frame has parallax that a patch could tell: by `moved_nats` of patches anywhere."""
-    return float(np.quantile(moved, _CALM_SHARE)) < _MOVED_NATS
 
 
 def _at_rest_nats(
