@@ -11,7 +11,10 @@ from dappled.clock import Clock, SystemClock
 from dappled.findings import Code, Finding, Subject
 
 INTERVAL_S = 60.0
-SHOTS_INTERVAL_S = 5.0  # of refused shots, which are in the flight's books: a power cut takes what was only counted
+SHOTS_INTERVAL_S = 3.0  # of refused shots, which are in the flight's books: a power cut takes what was only counted
+SHOTS_BEHIND_S = 6.0
+"""How far the flight's books may be behind refused shots. Counts are looked for each half second, and written by the
+service's loop, which waits for the disk: a second was too little for that beside other programs."""
 PEERS = 20  # for each reason; all further ones count as one
 OTHERS = "other peers"
 

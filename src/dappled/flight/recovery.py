@@ -88,9 +88,7 @@ def recover_flight(folder: FlightFolder, clock: Clock) -> list[Finding]:
                 ledger.failed(row.shot.index, lost)
                 report.append(lost)
         if "closed_utc_ns" not in ledger.facts():
-            ledger.set_fact(
-                CUT_SHORT, {"shots_s": logs.DURABLE_S, "refusals_s": refusals.SHOTS_INTERVAL_S + logs.DURABLE_S}
-            )
+            ledger.set_fact(CUT_SHORT, {"shots_s": logs.DURABLE_S, "refusals_s": refusals.SHOTS_BEHIND_S})
             close_ledger(folder, ledger, clock.utc_ns(), None, report)
             report.append(finding(Code.FLIGHT_PUT_RIGHT, FLIGHT))
         for one in report:
