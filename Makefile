@@ -7,7 +7,7 @@ PREFIX ?= /usr/local
 # Tests start hundreds of processes: where no bytecode may be kept, each of them compiles all modules anew.
 unexport PYTHONDONTWRITEBYTECODE
 # Three tests on two cores: a third of the time of tests is waiting for sockets and processes.
-BESIDE = --workers $(shell echo $$(( ($$(nproc) * 3 + 1) / 2 )))
+BESIDE = -n $(shell echo $$(( ($$(nproc) * 3 + 1) / 2 ))) --dist worksteal
 
 help: ## show this list
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | awk -F ':.*## ' '{printf "  make %-10s %s\n", $$1, $$2}'
@@ -40,9 +40,11 @@ BUDGET = $(BIN)/python tools/budget.py
 test: setup ## lint, types, import contracts, and the default tests
 	@$(BUDGET) "make test" 240 400 $(MAKE) -s checked-tests
 
-# The checks take a core for a minute: beside the tests, not before them.
+# The checks take a core for a minute: beside the tests, not before them. pytest's own bytecode of the tests is made once, in
+# a new clone, and not by each worker.
 checked-tests:
 	@failed=; { $(CHECKS); } & checks=$$!; \
+	[ -d tests/__pycache__ ] || $(BIN)/pytest -q --collect-only >/dev/null; \
 	$(TESTS) || failed=tests; \
 	wait $$checks || { echo "the checks failed: see what they say above, or run make check" >&2; failed=checks; }; \
 	[ -z "$$failed" ]

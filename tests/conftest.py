@@ -19,7 +19,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line does; 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests import beside, forked, left_behind, shared
+from tests import forked, left_behind, shared
 
 # No test fails for the speed of the machine it runs on, nor by chance: by default the examples are the same each time.
 settings.register_profile("many", deadline=None, suppress_health_check=[HealthCheck.too_slow], max_examples=300)
@@ -148,33 +148,18 @@ def types_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield folder
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    """`--workers`."""
-    parser.addoption("--workers", type=int, default=1, metavar="N", help="run the tests in N forked processes")
-
-
-def pytest_configure(config: pytest.Config) -> None:
-    """Processes may be forked from here on."""
-    _own_sockets()
-    _forks.install()
-    if (count := config.getoption("--workers")) > 1:
-        config.pluginmanager.register(beside.Beside(count, _own_sockets, _end))
-
-
-def _own_sockets() -> None:
-    """Sockets lie where no other process of tests, nor a daemon, has its own: a user's daemon holds the camera."""
+def pytest_configure() -> None:
+    """Processes may be forked from here on, and have their sockets where no other process of tests, nor a daemon, has
+    its own: a user's daemon holds the camera."""
     os.environ["XDG_RUNTIME_DIR"] = tempfile.mkdtemp(prefix="dpl-")
-
-
-def _end() -> None:
-    _forks.close()
-    shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
+    _forks.install()
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
     """End the process although a test that failed has left a thread behind: the interpreter would wait for it for ever,
     and so would whoever waits for the tests."""
-    _end()
+    _forks.close()
+    shutil.rmtree(os.environ["XDG_RUNTIME_DIR"], ignore_errors=True)
     left = [one.name for one in threading.enumerate() if one is not threading.main_thread() and not one.daemon]
     if left and not hasattr(config, "workerinput"):
         print(f"left behind by tests: the threads {', '.join(left)}", file=sys.stderr, flush=True)  # noqa: T201
