@@ -10,7 +10,7 @@ import pytest
 from scipy import ndimage
 
 from dappled.decode.joint.joint_views import joint_views
-from dappled.decode.joint.patch_model import is_motionless
+from dappled.decode.joint.patch_model import is_calm, is_motionless
 from dappled.decode.joint.slice_model import SliceModel
 from dappled.decode.lightfield.aperture import Aperture, angular_frequencies
 from dappled.decode.lightfield.light_field import LightField
@@ -212,6 +212,24 @@ def test_only_a_frame_in_which_nothing_tells_of_parallax_has_none(moved: float, 
     patches = np.full(40, moved)
     patches[:15] += np.where(np.arange(15) % 2, 500.0, -500.0)
     assert is_motionless(patches) is motionless
+
+
+@pytest.mark.parametrize(("share", "calm"), [(0.15, True), (0.3, False)])
+def test_a_frame_is_calm_where_four_fifths_of_it_tell_of_no_parallax(share: float, calm: bool) -> None:
+    """A motionless one may have two fifths that move: by these patches alone it could not be left to the rest."""
+    moved = np.where(np.arange(100) < 100 * share, 30.0, -3.0)
+    assert is_calm(moved) is calm
+    assert is_motionless(moved)
+
+
+@pytest.mark.slow
+def test_a_thing_that_hardly_moves_in_a_calm_frame_keeps_its_parallax() -> None:
+    """By 0.4 px from view to view; 53.3 dB where a patch may have errors that look like it."""
+    scene = RaySum(finest=BAND, snr=100, shape=(300, 400), boards=(0.0, 0.0, 2.0), covers="apart", seed=2)
+    plane, true = scene.expose()
+    field = scene.decoder(joint_views=True).decode(plane, focal_length_mm=FOCAL_MM, f_number=scene.f_number)
+    assert field.attributes["views_shares"]["at_rest"] == 1
+    assert psnr(field.views, on_slices(true, field.grid, field.slices.shape[1:])) > 54.8
 
 
 @pytest.mark.slow

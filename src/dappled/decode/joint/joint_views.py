@@ -9,7 +9,8 @@ the usual range or farther, and whether views have more alone than in common: a 
 
 Patches are looked at twice: at first any disparity may be there (`any_disparity`); a depth map of these first views
 tells which patches have hardly any parallax, and the disparities of the others, and views are made again
-(`told_disparity`).
+(`told_disparity`). In a calm frame, one of which a few patches from all over say that it has no parallax, as from the
+air, most patches are made without any at once, and only those that say otherwise are looked at so.
 """
 
 from __future__ import annotations
@@ -25,10 +26,12 @@ from numpy.typing import NDArray
 from dappled.decode.array_types import Complexes, Floats, Singles
 from dappled.decode.depth.estimate import estimate
 from dappled.decode.depth.evidence import of_views
+from dappled.decode.joint.alike_patches import AlikePatches, LookedPatches, alike_patches
 from dappled.decode.joint.any_disparity import PatchBackground, views_at_any
 from dappled.decode.joint.patch_model import (
     AT_A_TIME,
     BEYOND,
+    CALM_NATS,
     KINDS,
     MOTIONLESS_RANGE,
     MOVES_NATS,
@@ -37,14 +40,10 @@ from dappled.decode.joint.patch_model import (
     USUAL,
     USUAL_KINDS,
     FrameModel,
-    Rests,
-    TexturePower,
+    is_calm,
     is_motionless,
-    likely_errors,
     likely_kinds,
     moved_nats,
-    rests_in,
-    rests_of,
     some_of,
     usual_nats,
 )
@@ -59,18 +58,12 @@ from dappled.workers import each, spans
 
 # Chosen by hand where no figure stands beside a number; benchmarks/views.py measures what all of them together make.
 
-_TEXTURES = 3  # groups of patches of similar texture, each with its own spectrum
 _FEWEST_VIEWS = 3  # along an axis: depth compares them with the middle one
-_FEWEST = 12  # patches in a group
 # Of views whose patches a depth map tells their disparities; the rest are their first views. With all of it, views of
 # boards with hard edges gain 0.1 to 0.3 dB more, and those of boards that blend lose 0.4 dB instead of 0.2.
 _TRUST = np.float32(0.75)
 _UNLIKE = 1e-4  # of the light, times a transfer: what a slice's mean doesn't tell of a wrong aperture
-# Of a slice's power, what no light field explains: what edges of opaque things leave, or next to nothing. Each patch
-# says which (`likely_errors`): boards that hide each other, SNR 100, have 43.1 dB with the first alone, 42.5 with the
-# second and 43.0 so; boards that blend, without noise, 53.4, 58.8 and 58.8; apart, 52.1, 57.1 and 57.1.
-_ERRORS = (5e-4, 5e-6)
-_RING = 0.06  # of what a slice holds of a scene's mean: the frame's end rings in it, as far as a patch from the edge
+_SAMPLE = 128  # patches, at least: so many say whether a frame is calm
 # Of a patch's mean square difference to the views that it and its neighbours were joined to, of the model's variance of
 # what views have alone, and of all else of it, for each kind: 68 % of errors are within the root of the sum. Fitted by
 # hand to frames of benchmarks/views.py; docs/decoding.md has what share of errors is within on which family.
@@ -130,42 +123,31 @@ def joint_views(
     model = model.upright()
     back = model.turns[: len(slices)].conj()
     common = model.common()[: len(slices)] + (off * back).real
-    first, means = patches.less_means(patches.cut(slices[:1]), common[:1])  # which is real as it is
+    first = patches.less_means(patches.cut(slices[:1]), common[:1])  # which is real as it is
     frame = FrameModel.of(patches, model, samples_px, np.concatenate([noise, noise[1:]]), reach, workers=workers)
-    frame = replace(frame, unlike=math.hypot(unlike, _UNLIKE), error=_ERRORS[0])
-    group = _groups(first[0].real, patches)
-    rings = np.concatenate([[0.0], _RING * np.abs(model.common()[1:])])
-    stray = np.zeros(len(means)) if astray is None else astray
-    # Patches that light goes astray in are apart, but have the spectrum of their group.
-    parts = [
-        (alike, np.flatnonzero(alike & (stray == share)))
-        for alike in (group == number for number in np.unique(group))
-        for share in np.unique(stray[alike])
-    ]
-    parts.sort(key=lambda part: -len(part[1]))  # a large one that is left to the end is waited for
+    frame = replace(frame, unlike=math.hypot(unlike, _UNLIKE))
+    means = first[1]
+    groups = alike_patches(frame, patches, first, np.zeros(len(means)) if astray is None else astray, workers)
     spectra_of = _PatchSpectra(patches, slices, back.astype(np.complex64), common)
     made = _PatchViews.empty(patches, means, model.aperture.views)
-    found: dict[int, list[_Looked]] = {}
+    deep = model.aperture.views >= _FEWEST_VIEWS
+    # By how many nats patches moved: known of those of a calm frame.
+    moved = np.full(len(means), np.nan) if deep and _is_calm(groups, spectra_of, workers) else None
+    found: dict[int, list[LookedPatches]] = {}
 
-    def look(part: int) -> None:
-        alike, members = parts[part]
-        mean = float(np.sqrt(np.mean(means[alike] ** 2)))
-        ringing = rings * mean if group[members[0]] == _TEXTURES else np.zeros(len(rings))
-        here = replace(frame, noise=frame.noise + ringing**2, astray=float(stray[members[0]]))
-        power = (np.abs(patches.spectra(first[:, alike])[:, 0]) ** 2).mean(axis=1)
-        looked = _Looked.of(here, power, mean, members, spectra_of(members))
-        for one, spectra in looked:
-            made.solve(one, spectra)
-        found[part] = [one for one, _ in looked]
+    def look(number: int) -> None:
+        found[number] = made.look(groups[number], spectra_of, moved)
 
-    each(look, range(len(parts)), workers)
-    looked = [one for part in range(len(parts)) for one in found[part]]
+    each(look, range(len(groups)), workers)
+    looked = [one for number in range(len(groups)) for one in found[number]]
     still = likely = np.zeros(len(means), dtype=bool)
     told: list[ToldPatches] = []
-    if model.aperture.views >= _FEWEST_VIEWS:
+    if deep:
         depths = _depths(made.views(), model.aperture, samples_px, workers)
         still = at_rest(depths, STILL * reach, patches)
-        made.solve_at_rest(looked, still, spectra_of, workers)
+        made.solve_at_rest(looked, still, spectra_of, moved, workers)
+        if moved is not None:
+            still |= moved < CALM_NATS
         shares = shares_of(depths, frame.ranges[USUAL].disparities, patches)
         shares[still] = 0
         each(lambda one: told.extend(made.told(one, shares, spectra_of)), looked, workers)
@@ -230,46 +212,59 @@ class _PatchViews:
         variance, of_apart = np.empty((count * count, len(means))), np.empty(len(means))
         return cls(patches, lit, windowed, variance, of_apart, np.zeros(len(means), dtype=bool))
 
-    def solve(self, one: _Looked, spectra: Complexes) -> None:
-        """A part with these `spectra` (F, A, M), with any disparity."""
-        self._solve(one, one.members, spectra, one.kinds, np.ones(len(one.members), dtype=bool))
+    def look(self, group: AlikePatches, spectra_of: _PatchSpectra, moved: Floats | None) -> list[LookedPatches]:
+        """A group with any disparity: which of it were looked at so. In a calm frame those that hardly `moved` (N,),
+        which is written, are made without parallax."""
+        members, spectra = group.members, spectra_of(group.members)
+        if moved is not None:
+            moved[members] = group.moved(spectra)
+            still = moved[members] < CALM_NATS
+            self._rest(group.still(members[still]), some_of(spectra, still), moved)
+            members, spectra = members[~still], some_of(spectra, ~still)
+        looked = group.looked(members, spectra)
+        for one, part in looked:
+            self._solve(one, part, one.kinds, np.ones(len(one.members), dtype=bool))
+        return [one for one, _ in looked]
 
     def solve_at_rest(
-        self, looked: Sequence[_Looked], still: NDArray[np.bool_], spectra_of: _PatchSpectra, workers: int
+        self,
+        looked: Sequence[LookedPatches],
+        still: NDArray[np.bool_],
+        spectra_of: _PatchSpectra,
+        known: Floats | None,
+        workers: int,
     ) -> None:
         """With hardly any parallax where patches are `still` (N,), and with none that a patch could tell where the
-        frame is motionless."""
-        resting = [(one, one.members[still[one.members]]) for one in looked if still[one.members].any()]
+        frame is motionless: a calm one, of which it is `known` (N,) by how many nats patches moved."""
+        resting = [replace(one, members=one.members[still[one.members]]) for one in looked if still[one.members].any()]
         taken: dict[int, Complexes] = {}
-        moved = np.full(len(still), np.inf)
+        moved = np.full(len(still), np.inf) if known is None else known
 
         def ask(number: int) -> None:
-            one, members = resting[number]
-            taken[number] = spectra_of(members)
-            if still.mean() > MOST_STILL:
-                moved[members] = moved_nats(one.frame, one.rests, taken[number])
+            one = resting[number]
+            taken[number] = spectra_of(one.members)
+            if known is None and still.mean() > MOST_STILL:
+                moved[one.members] = moved_nats(one.frame, one.rests, taken[number])
 
         each(ask, range(len(resting)), workers)
-        if not (still.any() and is_motionless(moved[still])):
+        if known is None and not (still.any() and is_motionless(moved[still])):
             moved[:] = np.inf
+        each(lambda number: self._rest(resting[number], taken.pop(number), moved), range(len(resting)), workers)
 
-        def rest(number: int) -> None:
-            (one, members), spectra = resting[number], taken.pop(number)
-            kinds = likely_kinds(one.frame, one.rests, spectra, with_parallax=False)
-            self._solve(one, members, spectra, kinds, moved[members] >= MOVES_NATS)
-
-        each(rest, range(len(resting)), workers)
+    def _rest(self, one: LookedPatches, spectra: Complexes, moved: Floats) -> None:
+        """Patches with these `spectra` (F, A, M) at rest, and motionless where they hardly `moved` (N,)."""
+        kinds = likely_kinds(one.frame, one.rests, spectra, with_parallax=False)
+        self._solve(one, spectra, kinds, moved[one.members] >= MOVES_NATS)
 
     def _solve(
         self,
-        one: _Looked,
-        which: NDArray[np.intp],
+        one: LookedPatches,
         spectra: Complexes,
         kinds: NDArray[np.intp],
         moved: NDArray[np.bool_],
     ) -> None:
-        """Solve `which` (N,) patches of a part, with these `spectra` (F, A, N), of these `kinds` (N,); those at rest
-        that have not `moved` (N,) have no parallax that a patch could tell."""
+        """Solve patches with these `spectra` (F, A, M), of these `kinds` (M,); those at rest that have not `moved` (M,)
+        have no parallax that a patch could tell."""
         frame, own = one.frame, one.rests.own
         for number in np.unique(kinds):
             kind = KINDS[number]
@@ -280,14 +275,14 @@ class _PatchViews:
                 if not len(chosen):
                     continue
                 some = frame.ranges[MOTIONLESS_RANGE if still else kind.range]
-                members = which[chosen]
+                members = one.members[chosen]
                 self.of_apart[members], of_alone, of_rest = _TOLD_MOTIONLESS if still else _TOLD[number]
                 self.beyond[members] = kind.range == BEYOND
                 for few, made, found in views_at_any(frame, some, own, background, some_of(spectra, chosen)):
                     self.windowed[members[few]] = self.patches.images(views_of(made), self.lit[members[few]])
                     self.variance[:, members[few]] = of_alone * left + of_rest * variance_of_views(found)
 
-    def told(self, one: _Looked, shares: Floats, spectra_of: _PatchSpectra) -> list[ToldPatches]:
+    def told(self, one: LookedPatches, shares: Floats, spectra_of: _PatchSpectra) -> list[ToldPatches]:
         """Those of a part that have `shares` (N, D) of disparities: none where all are 0."""
         here = np.isin(one.kinds, USUAL_KINDS) & shares[one.members].any(axis=1)
         if not here.any():
@@ -316,52 +311,17 @@ class _PatchViews:
         return self.patches.apart(self.windowed, self.views())
 
 
+def _is_calm(groups: Sequence[AlikePatches], spectra_of: _PatchSpectra, workers: int) -> bool:
+    """Whether nearly nothing of a frame has parallax, by some patches of each group."""
+    apart = max(1, sum(len(one.members) for one in groups) // _SAMPLE)
+    moved: list[Floats] = []
+    each(lambda one: moved.append(one.moved(spectra_of(one.members[::apart]))), groups, workers)
+    return is_calm(np.concatenate(moved))
+
+
 def _depths(views: Singles, aperture: Aperture, samples_px: tuple[float, float], workers: int) -> Floats:
     """(h, w) disparities in sensor columns over the aperture, by views (V·U, h, w); NaN where unknown."""
     count, (rows_px, columns_px) = aperture.views, samples_px
     steps = count * np.unique(aperture.points()[:, 0])
     stack = ViewStack(views.reshape(count, count, *views.shape[1:]), steps * columns_px / rows_px, steps)
     return estimate(of_views(stack), workers=workers).disparity.astype(np.float64) * (count * columns_px)
-
-
-def _groups(images: Singles, patches: Patches) -> NDArray[np.intp]:
-    """(N,) which patches (N, side, side) are alike, by how much fine detail they have: `_TEXTURES` for those at the
-    edges, fewer for others."""
-    rows, columns = np.diff(images, axis=1)[:, :, 1:], np.diff(images, axis=2)[:, 1:, :]
-    texture = np.einsum("nyx,yx->n", rows**2 + columns**2, patches.window[1:, 1:])
-    count = max(1, min(_TEXTURES, len(images) // _FEWEST))
-    group = np.searchsorted(np.quantile(texture, np.arange(1, count) / count), texture)
-    return np.asarray(np.where(patches.at_edges, _TEXTURES, group))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Looked:
-    """Patches of similar texture, the `members` (M,) of all: their `frame`, the `rests` of each kind, and which `kinds`
-    (M,) with parallax they are likely to be, ascending."""
-
-    members: NDArray[np.intp]
-    frame: FrameModel
-    rests: Rests
-    kinds: NDArray[np.intp]
-
-    @classmethod
-    def of(
-        cls, frame: FrameModel, power: Floats, mean: float, members: NDArray[np.intp], spectra: Complexes
-    ) -> list[tuple[_Looked, Complexes]]:
-        """Those of each likely error with their spectra, from the mean power (F,) of the first slice and the mean of
-        all patches that look alike."""
-        radius = frame.radius(frame.frequencies)
-        spectrum = TexturePower.of(np.maximum(power - frame.noise[0], 0), radius)
-        strength = spectrum.at(radius)
-        frames = [replace(frame, error=error) for error in _ERRORS]
-        first = rests_of(frames[0], spectrum, strength, mean)
-        tried = [first, *(rests_in(one, first, mean) for one in frames[1:])]
-        kinds = likely_kinds(frame, tried[0], spectra, with_parallax=True)
-        likely = likely_errors(frames, tried, kinds, spectra)
-        order = np.argsort(kinds, kind="stable")
-        apart = (order[likely[order] == number] for number in range(len(frames)))
-        return [
-            (cls(members[some], one, rests, kinds[some]), some_of(spectra, some))
-            for one, rests, some in zip(frames, tried, apart, strict=True)
-            if len(some)
-        ]

@@ -54,6 +54,10 @@ _USUAL_AMOUNTS, _MORE, _SELDOM = (0.01, 1.0), (8.0, 64.0, 512.0), 0.05
 _MOVED_NATS = 2.0
 # Of one patch: straight edges at rest have up to 13, things that move by 0.9 px from view to view 24 and more.
 MOVES_NATS = 16.0
+# Of a patch of a calm frame, four fifths of whose patches have less than `_MOVED_NATS`, of any parallax. Of terrain
+# from the air nine tenths have less, by hundreds of nats; half of smooth boards 2.4 px from the focus have more. A
+# frame of which a third moves by 0.9 px from view to view is not calm.
+CALM_NATS, _CALM_SHARE = 4.0, 0.8
 # Edges between depths look like it, too. Chosen by hand: a thing 18 px from view to view before a board at 0.5 px has
 # 32.8 dB with this kind, 28.1 without.
 _ALONE_NATS = 500.0
@@ -415,12 +419,26 @@ def likely_kinds(frame: FrameModel, rests: Rests, spectra: Complexes, *, with_pa
     """(N,) the most probable kinds of patches (F, A, N) with these `rests_of` their group, of those `with_parallax` or
     those at rest. Which of the two a patch is of, likelihoods tell badly: small parallax, too, is explained better by
     folded detail in free amounts."""
+    numbers = [number for number, kind in enumerate(KINDS) if (kind.range != AT_REST) == with_parallax]
+    tried = _tried(frame, rests, numbers, spectra)
+    return np.array(numbers)[_most_likely(frame, rests, numbers, spectra, tried)]
+
+
+def parallax_nats(frame: FrameModel, rests: Rests, spectra: Complexes) -> Floats:
+    """(N,) by how many nats the likeliest kind with parallax is more probable than the likeliest at rest, of patches
+    (F, A, N). What is less than 0 may be small parallax nevertheless (`likely_kinds`); large parallax is far more."""
+    tried = _tried(frame, rests, range(len(KINDS)), spectra)
+    moving = np.array([kind.range != AT_REST for kind in KINDS])
+    return np.asarray(tried[moving].max(axis=0) - tried[~moving].max(axis=0))
+
+
+def _tried(frame: FrameModel, rests: Rests, numbers: Sequence[int], spectra: Complexes) -> Floats:
+    """(B, N) log likelihoods of these kinds by a few frequencies of patches (F, A, N), as if by all."""
     few = slice(None, None, _TRIED)
     weights = frame.weights[few] * (frame.weights.sum() / frame.weights[few].sum())
-    numbers = [number for number, kind in enumerate(KINDS) if (kind.range != AT_REST) == with_parallax]
     tried = likelihoods(wholes_of(frame, rests, numbers, few), spectra[few], weights)
     tried -= np.array([[KINDS[number].nats] for number in numbers])
-    return np.array(numbers)[_most_likely(frame, rests, numbers, spectra, tried)]
+    return tried
 
 
 def _most_likely(
@@ -453,6 +471,12 @@ def moved_nats(frame: FrameModel, rests: Rests, spectra: Complexes) -> Floats:
 def is_motionless(moved: Floats) -> bool:
     """Whether a frame without parallax has none that any patch could tell: by `moved_nats` of its patches."""
     return float(np.median(moved)) < _MOVED_NATS
+
+
+def is_calm(moved: Floats) -> bool:
+    """Whether nearly nothing of a frame has parallax that a patch could tell, by `AlikePatches.moved` of patches
+    anywhere."""
+    return float(np.quantile(moved, _CALM_SHARE)) < _MOVED_NATS
 
 
 def _at_rest_nats(
