@@ -1,4 +1,4 @@
-"""Encode pictures as the bytes of a JPEG or PNG file."""
+"""Encode pictures as the bytes of a JPEG, PNG or WebP file."""
 
 from __future__ import annotations
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from PIL import Image, features
 
 from dappled import durable
+from dappled.encoded_pictures import file_of
 from dappled.errors import DappledError
 from dappled.products.exports.prints import Bytes
 from dappled.products.extras import need
@@ -37,9 +37,8 @@ def save(path: Path, pictures: Sequence[Bytes]) -> None:
 def _webp(drawn: Sequence[Image.Image]) -> bytes:
     if not features.check("webp"):
         raise DappledError("this Pillow was built without WebP: install another, or name a .mp4")
-    file = io.BytesIO()
-    drawn[0].save(file, "WEBP", save_all=True, append_images=drawn[1:], duration=1000 // _A_SECOND, loop=0, quality=85)
-    return file.getvalue()
+    more = {"save_all": True, "append_images": drawn[1:], "duration": 1000 // _A_SECOND, "loop": 0, "quality": 85}
+    return file_of(drawn[0], "WEBP", **more)
 
 
 def _film(drawn: Sequence[Image.Image]) -> bytes:
