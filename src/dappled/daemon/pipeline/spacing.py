@@ -207,10 +207,11 @@ class DistanceTrigger(OneThread):
             missed = way.spacing_m is not None and math.isfinite(apart_m) and apart_m >= 2 * way.spacing_m
             if not missed and self._around.busy():
                 return _LOOK_S
-            way.taken += 1
+            way.taken += 1  # before it is fired: one that can't be is noted, and its number is used
             request = CaptureRequest(way.source, KIND, way.taken + way.refused, acknowledged=False)
             accepted = self._shutter.request(request).accepted
-            way.taken, way.refused = way.taken - (not accepted), way.refused + (not accepted)
+            if not accepted:
+                way.taken, way.refused = way.taken - 1, way.refused + 1
             too_far = bool(way.spacing_m and _LATE * way.spacing_m < apart_m < math.inf)
             way.is_late = missed or not accepted or too_far
             if way.is_late:
