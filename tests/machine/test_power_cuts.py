@@ -80,7 +80,7 @@ def compared(run: Callable[[str], str], flight: str, known: Heard, slack_s: floa
         (book["wishes"], known.accepted_s, within["shots_s"]),
         (book["refused"], known.refused_s, within["refusals_s"]),
     ):
-        ages_s = [round(known.cut_s - at, 2) for at in times]
+        ages_s = [known.cut_s - at for at in times]
         assert count >= sum(age_s > lost_s + slack_s for age_s in ages_s), (count, lost_s, ages_s[-40:])
     listed = run(f"cd {flight}/frames && sha256sum *.cr2 2>/dev/null || true").split()
     recorded = {int(name.partition(".")[0]): found for found, name in zip(listed[::2], listed[1::2], strict=True)}
